@@ -260,8 +260,8 @@ class Instance(Protocol):
 
         Args:
             inputs: `do_step` reads from it the connected inputs, which are the columns of its layout.
-            outputs: one or two rings; `do_step` writes to them the outputs of their layouts. Both have the same number
-                of rows.
+            outputs: one or two rings; `do_step` writes to them the outputs of their layouts. Each has a ``mask`` of its
+                own.
             grid: the communication points of the run.
             points: how many points of ``grid`` one own step takes; own step ``n`` starts at point ``n * points``.
             step: the number of the next own step.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FmuMeshError
 from ..rings.ring import Ring
+from ..rings.transfer import Index, elements_at
 from ..system.layout import Layout
 from ..system.plan import RECORDER, Link
 from ..variables.value_types import Value
@@ -53,7 +53,11 @@ class OutLink:
             raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
         while self._picked and (first := self.sent) < end:
             numbers = np.arange(first, min(end, first + self._rows))
-            rows = tuple(ring.parts[part][np.ix_(numbers & ring.mask, elements)] for part, elements in self._picked)
+            slots = numbers & ring.mask
+            rows = tuple(
+                ring.parts[part][(slots, own) if isinstance(own, slice) else np.ix_(slots, own)]
+                for part, own in self._picked
+            )
             for message in encode_frames(FRAME, self.link.index, first, rows):
                 self._put(message)
             self.sent += len(numbers)
@@ -72,12 +76,11 @@ class OutLink:
         self._put(encode_rows(INITIAL, self.link.index, tag, row.parts))
 
 
-def _picked(have: Layout, want: Layout) -> list[tuple[int, NDArray[np.intp]]]:
+def _picked(have: Layout, want: Layout) -> list[tuple[int, Index]]:
     """For each part of the wanted columns: its number in a ring with the columns ``have``, and its elements there."""
     numbers = {part.type: number for number, part in enumerate(have.parts)}
     picked = []
     for part in want.parts:
         places = [have.place(column.name) for column in part.columns]
-        elements = np.concatenate([np.arange(place.first, place.first + place.size) for place in places])
-        picked.append((numbers[part.type], elements))
+        picked.append((numbers[part.type], elements_at([p.first for p in places], [p.size for p in places])))
     return picked

@@ -20,6 +20,7 @@ from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
 from ..system.layout import Layout
 from ..system.plan import InstancePlan
+from ..system.window import rows_of_ring
 from .links import OutLink
 
 __all__ = ["Position", "PositionInTable", "Runner", "Source"]
@@ -181,7 +182,8 @@ class Runner:
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; the plan does not contain them."""
         variables = {variable.name: variable for variable in self.instance.description.variables}
-        self.watched = Ring(Layout.of(variables[name] for name in names), self.outputs.rows) if names else None
+        layout = Layout.of(variables[name] for name in names)
+        self.watched = Ring(layout, min(self.outputs.rows, rows_of_ring(layout))) if names else None
         self.bind()
 
     def wrap(self, wrapped: Instance) -> None:

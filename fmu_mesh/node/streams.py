@@ -98,6 +98,10 @@ class InstanceStreams:
         if not self._active or first >= end:
             return None
         self._next = end
+        watched = self.runner.watched
+        kept = min(self.runner.outputs.rows, watched.rows if watched is not None else end)
+        self._dropped += max(0, end - kept - first)
+        first = max(first, end - kept)  # older rows are overwritten
         if waiting_rows > MAX_WAITING_ROWS:
             self._dropped += end - first
             return None

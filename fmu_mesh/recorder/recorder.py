@@ -89,10 +89,9 @@ class Recorder:
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
-        self._rows = plan.rings[0].rows
-        self._wake_rows = min(
-            _WAKE_ROWS, max(1, plan.window // 2)
-        )  # at the window, the nodes would wait for this thread
+        self._rows = min(place.rows for place in plan.rings)
+        # At the end of the window, the nodes would wait for this thread.
+        self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
         self._files = RecordFiles(files, growth)
         self._has_begun = has_begun
         self._written = 0
@@ -176,11 +175,12 @@ class Recorder:
     def _source(self, link: Link, shares: Collection[str]) -> RecordedSource:
         """Where the rows of an instance are: in its ring, in a mirror that frames fill, or text in the mirror."""
 
+        place = next(place for place in self._plan.rings if place.instance == link.source)
+
         def fits(end: int) -> bool:
             """Whether rows of the source before its own step ``end`` overwrite no rows that are not written yet."""
-            return end - self._written // link.step_points <= self._rows
+            return end - self._written // link.step_points <= place.rows
 
-        place = next(place for place in self._plan.rings if place.instance == link.source)
         shared = self._memory if link.source_node in shares else None
         rows, receiver = rows_of(link, place, shared, self._own_memory, fits)
         return RecordedSource(link, self._plan.grid.last_point, rows, receiver)

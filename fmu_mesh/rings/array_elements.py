@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+import numpy as np
+
 from ..system.layout import Column, Layout
 from ..variables.value_types import Value
 from .ring import Ring
@@ -64,6 +66,9 @@ def scaled(value: Value, factor: float, offset: float) -> Value:
     """
     if (factor, offset) == (1.0, 0.0) or isinstance(value, str | bytes):
         return value
+    if isinstance(value, np.ndarray):
+        with np.errstate(all="ignore"):
+            return value * np.float64(factor) + np.float64(offset)
     if isinstance(value, list):
         return [scaled(element, factor, offset) for element in value]
     return value * factor + offset

@@ -5,7 +5,6 @@ Row ``n`` is in slot ``n & mask``. This module owns the memory; it knows neither
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -101,26 +100,30 @@ class Ring:
         return nested(self.parts[part][row & self.mask, first : first + size].tolist(), shape)
 
     def put(self, row: int, name: str, value: Value) -> None:
-        """Write a value that the type can hold to a column of ``row``, or to one element of it.
+        """Write a value that the type can hold to a column of ``row``, or to one element of it; an array also of numpy.
 
         A value beyond the range of a Float32 becomes infinite, as in C.
         """
-        part, first, _, shape = self._place(name)
+        part, first, size, shape = self._place(name)
         array, slot = self.parts[part], row & self.mask
-        if array.dtype == np.float32:
-            with np.errstate(over="ignore"):
-                array[slot, first : first + math.prod(shape)] = flattened(value, len(shape))
-        elif not shape:
+        if not shape and array.dtype != np.float32:
             array[slot, first] = value
-        else:
-            for place, element in enumerate(flattened(value, len(shape)), first):
-                array[slot, place] = element
+            return
+        elements = value.reshape(-1) if isinstance(value, np.ndarray) else flattened(value, len(shape))
+        with np.errstate(over="ignore"):
+            array[slot, first : first + size] = np.asarray(elements, array.dtype)
 
     def reader(self, name: str) -> Callable[[int], Value]:
-        """`value` of one column as a function of the row: the fast way for a caller that reads it at every point."""
-        part, first, _, shape = self._place(name)
+        """`value` of one column as a function of the row: the fast way for a caller that reads it at every point.
+
+        Of an array it is a view of the row, which a later row overwrites.
+        """
+        part, first, size, shape = self._place(name)
         mask, width, start = self.mask, *self._in_numbers(part)
-        if self._types[part] != "Float64" or shape:
+        if shape:
+            array: Any = self.parts[part]
+            return lambda row: array[row & mask, first : first + size].reshape(shape)
+        if self._types[part] != "Float64":
             return lambda row: self.value(row, name)
         first += start
         memory: Any = self._flat.view(np.float64).data  # a memory view: it takes half the time of an array

@@ -20,7 +20,7 @@ from .native import NUMBER_TYPES, Change, Lookup, Move, RowBase
 from .ring import Ring
 from .value_change import ValueChange
 
-__all__ = ["Transfer"]
+__all__ = ["Index", "Transfer", "elements_at"]
 
 Index = slice | NDArray[np.intp]
 
@@ -165,7 +165,7 @@ class _Copy:
         The assignment that follows converts between types; `check` refuses connections that would lose something.
         """
         if self.change is not None:
-            return np.array([self.change.of(value) for value in values.tolist()], self.part.dtype)
+            return np.array(self.change.of(values.tolist()), self.part.dtype)
         if self.scale is None:
             return values
         factor, offset = self.scale
@@ -185,24 +185,25 @@ def _copies(columns: Sequence[FeedColumn], changes: Sequence[ValueChange], sourc
 
     An unscaled column is not multiplied by 1.0, so it keeps every bit, also of a NaN.
     """
-    groups: dict[tuple[int, int, Change, int], list[tuple[int, int, float, float]]] = {}
+    groups: dict[tuple[int, int, Change, int], list[tuple[int, int, int, float, float]]] = {}
     for number, column in enumerate(columns):
         have, want = source.layout.place(column.source), inputs.layout.place(column.target)
         key = (Change.LOOKED_UP, number) if column.map else (_change_of(column), -1)
         group = groups.setdefault((have.part, want.part, *key), [])
-        places = range(want.size)
-        group += [(have.first + place, want.first + place, column.factor, column.offset) for place in places]
+        group.append((have.first, want.first, want.size, column.factor, column.offset))
     copies = []
-    for (source_part, target_part, kind, number), items in groups.items():
-        scale = (np.array([c[2] for c in items]), np.array([c[3] for c in items])) if kind == Change.SCALED else None
-        sources, targets = _index([c[0] for c in items]), _index([c[1] for c in items])
+    for (source_part, target_part, kind, number), group in groups.items():
+        have_first, want_first, sizes, factors, offsets = zip(*group, strict=True)
+        scale = (np.repeat(factors, sizes), np.repeat(offsets, sizes)) if kind == Change.SCALED else None
+        sources, targets = elements_at(have_first, sizes), elements_at(want_first, sizes)
         change = changes[number] if number >= 0 else None
         copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale, change))
     return copies
 
 
-def _index(columns: Sequence[int]) -> Index:
-    """A slice if the columns are consecutive, because numpy copies it faster; otherwise an index array."""
-    if list(columns) == list(range(columns[0], columns[0] + len(columns))):
-        return slice(columns[0], columns[0] + len(columns))
-    return np.array(columns, dtype=np.intp)
+def elements_at(first: Sequence[int], sizes: Sequence[int]) -> Index:
+    """The elements of several places in a part: a slice if they are consecutive, because numpy copies it faster."""
+    ends = [start + size for start, size in zip(first, sizes, strict=True)]
+    if [*first[1:]] == ends[:-1]:
+        return slice(first[0], ends[-1])
+    return np.concatenate([np.arange(start, end) for start, end in zip(first, ends, strict=True)])

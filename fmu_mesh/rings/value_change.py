@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from ..errors import FmuError, StepFailed
 from ..system.connections import Connection
 from ..system.feeds import FeedColumn
@@ -86,6 +88,8 @@ class ValueChange(NamedTuple):
             Traceback (most recent call last):
             fmu_mesh.errors.StepFailed: instance clutch.gear: 'engine.gear' is 300, which is out of the range of Int8...
         """
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
         if isinstance(value, list):
             return [self.of(element, kind) for element in value]
         if (self.factor, self.offset) != (1.0, 0.0):

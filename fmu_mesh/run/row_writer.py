@@ -55,7 +55,7 @@ class RowWriter:
             )
             for link in node.links_in
         }
-        self._rows = node.rings[0].rows
+        self._rows = min(place.rows for place in node.rings)
         self._sources = list(sources.values())
         records = node.records[: len(self._files.counted)]
         self._files.begin(plan.grid, records, lambda instance, variable: sources[instance].column(variable))

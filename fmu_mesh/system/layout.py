@@ -15,7 +15,7 @@ import numpy as np
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, TYPES, VariableType, element_names, is_text, split_element
 
-__all__ = ["Column", "Layout", "Part", "Place", "row_bytes", "row_offsets", "rows_for"]
+__all__ = ["Column", "Layout", "Part", "Place", "row_bytes", "row_offsets"]
 
 _TEXT_BYTES = 64
 """Assumed size of a String or Binary without a maximum size, to plan memory and frames."""
@@ -130,11 +130,6 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                     return Place(number, first + int(np.ravel_multi_index(index, column.shape)), 1, ())
                 first += column.size
         raise KeyError(name)
-
-
-def rows_for(window: int) -> int:
-    """Number of rows of a ring in which a node can be ``window`` points ahead without overwriting a row in use."""
-    return 1 << (window + 3).bit_length()
 
 
 def row_offsets(layout: Layout) -> list[int]:

@@ -74,14 +74,13 @@ class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def map_memory(
-    processes: Sequence[str], rings: Mapping[str, tuple[str, int, Layout]], rows: int
+    processes: Sequence[str], rings: Mapping[str, tuple[str, int, Layout, int]]
 ) -> tuple[MemoryMap, dict[str, RingPlace]]:
     """The map, and the place of each ring by instance.
 
     Args:
         processes: the names of all nodes, then the master.
-        rings: node, base points per own step and outputs of each instance.
-        rows: number of rows of each ring.
+        rings: node, base points per own step, outputs and number of rows of each instance.
     """
     ends = _Places(_TOKEN_LINES * _LINE)
     counter = _LINE + 8 * len(processes)
@@ -91,7 +90,7 @@ def map_memory(
     counters = {name: ends.take(counter) for name in rings}
     places = {
         name: RingPlace(name, node, points, layout, rows, counters[name], ends.take(rows * row_bytes(layout)))
-        for name, (node, points, layout) in rings.items()
+        for name, (node, points, layout, rows) in rings.items()
     }
     return MemoryMap(tuple(processes), ends.end, bells, grant, progress, tuple(counters.values())), places
 

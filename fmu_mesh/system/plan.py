@@ -6,7 +6,7 @@ Owns the synchronization model (docs/architecture.md) as data. The plan is a pur
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import msgspec
@@ -21,13 +21,13 @@ from .digest import digest_of
 from .execution_order import execution_order
 from .feeds import Feed, feeds_of
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
-from .layout import Layout, row_bytes, rows_for
+from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
 from .system import Connection, ResolvedSystem, SystemInstance
-from .window import batch_of, recorder_window, window_of
+from .window import batch_of, recorder_window, rows_of_ring, window_of
 
 __all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
@@ -214,7 +214,8 @@ def make_plan(
     connections, closing, order, cycles = execution_order(system, file)
     initialization = plan_initialization(system, connections)
     check_loops(initialization, connections, system, file)
-    points = window if window is not None else window_of(system)
+    outputs = _output_layouts(system, connections)
+    points = window_of(system, outputs.values(), window)
     plan = Plan(
         system=system,
         connections=connections,
@@ -226,7 +227,7 @@ def make_plan(
         digest="",
         nodes={},
     )
-    nodes = _nodes(plan)
+    nodes = _nodes(plan, outputs)
     digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
 
@@ -254,9 +255,8 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
     return digest_of(agreed, models)
 
 
-def _nodes(plan: Plan) -> dict[str, NodePlan]:
+def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     system, config = plan.system, plan.system.config
-    outputs = _output_layouts(plan)
     node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
     links = _links(plan)
     windows = dict.fromkeys(node_names, plan.window)
@@ -264,11 +264,15 @@ def _nodes(plan: Plan) -> dict[str, NodePlan]:
         rows = [row_bytes(link.layout) for link in links if link.target_node == RECORDER]
         windows[RECORDER] = recorder_window(plan.window, rows)
     longest_step = max(instance.step_points for instance in system.instances.values())
-    rings = {name: (own.node, own.step_points, outputs[name]) for name, own in system.instances.items()}
-    # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).
-    # A target may be one own step behind the progress it has told.
-    ring_rows = rows_for(max(windows.values()) + 3 * longest_step)
-    memory, places = map_memory([*windows, MASTER], rings, ring_rows)
+    recorded = {link.source for link in links if link.target_node == RECORDER}
+    rings = {}
+    for name, own in system.instances.items():
+        # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).
+        # A target may be one own step behind the progress it has told.
+        behind = (windows[RECORDER] if name in recorded else plan.window) + 3 * longest_step
+        rows = rows_of_ring(outputs[name], -(-behind // own.step_points), max(windows.values()))
+        rings[name] = own.node, own.step_points, outputs[name], rows
+    memory, places = map_memory([*windows, MASTER], rings)
     nodes = {}
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
@@ -322,15 +326,15 @@ def _in_cycle(plan: Plan, members: list[str], units: dict[str, tuple[str, ...]])
     return any(name in cycle and len(units[name]) < len(cycle) for name in members for cycle in plan.cycles)
 
 
-def _output_layouts(plan: Plan) -> dict[str, Layout]:
+def _output_layouts(system: ResolvedSystem, connections: Iterable[Connection]) -> dict[str, Layout]:
     """Connected outputs and recorded variables of each instance, in the order of its model description."""
-    instances = plan.system.instances
+    instances = system.instances
     wanted: dict[str, set[str]] = {name: set() for name in instances}
-    for c in plan.connections:
+    for c in connections:
         if not c.initial_only:
             wanted[c.source_instance].add(c.source.name)
-    for instance, variable in plan.system.recorded:
-        wanted[instance].add(plan.system.base_of(instance, variable))
+    for instance, variable in system.recorded:
+        wanted[instance].add(system.base_of(instance, variable))
     return {
         name: Layout.of(variable for variable in own.description.variables if variable.name in wanted[name])
         for name, own in instances.items()

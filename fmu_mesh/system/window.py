@@ -1,10 +1,13 @@
-"""The sizes of windows in points: how far nodes may be ahead, and how far the recorder may be behind."""
+"""The sizes of windows in points and of rings in rows: how far nodes may be ahead, and the recorder behind.
+
+Owns what memory bounds: narrow rows may wait in thousands, of wide ones (images, fields) there are a few.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from .layout import Layout
+from .layout import Layout, row_bytes
 from .system import ResolvedSystem
 
 __all__ = [
@@ -12,17 +15,22 @@ __all__ = [
     "STEADY_POINTS",
     "batch_of",
     "recorder_window",
+    "rows_for",
+    "rows_of_ring",
     "window_of",
 ]
 
 RECORDER_WINDOW = 32768
 """Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
-_LEAST_RECORDER_WINDOW = 64
-_RECORDER_BYTES = 16 * 2**20
+_ROOM_BYTES = 16 * 2**20
+"""Up to this size, memory for rows is not worth saving: a recorder, a reader and a watcher look less often."""
+
+_LEAST_POINTS = 16
+_MOST_BYTES = 32 * 2**20
+"""What the rows of a window that is configured may take, unless they are `_LEAST_POINTS` or fewer."""
 
 AUTO_WINDOW_POINTS = 32768
-AUTO_WINDOW_BYTES = 16 * 2**20
 AUTO_WINDOW_ROWS = 262144
 """Limit for all instances together."""
 
@@ -37,8 +45,7 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
         window: window of the mesh in points.
         row_sizes: row sizes of all recorded instances in bytes.
     """
-    most = min(RECORDER_WINDOW, _RECORDER_BYTES // max(sum(row_sizes), 1))
-    return max(window, _LEAST_RECORDER_WINDOW, most)
+    return max(window, min(RECORDER_WINDOW, _ROOM_BYTES // max(sum(row_sizes), 1)))
 
 
 def batch_of(window: int) -> int:
@@ -46,15 +53,36 @@ def batch_of(window: int) -> int:
     return max(1, window // 16)
 
 
-def window_of(system: ResolvedSystem) -> int:
-    """The window of the configuration in points; `auto` is as large as the memory for the rows allows.
+def window_of(system: ResolvedSystem, outputs: Iterable[Layout], asked: int | None = None) -> int:
+    """The window of a mesh in points; `auto` is as large as the memory for the rows allows.
 
     A large window costs memory only. Values do not depend on it, and a pause takes effect soon at every window: see
-    `fmu_mesh.master.granting`.
+    `fmu_mesh.master.granting`. So of wide rows, a window that is configured is only as large as memory should be.
+
+    Args:
+        system: the system, with the window of the configuration.
+        outputs: the rows of all instances.
+        asked: instead of the window of the configuration.
     """
-    configured = system.config.simulation.window
+    configured = asked if asked is not None else system.config.simulation.window
+    widest = max(1, *(layout.row_size for layout in outputs))
     if configured != "auto":
-        return configured
-    widest = max(Layout.of(instance.description.variables).row_size for instance in system.instances.values())
+        return min(configured, max(_LEAST_POINTS, _MOST_BYTES // widest))
     points = min(AUTO_WINDOW_POINTS, max(STEADY_POINTS, AUTO_WINDOW_ROWS // len(system.instances)))
-    return max(16, min(points, AUTO_WINDOW_BYTES // max(widest, 1)))
+    return max(_LEAST_POINTS, min(points, _ROOM_BYTES // widest))
+
+
+def rows_for(rows: int) -> int:
+    """Number of rows of a ring whose writer may be ``rows`` ahead without overwriting a row in use."""
+    return 1 << (rows + 3).bit_length()
+
+
+def rows_of_ring(layout: Layout, needed: int = 0, most: int = RECORDER_WINDOW) -> int:
+    """Number of rows of a ring.
+
+    Args:
+        layout: of its rows.
+        needed: how many rows the readers may be behind.
+        most: with how many rows the readers look less often; as many as take little memory.
+    """
+    return rows_for(max(needed, min(most, _ROOM_BYTES // row_bytes(layout))))

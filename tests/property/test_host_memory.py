@@ -35,7 +35,7 @@ LONG_S = 30.0
 
 
 def mapped(rows: int = 16) -> tuple[MemoryMap, RingPlace]:
-    map_, places = map_memory(["a", "b", RECORDER, MASTER], {"i": ("a", 1, LAYOUT)}, rows)
+    map_, places = map_memory(["a", "b", RECORDER, MASTER], {"i": ("a", 1, LAYOUT, rows)})
     return map_, places["i"]
 
 

@@ -324,7 +324,7 @@ def link_of(layout: Layout, step_points: int = 1) -> Link:
 
 def mirrored(layout: Layout, step_points: int = 1) -> tuple[FrameReceiver, Ring]:
     """A receiver, and the mirror of 16 rows that it fills."""
-    map_, places = map_memory(["target", MASTER], {"source": ("source", step_points, layout)}, 16)
+    map_, places = map_memory(["target", MASTER], {"source": ("source", step_points, layout, 16)})
     memory, place = HostMemory.private(map_, "target"), places["source"]
     mirror = memory.ring(place)
     return FrameReceiver(link_of(layout, step_points), mirror, memory.counter(place.counter)), mirror

@@ -35,7 +35,7 @@ class Receiver:
     """A `FrameReceiver` with a mirror of four rows; ``kept`` is the first row that a step still needs."""
 
     def __init__(self) -> None:
-        map_, places = map_memory(["right", MASTER], {"source": ("left", 2, LAYOUT)}, 4)
+        map_, places = map_memory(["right", MASTER], {"source": ("left", 2, LAYOUT, 4)})
         memory = HostMemory.private(map_, "right")
         self.mirror = memory.ring(places["source"])
         counter = memory.counter(places["source"].counter)
@@ -110,7 +110,7 @@ def test_a_frame_that_would_overwrite_a_row_in_use_ends_the_run(receiver: Receiv
 
 def test_where_a_ring_is_shared_only_its_text_comes_in_frames() -> None:
     layout = Layout.of([("a", "Float64"), ("s", "String")])
-    map_, places = map_memory(["right", MASTER], {"source": ("left", 2, layout)}, 4)
+    map_, places = map_memory(["right", MASTER], {"source": ("left", 2, layout, 4)})
     shared, own = HostMemory.private(map_, "right"), HostMemory.private(map_, "right")
     place, link = places["source"], Link(3, "source", "left", "right", 2, layout, (0, -1))
 
@@ -210,7 +210,7 @@ def test_an_initial_message_gives_the_values_of_its_level() -> None:
 @pytest.mark.parametrize(("step", "sent"), [(9, 0), (10, 11)], ids=["before", "at the end"])
 def test_rows_for_the_recorder_wait_for_more_rows_unless_no_more_will_come(step: int, sent: int) -> None:
     """Nothing wakes up a node that is done, so rows that wait there would delay the end of the run."""
-    map_, places = map_memory(["left", MASTER], {"source": ("left", 1, LAYOUT)}, 16)
+    map_, places = map_memory(["left", MASTER], {"source": ("left", 1, LAYOUT, 16)})
     memory, place = HostMemory.private(map_, "left"), places["source"]
     ring, messages = memory.ring(place), list[bytes]()
     plan = SimpleNamespace(name="source", step_points=1, inputs=Layout(), input_row=Layout(), finite=())

@@ -108,7 +108,7 @@ def runner_of(instance: Instance) -> tuple[Runner, Position]:
     """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])
     plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
-    map_, places = map_memory(["gain", MASTER], {"gain": ("gain", 1, outputs)}, 64)
+    map_, places = map_memory(["gain", MASTER], {"gain": ("gain", 1, outputs, 64)})
     memory = HostMemory.private(map_, "gain")
     ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
     runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), ring, counter)

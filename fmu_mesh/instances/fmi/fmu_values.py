@@ -126,7 +126,6 @@ class FmuValues(ABC):
         self._step_size = points * grid.step_size
         self._said.note(step=step)
         self._input_mask = inputs.mask
-        self._output_mask = outputs[0].mask
         self._keep = [inputs, *outputs]
         self._setters = self._part_calls("Set", inputs, RowBase.FIXED)
         getters = [
@@ -215,8 +214,8 @@ class FmuValues(ABC):
 
     def _read_outputs(self, step: int) -> None:
         """Write the outputs to row ``step``, call by call."""
-        slot = step & self._output_mask
         for part in self._getters:
+            slot = step & (len(part.array) - 1)
             if part.buffer is None:
                 self._call_part("Get", part, slot)
             else:

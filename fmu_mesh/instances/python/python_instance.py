@@ -129,16 +129,16 @@ class PythonInstance:
         self._start_time, self._base_step_size = grid.start_time, grid.step_size
         self._points = points
         self._step_size = points * grid.step_size
-        self._input_mask, self._output_mask = inputs.mask, outputs[0].mask
+        self._input_mask = inputs.mask
         self._reads = [(name, reader(inputs, self._variables[name])) for name in inputs.layout.names]
-        self._writes: list[tuple[str, Callable[[int, object], None]]] = [
-            (name, writer(ring, self._variables[name])) for ring in outputs for name in ring.layout.names
+        self._writes: list[tuple[str, Callable[[int, object], None], int]] = [
+            (name, writer(ring, self._variables[name]), ring.mask) for ring in outputs for name in ring.layout.names
         ]
         values = (
-            dict(zip(names, self.get_values(names), strict=True)) if (names := [n for n, _ in self._writes]) else {}
+            dict(zip(names, self.get_values(names), strict=True)) if (names := [n for n, *_ in self._writes]) else {}
         )
-        for name, write in self._writes:
-            write(step & self._output_mask, as_attribute(values[name], self._variables[name]))
+        for name, write, mask in self._writes:
+            write(step & mask, as_attribute(values[name], self._variables[name]))
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, call `step` of the component, write its outputs to row ``step + 1``.
@@ -157,10 +157,10 @@ class PythonInstance:
             raise self._failed(error) from error
         if self._lent:
             self._imported.modules.forget_names()
-        slot = (step + 1) & self._output_mask
-        for name, write in self._writes:
+        row = step + 1
+        for name, write, mask in self._writes:
             try:
-                write(slot, values[name])
+                write(row & mask, values[name])
             except KeyError:
                 raise self._never_assigned(name) from None
             except ValueRefused as refused:
