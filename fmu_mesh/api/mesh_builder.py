@@ -377,6 +377,7 @@ class Mesh:
             system = run.plan.system
             models = {name: (Path(one.fmu), one.description) for name, one in system.instances.items()}
             check_engines(system.config.instances, models, system.config.limits, str(file))
+            run.check_memory()
         except ConfigurationError as error:
             return Check(str(file), error, run)
         return Check(str(file), run=run)

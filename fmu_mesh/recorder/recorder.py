@@ -174,7 +174,6 @@ class Recorder:
 
     def _source(self, link: Link, shares: Collection[str]) -> RecordedSource:
         """Where the rows of an instance are: in its ring, in a mirror that frames fill, or text in the mirror."""
-
         place = next(place for place in self._plan.rings if place.instance == link.source)
 
         def fits(end: int) -> bool:

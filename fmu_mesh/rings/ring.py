@@ -99,7 +99,7 @@ class Ring:
             return element
         return nested(self.parts[part][row & self.mask, first : first + size].tolist(), shape)
 
-    def put(self, row: int, name: str, value: Value) -> None:
+    def put(self, row: int, name: str, value: Value | NDArray[Any]) -> None:
         """Write a value that the type can hold to a column of ``row``, or to one element of it; an array also of numpy.
 
         A value beyond the range of a Float32 becomes infinite, as in C.

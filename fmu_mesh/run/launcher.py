@@ -105,6 +105,7 @@ class Launcher:
         Raises:
             FmuMeshError: the run ended early, and why.
         """
+        self._run.check_memory()
         remove_stale_folders()
         self._folder = run_folder(self._run.mesh, self._run.run)
         try:

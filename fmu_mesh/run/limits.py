@@ -1,4 +1,4 @@
-"""The limit of the address space (`ulimit -v`): checks before a command starts that it is large enough.
+"""The limits of memory: checks before a command starts that the address space (`ulimit -v`) and the memory are enough.
 
 With too little, each library fails in its own way: a traceback of an import, a panic, an abort. Knows only the name of
 a command and imports nothing large, so that the check itself works.
@@ -7,11 +7,15 @@ a command and imports nothing large, so that the check itself works.
 from __future__ import annotations
 
 import errno
+import re
 import resource
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
 
 from ..errors import ConfigurationError
 
-__all__ = ["FEWEST_MIB", "RUN_MIB", "address_space_problem", "needed_mib", "out_of_memory"]
+__all__ = ["FEWEST_MIB", "RUN_MIB", "address_space_problem", "needed_mib", "out_of_memory", "ring_problem"]
 
 FEWEST_MIB = 300
 """Need of any command in MiB. Measured on two processors: `check` 200, `plot` 270."""
@@ -62,6 +66,37 @@ def out_of_memory(error: BaseException) -> ConfigurationError | None:
     if limit is None:
         return ConfigurationError("there is not enough memory for this on this host")
     return ConfigurationError(f"{_limited(limit)}, and that was not enough", hint=_WAY_OUT)
+
+
+def ring_problem(rings: Mapping[str, tuple[int, int]]) -> ConfigurationError | None:
+    """The error if rings do not fit into the memory of this host, with the largest one; None if they do.
+
+    Args:
+        rings: number of rows, and size of a row in bytes, by instance.
+    """
+    sizes = {name: rows * size for name, (rows, size) in rings.items()}
+    needed, available = sum(sizes.values()), _available()
+    if available is None or needed <= available:
+        return None
+    name = max(sizes, key=sizes.__getitem__)
+    rows, size = rings[name]
+    text = (
+        f"the rings of this run need {_gigabytes(needed)}, and this host has {_gigabytes(available)} for them: "
+        f"the ring of '{name}' needs {_gigabytes(sizes[name])} ({rows} rows of {_gigabytes(size)})"
+    )
+    hint = "Set `simulation.window` to 1, connect or record smaller arrays, or use `--local`, which needs a few rows."
+    return ConfigurationError(text, hint=hint)
+
+
+def _available() -> int | None:
+    """The memory in bytes that processes can get here: of the host, or of its control group; None: not known."""
+    found = []
+    with suppress(OSError):
+        found += [int(kib) << 10 for kib in re.findall(r"MemAvailable: +(\d+)", Path("/proc/meminfo").read_text())]
+    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):  # `max`: there is none
+            found.append(int(Path(limit).read_text()))
+    return min(found, default=None)
 
 
 def _limit() -> int | None:

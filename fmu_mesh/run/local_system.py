@@ -259,8 +259,9 @@ class _Member:
         self.instance = instance
         self._inputs = Ring(self.plan.input_row, 1)
         # A slower instance reads values that are as old as its own step.
-        oldest = max(instance.step_points for instance in plan.system.instances.values())
-        self._outputs = Ring(self.plan.outputs, 1 << (2 * oldest).bit_length())
+        readers = {c.target_instance for c in plan.connections if c.source_instance == name} | {name}
+        oldest = max(plan.system.instances[reader].step_points for reader in readers)
+        self._outputs = Ring(self.plan.outputs, 1 << (2 * -(-oldest // self.plan.step_points)).bit_length())
         self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs)
         self._looks_at_rows = True
         self._points = self.plan.step_points

@@ -17,9 +17,11 @@ from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError
 from ..instances.contract import Showing
 from ..instances.registry import decode_section
+from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
 from ..text import listed, nearest
 from ..variables.model_description import ModelDescription
+from .limits import ring_problem
 from .options import Options
 
 __all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "read_node", "read_run"]
@@ -110,6 +112,18 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         own = self.loaded.config.zenoh
         return replace(own, mode="client") if self.run == MANUAL and own.connect and not listen else own
+
+    def check_memory(self) -> None:
+        """Check that the rings between the processes of this run fit into the memory of this host.
+
+        Raises:
+            ConfigurationError: they do not; names the largest one.
+        """
+        places = (place for node in self.plan.nodes.values() for place in node.rings)
+        last = self.plan.grid.last_point
+        rings = {p.instance: (min(p.rows, last // p.step_points + 2), row_bytes(p.layout)) for p in places}
+        if (problem := ring_problem(rings)) is not None:
+            raise problem
 
     def node(self, name: str) -> NodeRun:
         """What the node ``name`` needs; a node with one instance and no group has the name of the instance.

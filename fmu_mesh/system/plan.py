@@ -270,8 +270,8 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
         # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).
         # A target may be one own step behind the progress it has told.
         behind = (windows[RECORDER] if name in recorded else plan.window) + 3 * longest_step
-        rows = rows_of_ring(outputs[name], -(-behind // own.step_points), max(windows.values()))
-        rings[name] = own.node, own.step_points, outputs[name], rows
+        count = rows_of_ring(outputs[name], -(-behind // own.step_points), max(windows.values()))
+        rings[name] = own.node, own.step_points, outputs[name], count
     memory, places = map_memory([*windows, MASTER], rings)
     nodes = {}
     for node in windows:
