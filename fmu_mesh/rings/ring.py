@@ -91,6 +91,11 @@ class Ring:
         """The memory of all rows as numbers of a float type."""
         return memoryview(self._flat.view(DTYPES[type_]).data)
 
+    def array(self, name: str) -> NDArray[Any]:
+        """The elements of a column in all slots, of shape (rows, *shape)."""
+        part, first, size, shape = self._place(name)
+        return self.parts[part][:, first : first + size].reshape(self.rows, *shape)
+
     def value(self, row: int, name: str) -> Value:
         """The value of a column of ``row``, or of one element of it, as a Python object."""
         part, first, size, shape = self._place(name)
@@ -118,11 +123,11 @@ class Ring:
 
         Of an array it is a view of the row, which a later row overwrites.
         """
-        part, first, size, shape = self._place(name)
+        part, first, _, shape = self._place(name)
         mask, width, start = self.mask, *self._in_numbers(part)
         if shape:
-            array: Any = self.parts[part]
-            return lambda row: array[row & mask, first : first + size].reshape(shape)
+            array: Any = self.array(name)
+            return lambda row: array[row & mask]
         if self._types[part] != "Float64":
             return lambda row: self.value(row, name)
         first += start
@@ -133,15 +138,18 @@ class Ring:
         """`put` of one column as a function of row and value: the fast way for a caller that writes at every point."""
         part, first, _, shape = self._place(name)
         mask, width, start = self.mask, *self._in_numbers(part)
-        if self._types[part] != "Float64" or shape:
+        if self._types[part] in ("Float32", "String", "Binary") or (self._types[part] != "Float64" and not shape):
             return lambda row, value: self.put(row, name, value)
         first += start
-        memory: Any = self._flat.view(np.float64).data
+        memory: Any = self._flat.view(np.float64).data if not shape else self.array(name)
 
         def write(row: int, value: Value) -> None:
             memory[(row & mask) * width + first] = value
 
-        return write
+        def write_array(row: int, value: Value) -> None:
+            memory[row & mask] = value
+
+        return write_array if shape else write
 
     def _in_numbers(self, part: int) -> tuple[int, int]:
         """The distance of two rows, and the place of a part in a row, in numbers of eight bytes."""

@@ -43,9 +43,10 @@ def as_value(attribute: object, variable: Variable) -> Value:
 def reader(ring: Ring, variable: Variable) -> Callable[[int], Any]:
     """A function that returns the value of an input, as the component sees it, from a slot of a ring."""
     place = ring.layout.place(variable.name)
-    part, first, end, shape = ring.parts[place.part], place.first, place.first + place.size, place.shape
-    if shape:
-        return lambda slot: part[slot, first:end].reshape(shape).copy()
+    part, first = ring.parts[place.part], place.first
+    if place.shape:
+        array = ring.array(variable.name)
+        return lambda slot: array[slot].copy()
     if variable.type != "Float64":
         return lambda slot: part.item(slot, first)
     memory = _memory(part)
@@ -59,12 +60,13 @@ def writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
         ValueRefused: by the function: it is no value of the variable's type and shape.
     """
     place = ring.layout.place(variable.name)
-    part, first, end, shape = ring.parts[place.part], place.first, place.first + place.size, place.shape
+    part, first = ring.parts[place.part], place.first
 
-    if shape:
+    if place.shape:
+        array = ring.array(variable.name)
 
         def write_array(slot: int, attribute: object) -> None:
-            part[slot, first:end] = _array(attribute, variable).reshape(-1)
+            array[slot] = _array(attribute, variable)
 
         return write_array
 
