@@ -22,6 +22,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from ..config.findings import Findings
 from ..errors import ConfigurationError
 from ..files import Kept, exists, is_file
 from ..rings.library import load_library
@@ -72,6 +73,11 @@ class CsvFile(BlockFile):
         self._lines: Callable[[Sequence[NDArray[Any]]], bytes | memoryview] = (
             python_lines if has_text or _native() is None else NativeLines(1 + len(columns), self._block_rows)
         )
+
+    @classmethod
+    def check(cls, recording: Recording, findings: Findings) -> None:
+        """Check that no array is too large."""
+        recording.check_arrays(findings)
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:

@@ -6,7 +6,7 @@ Looks at the blocks of rows that are written, so it costs a step nothing. Knows 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -28,6 +28,8 @@ _FIRST_PART: Final = 0.05
 _FIRST_POINTS: Final = 1000
 """The points that show the scale of a value: a part of the run, or this many where it has no end."""
 
+_BLOCK_NUMBERS: Final = 1 << 18
+
 
 class _Crossing(NamedTuple):
     point: int
@@ -41,21 +43,18 @@ class _Column:
         self.name = name
         self.instance = instance
         self.scale = given
-        self._read = read
+        self.read = read
         self._crossings: list[_Crossing] = []
 
-    def learn(self, first: int, end: int) -> None:
-        """Take the points first to end - 1 as a part of its normal size."""
-        values = self._read(first, end)
-        sizes = np.abs(values[np.isfinite(values)])
-        self.scale = max(self.scale, float(sizes.max(initial=0.0)))
+    def learn(self, size: float) -> None:
+        """Take the size of a value as a part of its normal size."""
+        self.scale = max(self.scale, size)
 
-    def look(self, first: int, end: int) -> tuple[_Crossing, ...] | None:
-        """All crossings, once it has crossed all steps."""
-        values, crossings = self._read(first, end), self._crossings
-        most = max(float(values.max()), -float(values.min()))
+    def look(self, first: int, values: NDArray[np.float64], most: float) -> tuple[_Crossing, ...] | None:
+        """All crossings, once it has crossed all steps; ``most`` is the largest size of these values."""
+        crossings = self._crossings
         while most > (limit := self.scale * _STEPS[len(crossings)]):
-            place = int((np.abs(values.astype(np.float64)) > limit).argmax())
+            place = int((np.abs(values) > limit).argmax())
             crossings.append(_Crossing(first + place, abs(float(values[place]))))
             if len(crossings) == len(_STEPS):
                 return tuple(crossings)
@@ -101,17 +100,30 @@ class GrowthWatch:
             return
         normal = min(max(self._normal, first), end)
         if first < normal:
-            for column in self._columns:
-                column.learn(first, normal)
+            for columns, values in self._blocks(first, normal):
+                sizes = np.abs(values)
+                sizes[~np.isfinite(sizes)] = 0.0
+                for column, size in zip(columns, sizes.max(axis=1).tolist(), strict=True):
+                    column.learn(size)
         if normal < end:
             found = [
                 (crossings[-1].point, column, crossings)
-                for column in self._columns
-                if (crossings := column.look(normal, end)) is not None
+                for columns, values in self._blocks(normal, end)
+                for column, own, most in zip(
+                    columns, values, np.maximum(values.max(axis=1), -values.min(axis=1)).tolist(), strict=True
+                )
+                if (crossings := column.look(normal, own, most)) is not None
             ]
             if found:
                 _, column, crossings = min(found, key=lambda item: item[0])
                 self.warnings = (self._told(column, *crossings),)
+
+    def _blocks(self, first: int, end: int) -> Iterator[tuple[Sequence[_Column], NDArray[np.float64]]]:
+        """The columns and their values at the points first to end - 1, of some columns at a time."""
+        count = max(1, _BLOCK_NUMBERS // (end - first))
+        for start in range(0, len(self._columns), count):
+            columns = self._columns[start : start + count]
+            yield columns, np.array([column.read(first, end) for column in columns], np.float64)
 
     def _told(self, column: _Column, begun: _Crossing, fast: _Crossing, far: _Crossing) -> str:
         time, points, ratio = self._plan.grid.time, far.point - fast.point, far.value / fast.value

@@ -98,9 +98,10 @@ class ParquetFile:
         self._stream_only = False  # the draft could not be written
 
     @classmethod
-    def check(cls, recording: Recording, findings: Findings) -> None:  # noqa: ARG003  it can hold values of all types
-        """Check that pyarrow is installed."""
+    def check(cls, recording: Recording, findings: Findings) -> None:
+        """Check that pyarrow is installed, and that no array is too large."""
         pyarrow_module()
+        recording.check_arrays(findings)
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:

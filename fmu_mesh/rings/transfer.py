@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,24 +140,15 @@ class Transfer:
         return moves
 
 
-class _Copy:
+class _Copy(NamedTuple):
     """Columns of one part of the source rows for columns of one part of the row of inputs."""
 
-    def __init__(  # noqa: PLR0913, PLR0917  places of both ends, and what happens between them
-        self,
-        source_part: int,
-        source_columns: Index,
-        part: NDArray[Any],
-        columns: Index,
-        scale: tuple[Any, Any] | None,
-        change: ValueChange | None,
-    ) -> None:
-        self.source_part = source_part
-        self.source_columns = source_columns
-        self.part = part
-        self.columns = columns
-        self.scale = scale
-        self.change = change
+    source_part: int
+    source_columns: Index
+    part: NDArray[Any]
+    columns: Index
+    scale: tuple[Any, Any] | None
+    change: ValueChange | None
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
         """``values * factor + offset`` in Float64, with one rounding each; for a Float32 the result is rounded again.

@@ -259,12 +259,11 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     system, config = plan.system, plan.system.config
     node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
     links = _links(plan)
+    recorded = {link.source for link in links if link.target_node == RECORDER}
     windows = dict.fromkeys(node_names, plan.window)
     if system.records:
-        rows = [row_bytes(link.layout) for link in links if link.target_node == RECORDER]
-        windows[RECORDER] = recorder_window(plan.window, rows)
+        windows[RECORDER] = recorder_window(plan.window, [row_bytes(outputs[name]) for name in recorded])
     longest_step = max(instance.step_points for instance in system.instances.values())
-    recorded = {link.source for link in links if link.target_node == RECORDER}
     rings = {}
     for name, own in system.instances.items():
         # A source may be two own steps beyond the grant (the step it takes, and the step for which it holds its value).

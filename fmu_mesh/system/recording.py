@@ -6,6 +6,7 @@ the dot. CSV, Parquet and MCAP are found in the same way. `docs/extending.md` sh
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,6 +55,9 @@ _OTHER_FORMATS = frozenset(
 )
 """Endings of known formats that nobody may have installed. The programs for them could not open a CSV."""
 
+_MOST_ELEMENTS = 10_000
+"""How many elements of an array may be columns: a file with more takes seconds per row, and few programs open it."""
+
 
 class Recording(msgspec.Struct, frozen=True):
     """What a run records into one file.
@@ -86,6 +90,18 @@ class Recording(msgspec.Struct, frozen=True):
             assert variable is not None  # the system is valid
             columns.append((f"{instance}.{name}", variable.type))
         return columns
+
+    def check_arrays(self, findings: Findings) -> None:
+        """Add a finding for each array that is too large for a file with a column for each element."""
+        known = ((own, name, self.descriptions[own].variable_of(name)) for own, name in self.recorded)
+        arrays = Counter(f"{own}.{variable.name}" for own, _, variable in known if variable and variable.shape)
+        for array, count in arrays.items():
+            if count > _MOST_ELEMENTS:
+                found = f"{count:,} elements of '{array}', for which this format has a column each"
+                expected = (
+                    f"at most {_MOST_ELEMENTS:,} elements, a file ending in .mcap, or variables without '{array}'"
+                )
+                findings.add(f"{self.place}.variables", found, expected)
 
 
 class Columns(NamedTuple):

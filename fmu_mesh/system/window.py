@@ -43,7 +43,7 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
 
     Args:
         window: window of the mesh in points.
-        row_sizes: row sizes of all recorded instances in bytes.
+        row_sizes: row sizes of the rings of all recorded instances in bytes.
     """
     return max(window, min(RECORDER_WINDOW, _ROOM_BYTES // max(sum(row_sizes), 1)))
 

@@ -12,6 +12,7 @@ import math
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..text import listed, nearest
 from .model_description import Variable
@@ -72,11 +73,21 @@ def to_value(plain: object, variable: Variable, *, finite: bool = False) -> Valu
     Raises:
         ValueRefused: it is no value of the variable's type and shape, or out of its range.
     """
+    if isinstance(plain, np.ndarray) and _is_value(plain, variable) and not (finite and not np.isfinite(plain).all()):
+        array: list[Any] = plain.tolist()
+        return array
     plain = plain.tolist() if isinstance(plain, np.ndarray | np.generic) else plain
     values = [_element(element, variable) for element in _elements(plain, variable, variable.shape)]
     if finite and not is_finite(values):
         raise ValueRefused(f"{plain!r} is not finite", expected=FINITE)
     return nested(values, variable.shape)
+
+
+def _is_value(array: NDArray[Any], variable: Variable) -> bool:
+    """Whether an array is a value as it is: of a type whose numbers are all allowed, and of the right shape."""
+    bounded = variable.minimum is not None or variable.maximum is not None
+    is_number = variable.type not in ("Enumeration", "String", "Binary")
+    return is_number and not bounded and array.dtype == DTYPES[variable.type] and array.shape == variable.shape != ()
 
 
 def is_finite(value: Value) -> bool:
