@@ -98,8 +98,11 @@ class RowBuffer:
         rows, self._waiting = self._waiting, []
         if not rows:
             return
-        columns = zip(zip(*rows, strict=True), self._types, strict=True)
-        self._arrays = [np.array(column, dtype=DTYPES[type_]) for column, type_ in columns]
+        if {*self._types} == {"Float64"}:  # one call for all columns, which may be the elements of large arrays
+            self._arrays = [*np.array(rows, dtype=np.float64).T]
+        else:
+            columns = zip(zip(*rows, strict=True), self._types, strict=True)
+            self._arrays = [np.array(column, dtype=DTYPES[type_]) for column, type_ in columns]
         try:
             self._files.write(self._first, self._first + len(rows))
         finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -162,7 +161,7 @@ def test_check_and_launch_say_which_ring_does_not_fit(tmp_path: Path, monkeypatc
     assert "the ring of 'camera' needs 29 MB (32 rows of 1 MB)" in said
     assert "`simulation.window` to 1" in said
     assert str(launched.value) == said
-    assert mesh.run(processes=False).outcome.point == 40
+    assert len(mesh.run(processes=False).times) == 41
 
 
 @pytest.mark.parametrize("file", ["fields.csv", "fields.parquet"])
@@ -193,11 +192,12 @@ def test_arrays_are_read_set_and_watched_while_a_mesh_runs(tmp_path: Path) -> No
     with mesh.start(stop_time=None, real_time_factor=1.0) as run:
         field = run.get("camera.field")
         sample = next(iter(run.watch("camera.unread")))
+        given = next(iter(run.watch("sum.u")))  # its ring has more rows than one of this width
         run.stop()
 
     assert len(field) == len(sample.value) == 10_000
     assert sample.value[0] == -(sample.point - 1) * 0.01
-    assert all(map(math.isfinite, sample.value))
+    assert given.value[0] == (((given.point - 1) * 0.01 * 0.5 + 0.1) * 1e200) * 1e-200
 
 
 def test_a_system_takes_an_array_of_numpy_as_it_is(tmp_path: Path) -> None:
