@@ -177,7 +177,10 @@ def test_a_file_with_columns_refuses_a_large_array(file: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("processes", [True, False])
-def test_an_element_that_is_not_finite_ends_the_run_with_its_name(processes: bool, tmp_path: Path) -> None:  # noqa: FBT001
+def test_an_element_that_is_not_finite_ends_the_run_with_its_name(
+    processes: bool,  # noqa: FBT001  a parameter of the test
+    tmp_path: Path,
+) -> None:
     mesh = mesh_of(tmp_path, 1_000)
 
     with pytest.raises(fmu_mesh.NotFinite) as error:
