@@ -88,13 +88,8 @@ class MasterServer:
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
         """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason."""
-        post, guard = self._inbox.post, self._inbox.refusals.guard
-
-        def take(query: zenoh.Query) -> None:
-            with guard(str(query.key_expr), query):
-                answer(query)
-
-        self._entities.append(self._session.declare_queryable(key, lambda query: post(lambda: take(query))))
+        take = self._inbox.refusals.answering(answer, self._inbox.post)
+        self._entities.append(self._session.declare_queryable(key, take))
 
     def show(self, what: Literal["info", "status", "plan", "log"], view: Callable[[], object]) -> None:
         """From now on queries of a key of the mesh are answered with a view."""

@@ -189,7 +189,8 @@ class NodeServer:
         for name in (instance.name for instance in self._plan.instances):
             root = self._keys.instance(name)
             self._entities.append(self._session.liveliness().declare_token(root))
-            self._entities.append(self._session.declare_queryable(f"{root}/**", partial(self._query_arrived, name)))
+            take = self._inbox.refusals.answering(partial(self._answers.answer, name), self._jobs.put)
+            self._entities.append(self._session.declare_queryable(f"{root}/**", take))
             # A log message must not be lost; the status is published again.
             for what, publishers, congestion_control in (
                 ("status", self._status_publishers, zenoh.CongestionControl.DROP),
@@ -198,13 +199,6 @@ class NodeServer:
                 publishers[name] = self._session.declare_publisher(
                     f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
                 )
-
-    def _query_arrived(self, name: str, query: zenoh.Query) -> None:
-        def answer() -> None:
-            with self._inbox.refusals.guard(str(query.key_expr), query):
-                self._answers.answer(name, query)
-
-        self._jobs.put(answer)
 
     # --- publishing
 

@@ -26,6 +26,10 @@ Message = tuple[str, int, int, int, int, bytes]
 """Sender, kind, link, count, point, and the whole message."""
 
 
+_MOST_AT_ONCE = 64
+"""Posted actions that run one after the other, before messages and grants get their turn."""
+
+
 class Sleeper(Protocol):
     """What the main thread may be in when there is something for it."""
 
@@ -73,9 +77,9 @@ class Inbox:
         before.ring_bell()
         sleeper.ring_bell()  # for what came meanwhile
 
-    def post(self, action: Callable[[], None]) -> None:
-        """From any thread: let the main thread run ``action`` when it next looks into the inbox."""
-        self._posted.append(action)
+    def post(self, action: Callable[[], None], *, first: bool = False) -> None:
+        """From any thread: let the main thread run ``action`` when it next looks into the inbox; ``first`` of all."""
+        (self._posted.appendleft if first else self._posted.append)(action)
         self._sleeper.ring_bell()
 
     def poll(self) -> Message | None:
@@ -121,8 +125,8 @@ class Inbox:
 
     def _run_posted(self) -> bool:
         """Run the posted actions; return whether there were any."""
-        found = bool(self._posted)
-        while self._posted:
+        found = min(len(self._posted), _MOST_AT_ONCE)
+        for _ in range(found):
             with self.refusals.guard("a query or a setting"):
                 self._posted.popleft()()
-        return found
+        return found > 0

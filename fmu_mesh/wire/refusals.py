@@ -6,7 +6,8 @@ Everything that an unknown sender can send is handled inside `Refusals.guard`, w
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import zenoh
@@ -19,6 +20,8 @@ log = logging.getLogger(__name__)
 
 _MOST_TOLD = 20
 _SHOWN_KEY = 120
+_MOST_WAITING = 1024
+"""Queries of one queryable that wait for an answer at most."""
 
 
 class Refusals:
@@ -60,6 +63,27 @@ class Refusals:
         except Exception as error:
             log.debug("refused", exc_info=True)
             self._refuse(key, f"it cannot be handled ({type(error).__name__}: {error})", query)
+
+    def answering(
+        self, answer: Callable[[zenoh.Query], None], post: Callable[[Callable[[], None]], None]
+    ) -> Callable[[zenoh.Query], None]:
+        """The callback of a queryable: ``post`` lets a thread ``answer`` its queries, of which only some may wait."""
+        waiting: deque[zenoh.Query] = deque()
+
+        def take() -> None:
+            query = waiting.popleft()
+            with self.guard(str(query.key_expr), query):
+                answer(query)
+
+        def arrived(query: zenoh.Query) -> None:
+            """On a thread of Zenoh, one query after the other."""
+            if len(waiting) >= _MOST_WAITING:
+                self._refuse(str(query.key_expr), f"{_MOST_WAITING} others wait for an answer", query)
+            else:
+                waiting.append(query)
+                post(take)
+
+        return arrived
 
     def _refuse(self, key: str, reason: str, query: zenoh.Query | None) -> None:
         self.add(key, reason)

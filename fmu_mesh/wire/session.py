@@ -43,6 +43,9 @@ LEASE_S = 30.0
 
 _STUCK_S = 4.0
 
+_LARGE_US = 2_000_000
+"""How long the pieces of one large sample or answer may wait for a client in all."""
+
 _OWN_SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
 _CANNOT_LISTEN = (
     ("Address already in use", "another process does", "End that process, or take another port; 0 is a free one."),
@@ -141,10 +144,24 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "open/return_conditions/connect_scouted": wiring.waits,
         "transport/link/tx/lease": round(1e3 * wiring.lease_s),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(1e6 * wiring.stuck_s),
-        # A slow subscriber must not delay other messages on its link: its samples are dropped at once (the default is
-        # to wait a millisecond for each). To drop fewer samples, the queue for streams has the largest possible size.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        # A slow subscriber must not delay other messages on its link: where a queue stays full for 5 ms, samples and
+        # answers are lost until some of it is read. For each piece of a large one the time doubles, up to a limit: an
+        # answer may be larger than the queue. To lose less, these queues have the largest possible size.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5_000,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": _LARGE_US,
         "transport/link/tx/queue/size/data_low": 16,
+        "transport/link/tx/queue/size/background": 16,
+        # Answers get what their question has: a queue of their own behind all other messages. An answer that
+        # waits for a client that does not read would stop the link on which it came, and with it frames and progress.
+        # `**` fits no key of the synchronization: their `@sync` is verbatim.
+        "qos/network": [
+            {
+                "messages": ["query"],
+                "key_exprs": ["**"],
+                "overwrite": {"priority": "background", "congestion_control": "drop"},
+                "flows": ["ingress"],
+            }
+        ],
         # Measured: with the implicit shared memory, Python is slower for messages of 3 kB and more.
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": True,

@@ -179,10 +179,12 @@ class MeshClient:
         for instance in dict.fromkeys(target.instance for target in targets):
             own = {target.key: target for target in targets if target.instance == instance}
             key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
-            for sample in self._ask(key, f"the values of instance '{instance}'"):
-                target = own.get(str(sample.key_expr))
-                if target is not None and (reading := reading_of(target, sample)) is not None:
-                    readings[target.key] = reading
+            # An answer may be lost where this process reads too slowly; it is asked for again.
+            for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
+                for sample in self._ask(asked, f"the values of instance '{instance}'"):
+                    target = own.get(str(sample.key_expr))
+                    if target is not None and (reading := reading_of(target, sample)) is not None:
+                        readings[target.key] = reading
         return [readings[target.key] for target in targets if target.key in readings]
 
     def set(self, target: Target, value: object, at: float | None = None) -> SetAnswer:
