@@ -38,7 +38,7 @@ from ..rings.host_memory import HostMemory, can_share
 from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
-from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json
+from ..wire.messages import FINISH, GRANT, PROGRESS, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
 from ..wire.session import RouterLink, tokens
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
@@ -171,7 +171,7 @@ class Master:
             if isinstance(self.ended_by, NotFinite):
                 raise self.ended_by
             self._enter("stopping")
-            self._members.send(FINISH, 0)
+            self._members.send(FINISH, self._last_point)
             self._wait_for(
                 lambda: len(self._reports) == len(self._nodes),
                 self._timeouts.stop + self._timeouts.terminate * self._most_instances,
@@ -220,7 +220,7 @@ class Master:
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted`."""
-        self._inbox.post(lambda: self._fail(Interrupted(reason)))
+        self._inbox.post(lambda: self._fail(Interrupted(reason)), first=True)
 
     # --- phases
 
@@ -341,8 +341,8 @@ class Master:
     def _take_report(self, query: zenoh.Query) -> None:
         node = RunKeys.node_in(str(query.key_expr))
         report, granting = decode_json(payload_of(query), NodeReport), self._granting
-        if report.node != node or not self._members.is_admitted(node):
-            raise MessageRefused("its sender has not registered")
+        if report.node != node or not self._members.is_of(node, sealed(report.secret)):
+            raise MessageRefused("its sender is not the process that has registered")
         error = from_report(report.error) if report.error is not None else None
         if isinstance(error, TerminationRequested) or (isinstance(error, NotFinite) and error.point):
             # Its node continues with its other instances, and reports again at the end.

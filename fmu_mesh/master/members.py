@@ -19,7 +19,7 @@ from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
-from ..wire.messages import HEADER, decode_json, encode_abort
+from ..wire.messages import HEADER, decode_json, encode_abort, sealed
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import tokens, undeclare_all
@@ -109,9 +109,9 @@ class Members:
             return f"node '{node}' is there already; two processes run it"
         return None
 
-    def is_admitted(self, node: str) -> bool:
-        """Whether this is a node of the run."""
-        return node in self._admitted
+    def is_of(self, node: str, opened: str) -> bool:
+        """Whether the sender of a message has registered as this node: it knows what the seal was made from."""
+        return node in self._admitted and sealed(opened) == self._admitted[node].seal
 
     def ready(self, query: zenoh.Query) -> None:
         """Store that a node is ready; `welcome` answers it.
@@ -120,10 +120,9 @@ class Members:
             MessageRefused: it is no such message, or not of a node of this run.
         """
         node = RunKeys.node_in(str(query.key_expr))
-        data = payload_of(query)
-        if node not in self._admitted or node in self._ready:
-            raise MessageRefused("its sender has not registered")
-        ready = decode_json(data, NodeReady)
+        ready = decode_json(payload_of(query), NodeReady)
+        if not self.is_of(node, ready.opened) or node in self._ready:
+            raise MessageRefused("its sender is not the process that has registered")
         self._ready[node] = (ready, query)
 
     def token_changed(self, sample: zenoh.Sample) -> None:

@@ -16,8 +16,10 @@ served by `fmu_mesh.node.node_server` from snapshots.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import zenoh
 
@@ -92,7 +94,6 @@ class Node:
         engine: makes the engine, as `make_engine` does.
 
     Attributes:
-        finished: whether all nodes have done all points: what an FMU does then changes no result.
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
 
     Call `run` once, from the main thread.
@@ -113,7 +114,7 @@ class Node:
         self._session = session
         self._open_instance = open_instance
         self._make_engine = engine
-        self.finished = False
+        self._finish_at: float = math.inf
         self._token_went = False
         self.failure_is_known = False
         self._clock = AwakeClock()
@@ -134,6 +135,11 @@ class Node:
         self.server = NodeServer(
             plan, session, self._inbox, self._activity, self._membership.report, on_hang, self._tell_set
         )
+
+    @property
+    def finished(self) -> bool:
+        """Whether all nodes have done all points, this one included: what an FMU does then changes no result."""
+        return self._engine is not None and self._engine.covered >= self._finish_at
 
     def run(self) -> None:
         """Load, initialize and step to the last point, then report to the master.
@@ -165,16 +171,13 @@ class Node:
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point or during the current wait."""
-        self._inbox.post(lambda: _raise(Interrupted(reason)))
+        self._inbox.post(lambda: _raise(Interrupted(reason)), first=True)
 
     def report_hang(self, error: FmuError) -> bool:
         """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""
         if not self._membership.lost_master:
-            if self._engine is None:
-                self._send_last_rows()
-            else:
-                with self._engine.sending:  # should the step end now, the main thread waits for this
-                    self._send_last_rows()
+            with self._engine.sending if self._engine is not None else nullcontext():
+                self._send_last_rows()  # should the step end now, the main thread waits for this
         return self.server.report_hang(error, self._patience_s())
 
     # --- before the first point
@@ -222,7 +225,6 @@ class Node:
             links.append(OutLink(link, layout, runner.outputs, put))
         self._receivers = connect(plan, self._runners, self._memory, self._own_memory, shares)
         self._put_progress = membership.sender(keys.progress(plan.node))
-        self._is_recorded = RECORDER in dict(plan.windows)
         self._put_set = membership.sender(keys.settings(plan.node))
 
     def _initialize(self) -> Engine:
@@ -327,7 +329,7 @@ class Node:
                 )
             self._memory.grant.raise_to(min(point, self._plan.grid.last_point))
         elif kind == FINISH:
-            self.finished = True
+            self._finish_at = point
         elif kind == ABORT:
             raise _Aborted(from_report(decode_abort(data)))
         else:
@@ -419,8 +421,7 @@ class Node:
 
     def _patience_s(self) -> float:
         """How long in s a report of a failure may take."""
-        stop_s = self._plan.timeouts.stop
-        return stop_s if self._membership.is_admitted else min(stop_s, _NO_MASTER_S)
+        return min(self._plan.timeouts.stop, math.inf if self._membership.is_admitted else _NO_MASTER_S)
 
     def _tell_end(self, error: FmuMeshError | None, timeout_s: float) -> None:
         point = min((runner.point for runner in self._runners.values()), default=0)
@@ -431,7 +432,7 @@ class Node:
 
     def _tell_set(self, value: SetValue) -> None:
         """Tell the recorder which value another program has set."""
-        if self._is_recorded:
+        if RECORDER in dict(self._plan.windows):
             self._put_set(encode_set(value))
 
     def _has_no_master(self) -> bool:

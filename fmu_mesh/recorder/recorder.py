@@ -7,6 +7,7 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -98,6 +99,7 @@ class Recorder:
         self._told = 0
         self._flushed = 0.0
         self._finished = False
+        self._finish_at: float = math.inf
         self._cause: BaseException | None = None
         self._ended: set[str] = set()
         self._inbox = Inbox(self._memory)
@@ -186,7 +188,7 @@ class Recorder:
 
     def _record(self) -> None:
         """Write rows when there are many, or every few milliseconds, and tell the progress."""
-        while not self._finished:
+        while not self._finished and self._written <= self._finish_at:
             message = self._inbox.poll()
             if message is None:
                 self._write_rows()
@@ -231,7 +233,7 @@ class Recorder:
     def _take_from_master(self, message: Message) -> None:
         kind = message[1]
         if kind == FINISH:
-            self._finished = True
+            self._finish_at = message[4]
         elif kind not in (GRANT, ABORT):  # why the run ends early comes from the master of this process: `__exit__`
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 

@@ -11,6 +11,7 @@ There are three steps; each is a query with an answer:
 from __future__ import annotations
 
 import os
+import secrets
 import socket
 import threading
 from collections.abc import Callable
@@ -20,13 +21,14 @@ from typing import Annotated, TypeVar
 
 import msgspec
 import zenoh
+from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, MeshLost, MessageRefused
 from ..rings.host_memory import HostMemory, Offer
 from ..system.plan import MASTER, RECORDER, NodePlan
 from .inbox import Inbox
 from .keys import RUN_ID_BYTES, Keys, RunKeys
-from .messages import NodeReport, decode_json
+from .messages import NodeReport, decode_json, sealed
 from .refusals import payload_of
 from .runtime import STOPPED, is_alive, is_stopped
 from .session import Question, RouterLink, ask, tokens
@@ -46,7 +48,9 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         launch: the launcher that started it; None if it was started manually.
-        session: the random id of its Zenoh session. Processes of two hosts may have one process id and one host name.
+        seal: the secret of the process, `sealed` twice. Its readiness contains the secret sealed once, and its report
+            the secret itself. So nobody can send them who has only read what came before. No other process has the
+            same one, while two hosts may have one process id and one host name.
     """
 
     node: str
@@ -54,7 +58,7 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     host: str
     launch: str | None = None
-    session: str = ""
+    seal: str = ""
 
 
 class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,9 +86,11 @@ class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         shared: whether it has opened the shared memory.
+        opened: what its seal was made from.
     """
 
     shared: bool = False
+    opened: str = ""
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -134,6 +140,7 @@ class Membership:
         self._session = session
         self._inbox = inbox
         self._launch = launch
+        self._secret = secrets.token_hex()
         self._public = Keys(plan.key_prefix, plan.mesh)
         self._keys: RunKeys | None = None
         self._admitted: Future[Admission] = Future()
@@ -256,7 +263,8 @@ class Membership:
             MeshLost: the master did not accept it in time, or this is not a node of its run.
         """
         key = self.keys(timeout_s).report(self._plan.node)
-        question = Question(key, "the master", timeout_s, msgspec.json.encode(report), priority=priority)
+        payload = msgspec.json.encode(replace(report, secret=self._secret))
+        question = Question(key, "the master", timeout_s, payload, priority=priority)
         ask(self._session, question, over)
 
     def open_memory(self) -> HostMemory | None:
@@ -287,7 +295,7 @@ class Membership:
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
             question = Question(keys.hello(node), f"node '{node}'", deadline_s, hello)
             ask(self._session, question, self._has_nothing_to_join)
-        ready = msgspec.json.encode(NodeReady(shared=self.memory is not None))
+        ready = msgspec.json.encode(NodeReady(self.memory is not None, sealed(self._secret)))
         question = Question(keys.ready(plan.node), "the master", 2 * deadline_s, ready)  # it waits for all others
         answer = ask(self._session, question, self._has_nothing_to_join)
         self._router.look()
@@ -307,8 +315,8 @@ class Membership:
     def _enter(self, on_master_gone: Callable[[], None]) -> Admission:
         """Register, then declare the token and `hello`: the master notices from now on if this process is lost."""
         plan, stack = self._plan, self._stack
-        host, own = socket.gethostname(), str(self._session.zid())
-        registration = Registration(plan.node, plan.digest, os.getpid(), host, self._launch, own)
+        seal, host = sealed(sealed(self._secret)), socket.gethostname()
+        registration = Registration(plan.node, plan.digest, os.getpid(), host, self._launch, seal)
         payload = msgspec.json.encode(registration)
         question = Question(self._public.register, "the master", plan.timeouts.start, payload)
         admission = _understood(ask(self._session, question, lambda: self.given_up), Admission)

@@ -8,6 +8,7 @@ ended early. Every decoder checks sizes before it reads anything, and raises onl
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from typing import Final, TypeVar
 
@@ -35,6 +36,7 @@ __all__ = [
     "decode_json",
     "encode_abort",
     "encode_set",
+    "sealed",
 ]
 
 HEADER: Final = struct.Struct("<BxxxIIxxxxq")
@@ -53,12 +55,20 @@ T = TypeVar("T")
 
 
 class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a node ended: at which point, with which error if any, and its profile if the master asked for one."""
+    """How a node ended.
+
+    Attributes:
+        point: where it ended.
+        error: why, if it is a failure, or if an FMU asked for it.
+        profile: what it has measured, if the master asked for it.
+        secret: `Membership.report` adds it; see `fmu_mesh.wire.membership.Registration`.
+    """
 
     node: str
     point: int
     error: ErrorReport | None = None
     profile: NodeProfile | None = None
+    secret: str = ""
 
 
 class SetValue(msgspec.Struct, frozen=True):
@@ -81,6 +91,11 @@ class SetValue(msgspec.Struct, frozen=True):
     time: float | None
     key: str
     who: str
+
+
+def sealed(secret: str) -> str:
+    """What tells nobody a secret, and shows who knows it."""
+    return hashlib.sha256(secret.encode()).hexdigest()
 
 
 def encode_abort(report: ErrorReport) -> bytes:

@@ -10,6 +10,7 @@ import fcntl
 import json
 import mmap
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,7 +31,7 @@ from fmu_mesh.run.options import Options
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
-from tests.helpers import DEADLINE_S, Launched, Place, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 
 WAYS = pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
 needs_memory = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")
@@ -66,7 +67,7 @@ class Stranger:
         return sum(int(json.loads(reply.ok.payload.to_bytes())["refused"]) for reply in replies if reply.ok is not None)
 
 
-def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, window: int = 256) -> Path:
+def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, **simulation: float) -> Path:
     """A cycle with a free input: frames go both ways, and something can be set."""
     return write_config(
         place.folder,
@@ -77,7 +78,7 @@ def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, wind
         },
         connections=("left.y -> right.x", "right.y -> left.u"),
         stop_time=stop_time,
-        simulation={"window": window},
+        simulation={"window": 256, **simulation},
         zenoh={"shared_memory": shared_memory},
     )
 
@@ -220,6 +221,129 @@ def test_what_is_right_in_every_respect_but_its_key_is_refused(place: Place, *, 
     assert_unharmed(place, config, launched)
 
 
+# ---- what only the process of a node knows
+
+
+@WAYS
+def test_no_stranger_reports_the_end_of_a_node(place: Place, *, shared_memory: bool) -> None:
+    config = config_of(place, shared_memory=shared_memory)
+    with paused(place, config) as (launched, stranger):
+        place.run("step", "pair", "500")
+        wait_until(lambda: json.loads(place.run("status", "pair", "--json").output)["point"] == 500, "point 500")
+        for point in (0, 100, 500, 1500, 2000):  # of the past, now, and beyond what is granted
+            for kind in ("TerminationRequested", "NotFinite", "StepFailed", "MeshLost"):
+                error = ErrorReport(kind, "that is all", 3, instance="left", point=point, time=point / 1000)
+                for report in (NodeReport("left", point, error), NodeReport("left", point)):
+                    [refusal] = stranger.ask(stranger.keys.report("left"), msgspec.json.encode(report))
+                    assert refusal == "its sender is not the process that has registered"
+        assert stranger.ask(stranger.keys.report("@record"), msgspec.json.encode(NodeReport("@record", 100)))
+        assert stranger.refused() >= 41
+    assert_unharmed(place, config, launched)
+
+
+def test_no_stranger_is_ready_instead_of_a_node(place: Place) -> None:
+    place.hold("node right")
+    config = config_of(place, shared_memory=True)
+    launched = place.start("launch", config, "--no-progress")
+    with place.session() as session:
+        stranger = Stranger(session, "pair")
+        token = stranger.keys.node("left")
+        wait_until(lambda: [*session.liveliness().get(token, timeout=DEADLINE_S)], "left, which waits for right")
+
+        assert stranger.ask(stranger.keys.ready("left"), b'{"shared":false}')
+
+        launched.child("right").resume()
+        assert launched.wait() == 0, launched.story()
+
+
+GATE = """
+import time
+from pathlib import Path
+import fmu_mesh
+
+class Gate(fmu_mesh.Component):
+    y = fmu_mesh.Output(start=0.0)
+
+    def step(self, now, step_size):
+        while now > 0.05 and not (Path(__file__).parent / "open").exists():
+            time.sleep(0.001)
+        self.y = now
+"""
+
+
+def test_progress_that_a_stranger_sends_makes_no_result_shorter(place: Place) -> None:
+    (place.folder / "gate.py").write_text(GATE)
+    instances = {"gate": {"python": "gate.py:Gate"}, "free": {"fmu": "Gain"}}
+    config = write_config(
+        place.folder, instances=instances, connections=(), stop_time=0.2, zenoh={"shared_memory": False}
+    )
+    launched = place.start("launch", config, "--no-progress")
+    with place.session() as session:
+        stranger = Stranger(session, "pair")
+        status = f"{stranger.public.root}/*/status"
+
+        def seen(text: bytes) -> bool:
+            return any(reply.ok and text in reply.ok.payload.to_bytes() for reply in session.get(status))
+
+        wait_until(lambda: seen(b'"point":200'), "'free' at the last point")
+        for node in ("gate", "@record"):
+            stranger.put(stranger.keys.progress(node), HEADER.pack(PROGRESS, 0, 0, 200))
+        wait_until(lambda: seen(b'"state":"stopping"'), "a master that believes it")
+    (place.folder / "open").touch()
+
+    assert launched.wait() == 0, launched.story()
+    assert config.with_suffix(".csv").read_bytes() == local_result(place, config)
+
+
+# ---- more than anybody needs
+
+FLOOD = """
+import json, sys, threading
+import zenoh
+
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+session = zenoh.open(config)
+open_queries = [session.get("**", zenoh.handlers.FifoChannel(1), timeout=600) for _ in range(10_000)]
+print("sent", flush=True)
+threading.Event().wait()
+"""
+
+
+@WAYS
+def test_ten_thousand_open_queries_of_a_client_that_does_not_read_end_no_run(
+    place: Place, *, shared_memory: bool
+) -> None:
+    config = config_of(place, shared_memory=shared_memory, stop_time=8.0, real_time_factor=1.0)
+    launched = place.start("launch", config, "--no-progress")
+    wait_until(lambda: row_count(config.with_suffix(".csv")), "the first row")
+    flood = place.start_command([sys.executable, "-c", FLOOD, place.note().endpoints[0]])
+    wait_until(lambda: "sent" in flood.output, "its queries")
+
+    assert launched.wait() == 0, launched.story()
+
+    flood.close()
+    config = config_of(place, shared_memory=shared_memory, stop_time=8.0)
+    assert config.with_suffix(".csv").read_bytes() == local_result(place, config)
+
+
+@WAYS
+def test_many_subscribers_and_tokens_of_a_stranger_do_no_harm(place: Place, *, shared_memory: bool) -> None:
+    config = config_of(place, shared_memory=shared_memory)
+    with paused(place, config) as (launched, stranger):
+        root, keys, session = stranger.public.root, stranger.keys, stranger.session
+        for key in (f"{root}/**", f"{root}/left/out/y", f"{keys.base}/**", f"{root}/mesh/log"):
+            for _ in range(500):
+                session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+        for number in range(500):
+            session.liveliness().declare_token(f"{root}/x{number}")
+            session.liveliness().declare_token(keys.node("left")).undeclare()
+            session.liveliness().declare_token(keys.node(f"x{number}"))
+    assert_unharmed(place, config, launched)
+
+
 # ---- what a registered peer may not send
 
 
@@ -253,15 +377,6 @@ def progress(stranger: Stranger) -> None:
         stranger.put(stranger.keys.progress(node), HEADER.pack(PROGRESS, 0, 0, 2000))
 
 
-def end(stranger: Stranger) -> None:
-    assert not stranger.ask(stranger.keys.report("left"), msgspec.json.encode(NodeReport("left", 2000)))
-
-
-def termination(stranger: Stranger) -> None:
-    error = ErrorReport("TerminationRequested", "that is all", 0, instance="left", point=1500, time=1.5)
-    assert not stranger.ask(stranger.keys.report("left"), msgspec.json.encode(NodeReport("left", 1500, error)))
-
-
 def too_many_rows(stranger: Stranger) -> None:
     rows = 1 << 17  # more than its ring has
     for index in range(5):
@@ -273,8 +388,6 @@ def too_many_rows(stranger: Stranger) -> None:
     [
         (grant, ("the master grants point 4611686018427387904 to node '", "which may be granted ")),
         (progress, ("says that it is at point 2000, and the master has granted point ",)),
-        (end, ("node 'left' says that it has ended at point 2000, and the master has granted point ",)),
-        (termination, ("node 'left' says that it has an FMU that ends the simulation at point 1500, and the master",)),
         (too_many_rows, ("'left' sends its values up to point 131071 to node 'right', more than was granted",)),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
