@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import json
 import re
-from collections.abc import Iterable, Sequence
+import subprocess
+import sys
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from .errors import ConfigurationError
@@ -13,9 +16,9 @@ from .printing import printable
 __all__ = [
     "EXPRESSION",
     "WILDCARDS",
-    "expression_of",
     "is_pattern",
     "listed",
+    "matched",
     "matching",
     "nearest",
     "nearest_file",
@@ -28,12 +31,21 @@ __all__ = [
 _LISTED_NAMES = 8
 _SHOWN_CHARACTERS = 60
 
+_REPETITION = re.compile(r"[*+?{]")
+_MATCHING = """
+import json, re, sys
+expression, names = json.load(sys.stdin)
+matches = re.compile(expression, re.DOTALL).fullmatch
+json.dump([name for name in names if matches(name)], sys.stdout)
+"""
+_MATCHING_S = 10.0
+"""How long all names may take."""
 
 EXPRESSION = "re:"
 """Begins a pattern of names that is a regular expression."""
 
-WILDCARDS = {"*": ".*", "?": "."}
-"""The signs of other patterns, and what they mean."""
+WILDCARDS = "*?"
+"""The signs of other patterns."""
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
@@ -113,23 +125,41 @@ def matching(text: str, names: Sequence[str]) -> list[str]:
     if not is_pattern(text):
         return []
     try:
-        matches = expression_of(text).fullmatch
+        found = matched(text, names)
     except ValueError as error:
         raise ConfigurationError(f"'{text}' is no regular expression: {error}.") from error
-    return [name for name in names if matches(name)]
+    return [name for name in names if name in found]
 
 
-def expression_of(pattern: str) -> re.Pattern[str]:
-    """What a pattern of names matches as a whole: `*` any characters, `?` one; after `re:` it is a regular expression.
+def matched(pattern: str, names: Collection[str]) -> set[str]:
+    """The names that a pattern matches as a whole: `*` any characters, `?` one; after `re:` it is a regular expression.
 
     Brackets belong to the names of variables, so these are not the patterns of `fnmatch`.
 
     Raises:
-        ValueError: it is no regular expression, or one that is too large.
+        ValueError: it is no regular expression, or one that is too large or takes too long.
     """
     if pattern.startswith(EXPRESSION):
         try:
-            return re.compile(pattern.removeprefix(EXPRESSION), re.DOTALL)
+            expression = re.compile(pattern.removeprefix(EXPRESSION), re.DOTALL)
         except (re.error, OverflowError, RecursionError) as error:
             raise ValueError(str(error)) from error
-    return re.compile("".join(WILDCARDS.get(sign) or re.escape(sign) for sign in pattern), re.DOTALL)
+        if len(_REPETITION.findall(expression.pattern)) > 1:
+            return _matched_in_time(expression.pattern, names)
+    else:
+        # The shortest text in front of each part is as good as any other, so no other has to be tried (`?>`).
+        first, *rest = ("".join("." if c == "?" else re.escape(c) for c in part) for part in pattern.split("*"))
+        tried = [f"(?>.*?{part})" for part in rest[:-1]] + [f".*{part}" for part in rest[-1:]]
+        expression = re.compile("".join((first, *tried)), re.DOTALL)
+    return {name for name in names if expression.fullmatch(name)}
+
+
+def _matched_in_time(expression: str, names: Collection[str]) -> set[str]:
+    """The names that an expression matches, found in a process of its own: some, as `(a*)*b`, take for ever."""
+    command, request = [sys.executable, "-ISc", _MATCHING], json.dumps([expression, [*names]])
+    try:
+        done = subprocess.run(command, input=request, capture_output=True, text=True, timeout=_MATCHING_S, check=True)
+    except (subprocess.SubprocessError, OSError) as error:
+        reason = f"it takes more than {_MATCHING_S:g} s" if isinstance(error, subprocess.TimeoutExpired) else str(error)
+        raise ValueError(reason) from error
+    return {*json.loads(done.stdout)}

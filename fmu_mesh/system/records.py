@@ -17,7 +17,7 @@ from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
 from ..simtime import TimeGrid, steps_between
-from ..text import EXPRESSION, expression_of, is_pattern, listed, nearest, short_number, shown
+from ..text import EXPRESSION, is_pattern, listed, matched, nearest, short_number, shown
 from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
@@ -226,7 +226,7 @@ def _add_matched(
     findings: Findings,
 ) -> None:
     """Add the columns of all variables that a pattern matches."""
-    pattern = _pattern(reference, place, findings)
+    pattern = _pattern(reference, place, variables, findings)
     if pattern is None:
         return
     found = _matched(pattern, variables)
@@ -282,7 +282,7 @@ def _resolved(
 class _Pattern(NamedTuple):
     """What a pattern matches: whole names `instance.variable`, of variables with one of the causalities."""
 
-    expression: re.Pattern[str]
+    names: set[str]
     causalities: tuple[Causality, ...]
 
 
@@ -301,11 +301,12 @@ def _parts(reference: str) -> tuple[str, str]:
     return (word, text) if colon and word in _PREFIXES else ("out", reference)
 
 
-def _pattern(reference: str, place: str, findings: Findings) -> _Pattern | None:
+def _pattern(reference: str, place: str, variables: Variables, findings: Findings) -> _Pattern | None:
     """The pattern that a text is; None after a finding."""
     word, text = _parts(reference)
+    every = [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}]
     try:
-        return _Pattern(expression_of(text), _PREFIXES[word])
+        return _Pattern(matched(text, every), _PREFIXES[word])
     except ValueError as error:
         findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
         return None
@@ -319,7 +320,7 @@ def _matched(pattern: _Pattern, variables: Variables) -> list[tuple[str, Variabl
         for variable in (own or {}).values()
         if variable.causality in pattern.causalities
         and not is_text(variable.type)
-        and pattern.expression.fullmatch(f"{instance}.{variable.name}")
+        and f"{instance}.{variable.name}" in pattern.names
     ]
 
 
@@ -329,9 +330,7 @@ def _nothing_matches(reference: str, pattern: _Pattern, place: str, variables: V
     every = [(f"{instance}.{v.name}", v) for instance, own in variables.items() for v in (own or {}).values()]
     names = [name for name, v in every if v.causality in pattern.causalities and not is_text(v.type)]
     texts = [
-        name
-        for name, v in every
-        if v.causality in pattern.causalities and is_text(v.type) and pattern.expression.fullmatch(name)
+        name for name, v in every if v.causality in pattern.causalities and is_text(v.type) and name in pattern.names
     ]
     others = [own for own in _PREFIXES if _matched(pattern._replace(causalities=_PREFIXES[own]), variables)]
     found = f"{shown(reference)}, which matches no {_WORDS[word]}"

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmu_mesh import text
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.recorder.csv_file import CsvFile
@@ -387,3 +388,18 @@ def test_a_level_of_logging_that_there_is_not_is_refused(
     assert capsys.readouterr().err == (
         "fmu-mesh: FMU_MESH_LOG is 'loud', which is no level. There are DEBUG, INFO, WARNING, ERROR and CRITICAL.\n"
     )
+
+
+def test_a_pattern_that_would_match_for_ever_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(text, "_MATCHING_S", 2.0)
+
+    with pytest.raises(ConfigurationError, match=r"'re:\(a\*\)\*b' is no regular expression: it takes more than 2 s"):
+        text.matching("re:(a*)*b", ["a" * 60])
+
+
+def test_a_pattern_with_many_stars_is_matched_at_once() -> None:
+    names = ["a" * 500, "a" * 500 + "b", "b"]
+
+    assert text.matching("*a" * 30 + "*b", names) == names[1:2]
+    assert text.matching("re:(a|b)*b", names) == names[1:]
+    assert text.matching("re:(a+)+b", names[1:]) == names[1:2]

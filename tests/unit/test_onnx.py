@@ -20,6 +20,7 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import InitializationFailed, LoadFailed, StepFailed
+from fmu_mesh.instances import child_question
 from fmu_mesh.instances.contract import Instance, KeepsState, Opening
 from fmu_mesh.instances.registry import KINDS, content, describe, open_instance
 from fmu_mesh.rings.ring import Ring
@@ -420,10 +421,48 @@ def test_inspect_shows_a_model_and_says_why_it_cannot(tmp_path: Path, capsys: py
 def test_without_onnxruntime_the_finding_says_what_to_install(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    (tmp_path / "onnxruntime.py").write_text("raise ImportError('not here')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
     assert main(["check", str(config_of(tmp_path))]) == 2
 
     told = capsys.readouterr().err
     assert "mesh.yaml:5: instances.policy.onnx: onnxruntime is not installed" in told
     assert "pip install 'fmu-mesh[onnx]'" in told
+
+
+# --- no end
+
+
+def write_endless(path: Path) -> Path:
+    """Write a model that computes for ever where its input is not above 0.5."""
+    nothing: list[onnx.NodeProto] = [
+        onnx.helper.make_node("Identity", [name], [f"next {name}"]) for name in ("goes on", "value")
+    ]
+    kinds = {"number": ("INT64", []), "goes on": ("BOOL", []), "value": ("FLOAT", [1])}
+    of = {
+        name: onnx.helper.make_tensor_value_info(name, getattr(onnx.TensorProto, kind), sizes)
+        for name, (kind, sizes) in {**kinds, **{f"next {name}": kind for name, kind in kinds.items()}}.items()
+    }
+    body = onnx.helper.make_graph(nothing, "body", [of[name] for name in kinds], [of["next goes on"], of["next value"]])
+    return write_model(
+        path,
+        [
+            ("Greater", ["limit", "x"], ["below"]),
+            ("Squeeze", ["below"], ["for ever"]),
+            ("Loop", ["", "for ever", "x"], ["y"], {"body": body}),
+        ],
+        {"x": ("FLOAT", [1])},
+        {"y": ("FLOAT", [1])},
+        {"limit": np.array([0.5], np.float32)},
+    )
+
+
+def test_a_model_that_computes_for_ever_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child_question, "_DEADLINE_S", 3.0)
+    path = write_endless(tmp_path / "endless.onnx")
+
+    with pytest.raises(LoadFailed) as caught:
+        describe(path, section_of(path))
+
+    assert f"onnxruntime, which loads and computes '{path}', did not end within 3 s" in str(caught.value)

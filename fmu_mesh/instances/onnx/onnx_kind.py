@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 
 from ... import files
@@ -18,9 +19,13 @@ from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotF
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
+from ..child_question import ask_child
 from ..contract import Instance, Kind, Opening
 
 __all__ = ["KIND_OF_ONNX_MODELS", "OnnxConfig"]
+
+_Answer = tuple[ModelDescription | None, str, str | None]
+"""A description, or why there is none, and what to do."""
 
 
 class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="onnx"):
@@ -47,10 +52,16 @@ class OnnxKind(Kind[OnnxConfig]):
         limits: LimitsConfig,
         tell: Callable[[str], None],  # noqa: ARG002  loading a policy is fast
     ) -> ModelDescription:
-        """Load the model and compute it twice; its inputs and outputs are the variables."""
-        from .onnx_model import OnnxModel  # noqa: PLC0415  onnxruntime is an extra, and slow to import
-
-        return OnnxModel(path, limits).description
+        """Load the model and compute it twice, in a child process; its inputs and outputs are the variables."""
+        request = msgspec.json.encode((str(path), limits)).decode()
+        output, ending = ask_child(__name__, request)
+        try:
+            answer: _Answer = msgspec.msgpack.decode(output, type=_Answer)
+        except msgspec.DecodeError:
+            raise LoadFailed(f"onnxruntime, which loads and computes '{path}', {ending}") from None
+        if answer[0] is None:
+            raise LoadFailed(answer[1], hint=answer[2])
+        return answer[0]
 
     def content(self, path: Path) -> str:
         """The SHA-256 of the file: nothing else is read."""
@@ -66,6 +77,18 @@ class OnnxKind(Kind[OnnxConfig]):
         except LoadFailed as error:
             raise LoadFailed(error.message, instance=opening.name, hint=error.hint) from error
         return OnnxInstance(opening.name, model, opening.section.not_finite)
+
+
+def answer_to(request: str) -> bytes:
+    """In the child process: the description of a model, or why there is none."""
+    from .onnx_model import OnnxModel  # noqa: PLC0415  onnxruntime is an extra, and slow to import
+
+    path, limits = msgspec.json.decode(request, type=tuple[str, LimitsConfig])
+    try:
+        answer: _Answer = (OnnxModel(Path(path), limits).description, "", None)
+    except LoadFailed as error:
+        answer = (None, error.message, error.hint)
+    return msgspec.msgpack.encode(answer)
 
 
 KIND_OF_ONNX_MODELS = OnnxKind()

@@ -5,12 +5,7 @@ Owns the request and the answer, for both sides.
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +14,13 @@ import msgspec
 from ... import __version__
 from ...errors import FmuMeshError, LoadFailed
 from ...variables.model_description import ModelDescription
+from ..child_question import ask_child, run_child
 from .component_description import check_arguments
 from .importing import ImportedComponent
 from .python_section import PythonConfig, class_place_of
 
 __all__ = ["answer_to", "ask_description"]
 
-_DEADLINE_S = 60.0
-_KILLED_S = 10.0
-_SHOWN_CHARACTERS = 300
 _VERSION = "import fmu_mesh; print(fmu_mesh.__version__)"
 
 
@@ -63,13 +56,13 @@ def ask_description(path: Path, section: PythonConfig) -> ModelDescription:
         raise LoadFailed("a folder" if path.is_dir() else "no such file")
     python = section.interpreter or sys.executable
     request = msgspec.json.encode(_Request(section.python, str(path), section.arguments)).decode()
-    code, output, errors = _run([python, "-Pm", __package__, request])
+    output, ending = ask_child(__name__, request, python)
     try:
         answer = msgspec.msgpack.decode(output, type=_Answer)
     except msgspec.DecodeError:
         if section.interpreter is not None:
             _check_version(python)
-        raise LoadFailed(f"its import {_ending(code)}{_last_words(errors)}") from None
+        raise LoadFailed(f"its import {ending}") from None
     if answer.version != __version__:
         raise _wrong_version(python, f"has fmu-mesh {answer.version}")
     if answer.description is None:
@@ -96,44 +89,13 @@ def _hint(error: BaseException) -> str | None:
     return error.hint if isinstance(error, FmuMeshError) else None
 
 
-def _run(command: Sequence[str]) -> tuple[int | None, bytes, bytes]:
-    """Run a command, which ends with this process; returns its exit code, output and errors.
-
-    The exit code is None if it did not end in time.
-    """
-    reading, writing = os.pipe()
-    try:
-        child = subprocess.Popen(
-            command, stdin=reading, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-        )
-    except OSError as error:
-        os.close(writing)
-        raise LoadFailed(f"the Python '{command[0]}' cannot be started: {error.strerror}") from error
-    finally:
-        os.close(reading)
-    try:
-        output, errors = child.communicate(timeout=_DEADLINE_S)
-    except subprocess.TimeoutExpired as late:
-        return None, b"", late.stderr or b""
-    else:
-        return child.returncode, output, errors
-    finally:
-        with suppress(ProcessLookupError):  # it and what it has started
-            os.killpg(child.pid, signal.SIGKILL)
-        os.close(writing)
-        child.wait(_KILLED_S)
-        for pipe in (child.stdout, child.stderr):
-            if pipe is not None:
-                pipe.close()
-
-
 def _check_version(python: str) -> None:
     """Check that a Python has our version.
 
     Raises:
         LoadFailed: it has another one, or none.
     """
-    _, output, _ = _run([python, "-c", _VERSION])
+    output, _ = run_child([python, "-c", _VERSION])
     version = output.decode(errors="replace").strip()
     if version != __version__:
         raise _wrong_version(python, f"has fmu-mesh {version}" if version else "has no fmu-mesh")
@@ -142,14 +104,3 @@ def _check_version(python: str) -> None:
 def _wrong_version(python: str, what: str) -> LoadFailed:
     hint = f"Install fmu-mesh {__version__} there: {python} -m pip install fmu-mesh=={__version__}"
     return LoadFailed(f"the Python '{python}' {what}", hint=hint)
-
-
-def _ending(code: int | None) -> str:
-    if code is None:
-        return f"did not end within {_DEADLINE_S:g} s"
-    return f"ended the process with exit code {code}" if code >= 0 else f"ended the process by signal {-code}"
-
-
-def _last_words(errors: bytes) -> str:
-    text = " ".join(errors.decode(errors="replace").split())
-    return f"; it wrote: {text[-_SHOWN_CHARACTERS:]}" if text else ""

@@ -1,0 +1,65 @@
+"""Asking a child process about a model: whatever a user wrote may hang or crash there while a run is planned.
+
+Owns the process and its deadline; a kind of instances knows the request and the answer.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+
+from ..errors import LoadFailed
+
+__all__ = ["ask_child", "run_child"]
+
+_DEADLINE_S = 60.0
+_KILLED_S = 10.0
+_SHOWN_CHARACTERS = 300
+
+
+def ask_child(module: str, request: str, python: str = sys.executable) -> tuple[bytes, str]:
+    """What ``answer_to`` of a module answers to a request in a child process, and as `run_child` how that ended."""
+    return run_child([python, "-Pm", __package__, module, request])
+
+
+def run_child(command: Sequence[str]) -> tuple[bytes, str]:
+    """The output of a command, which ends with this process, and in words how it ended.
+
+    Raises:
+        LoadFailed: it cannot be started.
+    """
+    reading, writing = os.pipe()
+    try:
+        child = subprocess.Popen(
+            command, stdin=reading, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        )
+    except OSError as error:
+        os.close(writing)
+        raise LoadFailed(f"the Python '{command[0]}' cannot be started: {error.strerror}") from error
+    finally:
+        os.close(reading)
+    try:
+        output, errors = child.communicate(timeout=_DEADLINE_S)
+    except subprocess.TimeoutExpired as late:
+        return b"", f"did not end within {_DEADLINE_S:g} s{_last_words(late.stderr or b'')}"
+    else:
+        code = child.returncode
+        how = f"with exit code {code}" if code >= 0 else f"by signal {-code}"
+        return output, f"ended the process {how}{_last_words(errors)}"
+    finally:
+        with suppress(ProcessLookupError):  # it and what it has started
+            os.killpg(child.pid, signal.SIGKILL)
+        os.close(writing)
+        child.wait(_KILLED_S)
+        for pipe in (child.stdout, child.stderr):
+            if pipe is not None:
+                pipe.close()
+
+
+def _last_words(errors: bytes) -> str:
+    text = " ".join(errors.decode(errors="replace").split())
+    return f"; it wrote: {text[-_SHOWN_CHARACTERS:]}" if text else ""
