@@ -30,6 +30,13 @@ def _add_foxglove(parser: CommandParser) -> None:
         "--port", type=port_number, default=_PORT, metavar="N", help=f"the port, 0 for a free one ({_PORT})"
     )
     parser.add_argument("--steer", action="store_true", help="clients may set inputs and parameters")
+    parser.add_argument(
+        "--origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="let pages of this origin connect, too, such as https://foxglove.example.org; may be repeated",
+    )
     parser.set_defaults(run_command=_foxglove)
 
 
@@ -47,11 +54,12 @@ def _foxglove(arguments: argparse.Namespace) -> int:
         host=arguments.host,
         port=arguments.port,
         read_only=not arguments.steer,
+        origins=tuple(arguments.origin),
     )
     if serving.leaves_host:
         can = "read" if serving.read_only else "read and set"
-        text = f"warning: whoever can reach this host at {serving.host}, port {serving.port} can {can} this mesh"
-        print(f"fmu-mesh: {text}", file=sys.stderr, flush=True)
+        who = f"whoever can reach this host at {serving.host}, port {serving.port} and knows the address"
+        print(f"fmu-mesh: warning: {who} can {can} this mesh; it is not encrypted", file=sys.stderr, flush=True)
     serve(serving, lambda text: print(text, flush=True))
     return 0
 

@@ -6,12 +6,16 @@ the SDK keeps a bounded number of messages for each, and drops the oldest ones o
 
 from __future__ import annotations
 
+import errno
+import secrets
+import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
+from urllib.parse import urlencode
 
 import foxglove
 from foxglove import Channel, ConnectionGraph, Context, Parameter, StatusLevel
@@ -23,6 +27,7 @@ from ..errors import ConfigurationError
 from ..wire.views import LogLine
 from .mesh_parameters import MeshParameters
 from .mesh_topics import STATUS_SCHEMA
+from .relay import Relay
 
 __all__ = ["PORT", "FoxgloveServer"]
 
@@ -51,32 +56,32 @@ class FoxgloveServer:
         name: what clients show as the name of the source.
         host: the address to listen at.
         port: 0 for a free one.
+        origins: further origins whose pages may connect.
 
     Attributes:
-        port: the port that it listens at.
-        url: where clients connect to.
+        url: where clients connect to; has a token.
 
     Raises:
         ConfigurationError: the port cannot be used.
     """
 
-    def __init__(self, name: str, host: str, port: int) -> None:
+    def __init__(self, name: str, host: str, port: int, origins: Iterable[str] = ()) -> None:
+        listener = _listening(host, port)
         self._context = Context()
         self._listener = _Requests()
-        try:
-            self._server = foxglove.start_server(
-                name=name,
-                host=host,
-                port=port,
-                capabilities=[Capability.Time, Capability.Parameters, Capability.ConnectionGraph],
-                server_listener=self._listener,
-                context=self._context,
-                message_backlog_size=_WAITING_MESSAGES,
-            )
-        except (RuntimeError, OSError, ValueError) as error:
-            raise _not_started(host, port, error) from error
-        self.port = self._server.port
-        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self.port}"
+        self._server = foxglove.start_server(
+            name=name,
+            host="127.0.0.1",
+            port=0,
+            capabilities=[Capability.Time, Capability.Parameters, Capability.ConnectionGraph],
+            server_listener=self._listener,
+            context=self._context,
+            message_backlog_size=_WAITING_MESSAGES,
+        )
+        token = secrets.token_urlsafe(24)
+        self._relay = Relay(listener, self._server.port, token, origins)
+        shown = f"[{host}]" if ":" in host else host
+        self.url = f"ws://{shown}:{listener.getsockname()[1]}/?token={token}"
         self._clock = threading.Lock()
         self._time_ns = -1
         self._told_at = 0.0
@@ -92,12 +97,13 @@ class FoxgloveServer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._relay.close()
         self._server.stop()
 
     @property
     def link(self) -> str:
         """The address of Foxglove in a browser with this server as its source."""
-        return self._server.app_url() or ""
+        return f"https://app.foxglove.dev?{urlencode({'ds': 'foxglove-websocket', 'ds.url': self.url})}"
 
     # --- one run
 
@@ -274,10 +280,17 @@ class _Requests(ServerListener):
             served.changed()
 
 
-def _not_started(host: str, port: int, error: Exception) -> ConfigurationError:
-    """The error of a server that cannot listen."""
-    reason = str(error).removeprefix("FoxgloveError: ").removeprefix("Failed to bind port: ")
-    if "in use" in reason:
-        text = f"port {port} of {host} is in use."
-        return ConfigurationError(text, hint="Take another one with --port; 0 takes any free one.")
-    return ConfigurationError(f"Foxglove cannot be served at {host}, port {port}: {reason}.")
+def _listening(host: str, port: int) -> socket.socket:
+    """A socket that listens.
+
+    Raises:
+        ConfigurationError: the port is in use, or the address is none of this host.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            text = f"port {port} of {host} is in use."
+            raise ConfigurationError(text, hint="Take another one with --port; 0 takes any free one.") from error
+        reason = error.strerror or str(error)
+        raise ConfigurationError(f"Foxglove cannot be served at {host}, port {port}: {reason}.") from error

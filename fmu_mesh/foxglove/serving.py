@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.waiting import appearance
 from .foxglove_server import PORT, FoxgloveServer
+from .relay import is_loopback
 from .shown_mesh import ShownMesh
 
 __all__ = ["Serving", "serve"]
@@ -33,6 +33,7 @@ class Serving(msgspec.Struct, frozen=True):
         host: the address to listen at.
         port: 0 for a free one.
         read_only: whether clients cannot set anything.
+        origins: further origins whose pages may connect.
     """
 
     mesh: str | None = None
@@ -42,14 +43,12 @@ class Serving(msgspec.Struct, frozen=True):
     host: str = "127.0.0.1"
     port: int = PORT
     read_only: bool = True
+    origins: tuple[str, ...] = ()
 
     @property
     def leaves_host(self) -> bool:
         """Whether other hosts can connect."""
-        try:
-            return not ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host != "localhost"
+        return not is_loopback(self.host)
 
 
 def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | None = None) -> None:
@@ -65,7 +64,7 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
     """
     mesh, stop = serving.mesh, stop or threading.Event()
     name = f"fmu_mesh: {mesh}" if mesh is not None else "fmu_mesh"
-    with FoxgloveServer(name, serving.host, serving.port) as server:
+    with FoxgloveServer(name, serving.host, serving.port, serving.origins) as server:
         say(f"Foxglove can connect to {server.url}, or open {server.link}")
         while not stop.is_set():
             mesh = _once(serving, mesh, server, say, stop)

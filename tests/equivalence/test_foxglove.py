@@ -7,9 +7,16 @@ import json
 import re
 import signal
 from pathlib import Path
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+from websockets.exceptions import InvalidHandshake
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from tests.foxglove_client import FoxgloveClient
-from tests.helpers import Launched, Place, assert_readable, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, Launched, Place, assert_readable, rows_of, wait_until, write_config
 
 TALKER = """
 import fmu_mesh
@@ -27,7 +34,9 @@ class Talker(fmu_mesh.Component):
 def start(place: Place, *arguments: str | Path) -> tuple[Launched, str]:
     """Start the command at a free port; returns it with the address of the server."""
     served = place.start("foxglove", *arguments, "--port", "0")
-    [url] = wait_until(lambda: re.findall(r"ws://127\.0\.0\.1:\d+", served.output)[:1], "the address of the server")
+    [url] = wait_until(
+        lambda: re.findall(r"ws://127\.0\.0\.1:\d+/\?token=[^\s,]+", served.output)[:1], "the address of the server"
+    )
     return served, url
 
 
@@ -229,9 +238,9 @@ def test_times_before_zero_are_shifted(place: Place) -> None:
 def test_wrong_usage_is_said_in_one_sentence(place: Place) -> None:
     place.start("launch", paced(place), "--no-progress")
     _, url = start(place, "pair")
-    port = url.rpartition(":")[2]
+    port = urlsplit(url).port
 
-    taken = place.run("foxglove", "pair", "--port", port)
+    taken = place.run("foxglove", "pair", "--port", str(port))
     pattern = place.run("foxglove", "pair", "--port", "0", "--variables", "pendulum.nothing")
     number = place.run("foxglove", "--port", "70000")
 
@@ -260,3 +269,48 @@ def test_other_hosts_are_warned_about(place: Place) -> None:
     served = place.start("foxglove", "--host", "0.0.0.0", "--port", "0")  # noqa: S104  that is what it warns about
 
     wait_until(lambda: "whoever can reach this host at 0.0.0.0" in served.errors, "the warning")
+
+
+# --- who may connect
+
+
+def gets_in(url: str, origin: str | None = None) -> bool:
+    try:
+        page = Origin(origin) if origin is not None else None
+        with connect(
+            url, origin=page, subprotocols=[Subprotocol("foxglove.sdk.v1")], open_timeout=DEADLINE_S
+        ) as socket:
+            return "serverInfo" in str(socket.recv(timeout=DEADLINE_S))
+    except (InvalidHandshake, EOFError):
+        return False
+
+
+def test_only_those_who_know_the_token_and_pages_of_known_origins_connect(place: Place) -> None:
+    _, url = start(place, "--steer", "--origin", "https://foxglove.example.org")
+    without, _, token = url.partition("?")
+
+    assert gets_in(url)
+    for origin in ("https://app.foxglove.dev", "http://localhost:8080", "https://foxglove.example.org"):
+        assert gets_in(url, origin)
+        assert not gets_in(without, origin)
+    for origin in ("https://evil.example", "null", "https://app.foxglove.dev.evil.example", "file://"):
+        assert not gets_in(url, origin)
+    for wrong in (without, f"{without}?token=", f"{url}x", f"{without}other/?{token[:-1]}", f"{without}?token=%ff"):
+        assert not gets_in(wrong)
+    assert gets_in(url)
+
+
+def test_nobody_passes_by_the_token_at_the_port_behind_it(place: Place) -> None:
+    served, url = start(place)
+    ports = [
+        connection.laddr.port
+        for connection in psutil.Process(served.pid).net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN and connection.laddr.port != urlsplit(url).port
+    ]
+
+    for port in ports:
+        with pytest.raises(TimeoutError):
+            connect(f"ws://127.0.0.1:{port}", subprotocols=[Subprotocol("foxglove.sdk.v1")], open_timeout=2.0)
+
+    assert len(ports) == 1
+    assert gets_in(url)

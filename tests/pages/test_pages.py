@@ -164,8 +164,9 @@ class PageRun:
 
 
 def masked(text: str) -> list[str]:
-    """The lines of an output without what differs from run to run: numbers, and how columns are filled up."""
+    """The lines of an output without what differs from run to run: numbers, tokens, and columns."""
     text = re.sub(r"unixsock-stream/\S+", "SOCKET", text)
+    text = re.sub(r"token(=|%3D)[\w-]{32}", "TOKEN", text)
     text = re.sub(r"-?\d+(\.\d+)?(e[-+]?\d+)?\b", "#", text)
     return [" ".join(line.split()) for line in text.splitlines() if line.strip()]
 
