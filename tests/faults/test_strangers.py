@@ -377,6 +377,17 @@ def progress(stranger: Stranger) -> None:
         stranger.put(stranger.keys.progress(node), HEADER.pack(PROGRESS, 0, 0, 2000))
 
 
+def finish(stranger: Stranger) -> None:
+    for key in {*stranger.keys.grants(["left", "right", "free", "@record"]).values()}:
+        stranger.put(key, HEADER.pack(FINISH, 0, 0, 0))
+
+
+def abort(stranger: Stranger) -> None:
+    error = ErrorReport("StepFailed", "a lie", 3, instance="left", point=0)
+    for key in {*stranger.keys.grants(["left", "right", "free", "@record"]).values()}:
+        stranger.put(key, HEADER.pack(ABORT, 0, 0, 0) + msgspec.json.encode(error))
+
+
 def too_many_rows(stranger: Stranger) -> None:
     rows = 1 << 17  # more than its ring has
     for index in range(5):
@@ -387,6 +398,8 @@ def too_many_rows(stranger: Stranger) -> None:
     ("forge", "names"),
     [
         (grant, ("the master grants point 4611686018427387904 to node '", "which may be granted ")),
+        (finish, ("says that it has ended at point 0, and the master has granted point ",)),
+        (abort, (" was lost",)),
         (progress, ("says that it is at point 2000, and the master has granted point ",)),
         (too_many_rows, ("'left' sends its values up to point 131071 to node 'right', more than was granted",)),
     ],
