@@ -114,7 +114,7 @@ def is_pattern(text: str) -> bool:
     return text.startswith(EXPRESSION) or any(sign in text for sign in WILDCARDS)
 
 
-def matching(text: str, names: Sequence[str]) -> list[str]:
+def matching(text: str, names: Collection[str]) -> list[str]:
     """The names that a text means: the one that it is, or else all that it matches as a pattern.
 
     Raises:

@@ -36,7 +36,7 @@ from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, Varia
 from .activity import Activity
 from .inputs import set_input
 from .stepping import Runner
-from .streams import kind_of
+from .streams import VariableKeys, kind_of
 
 __all__ = ["Answers", "Job"]
 
@@ -116,7 +116,7 @@ class Answers:
         """Answer with the variables that a query matches; keep it for `turn` if there are no values yet."""
         name, query = pending.instance, pending.query
         runner = self._activity.runners.get(name)
-        wanted = self._variables_matching(runner, query.key_expr) if runner is not None else []
+        wanted = [*VariableKeys(self._keys, runner).matching(query.key_expr)] if runner is not None else []
         if runner is None or not wanted:
             query.drop()
             return
@@ -169,15 +169,6 @@ class Answers:
             self._pending.remove(pending)
             pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")
 
-    def _variables_matching(self, runner: Runner, asked: zenoh.KeyExpr) -> list[tuple[str, Variable]]:
-        """(key, variable) of all variables that a key expression matches."""
-        return [
-            (key, variable)
-            for variable in runner.instance.description.variables
-            if (kind := kind_of(variable)) is not None
-            and asked.intersects(zenoh.KeyExpr(key := self._keys.variable(runner.name, kind, variable.name)))
-        ]
-
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
         """The outputs in the rows of the newest own step, and that step; what only the FMU has is not included.
 
@@ -187,11 +178,12 @@ class Answers:
         values are read again; after a few attempts the main thread reads them.
         """
         ring = runner.outputs
-        names = {*ring.layout.names}
         for _ in range(_LOOKS):
             step = runner.step
             values = [
-                (key, ring.value(step, v.name)) for key, v in wanted if v.name in names and v.causality == "output"
+                (key, ring.value(step, v.name))
+                for key, v in wanted
+                if v.name in ring.layout and v.causality == "output"
             ]
             if runner.step + 1 - step < ring.rows:
                 return values, step

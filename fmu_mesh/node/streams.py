@@ -6,23 +6,28 @@ subscriber that stops loses samples (their points show which), and does not slow
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
+from zenoh.handlers import Callback
 
 from ..simtime import TimeGrid
 from ..variables.model_description import Variable
-from ..wire.keys import Keys, VariableKind
-from ..wire.session import matches, undeclare_all
+from ..wire.keys import Keys, VariableKind, unescape
+from ..wire.session import matches, subscribed, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
-__all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "kind_of"]
+__all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "VariableKeys", "kind_of"]
 
 MAX_WAITING_ROWS = 1 << 14
+_MAX_WAITING_VALUES = 1 << 20
+"""Somebody may subscribe to all 60,000 variables of an FMU: their rows would need gigabytes."""
 
 PRIORITY = zenoh.Priority.DATA_LOW
 """Frames and grants must not wait behind samples for subscribers."""
@@ -35,8 +40,8 @@ _KINDS: Final[dict[str, VariableKind]] = {
     "local": "local",
 }
 
-Batch = tuple["InstanceStreams", NDArray[np.intp], dict[str, NDArray[Any]]]
-"""Streams, own steps, and the values by variable name."""
+Batch = tuple["InstanceStreams", NDArray[np.intp], list[tuple[zenoh.KeyExpr, NDArray[Any]]]]
+"""Streams, own steps, and the values of each key."""
 
 
 def kind_of(variable: Variable) -> VariableKind | None:
@@ -44,49 +49,81 @@ def kind_of(variable: Variable) -> VariableKind | None:
     return _KINDS.get(variable.causality)
 
 
+class VariableKeys:
+    """The keys of the variables of one instance."""
+
+    def __init__(self, keys: Keys, runner: Runner) -> None:
+        self._keys = keys
+        self._runner = runner
+        self._root = f"{keys.instance(runner.name)}/"
+        self.every = zenoh.KeyExpr(f"{self._root}*/*")
+
+    def matching(self, asked: zenoh.KeyExpr) -> Iterator[tuple[str, Variable]]:
+        """(key, variable) of all variables that a key expression matches; fast if it is one key, or nothing matches."""
+        description, text = self._runner.instance.description, str(asked)
+        if not asked.intersects(self.every):
+            return
+        name = unescape(text.rpartition("/")[2])
+        own = (description.variable(name),) if "*" not in text else description.variables
+        everything = asked.includes(self.every)
+        for variable in own:
+            if variable is None or (kind := kind_of(variable)) is None:
+                continue
+            key = self._keys.variable(self._runner.name, kind, variable.name)
+            if everything or key == text or ("*" in text and asked.intersects(zenoh.KeyExpr(key))):
+                yield key, variable
+
+
 class InstanceStreams:
     """The streams of one instance.
 
+    One publisher for all variables tells whether somebody may listen. Only then `look` finds out to what, so that
+    nothing is declared for a variable (an FMU may have 60,000).
+
     Args:
-        changed: called on a thread of Zenoh when a variable gets its first or loses its last subscriber.
+        changed: called on a thread of Zenoh when the instance gets its first or loses its last subscriber.
     """
 
     def __init__(
-        self,
-        runner: Runner,
-        session: zenoh.Session,
-        keys: Keys,
-        grid: TimeGrid,
-        changed: Callable[[InstanceStreams], None],
+        self, runner: Runner, session: zenoh.Session, keys: Keys, grid: TimeGrid, changed: Callable[[], None]
     ) -> None:
         self.runner = runner
+        self._session = session
+        self._keys = VariableKeys(keys, runner)
         self._dropped = 0
         self._grid = grid
         self._next = 0
-        self._active: tuple[str, ...] = ()
-        self._publishers: dict[str, zenoh.Publisher] = {}
-        self._listeners: list[zenoh.MatchingListener[Any]] = []
-        for variable in runner.instance.description.variables:
-            kind = kind_of(variable)
-            if kind is None:
-                continue
-            publisher = session.declare_publisher(
-                keys.variable(runner.name, kind, variable.name),
-                encoding=json_encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=PRIORITY,
-                allowed_destination=zenoh.Locality.REMOTE,
-            )
-            self._publishers[variable.name] = publisher
-            self._listeners.append(publisher.declare_matching_listener(lambda _status: changed(self)))
+        self._subscribed: frozenset[str] = frozenset()
+        self._wanted: dict[str, zenoh.KeyExpr] = {}
+        self._active: dict[str, zenoh.KeyExpr] = {}
+        self._publisher = session.declare_publisher(
+            self._keys.every, priority=PRIORITY, allowed_destination=zenoh.Locality.REMOTE
+        )
+        notice: Callback[Any] = Callback(lambda _status: changed(), indirect=False)  # without a thread
+        self._listener: zenoh.MatchingListener[Any] = self._publisher.declare_matching_listener(notice)
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether somebody subscribes to something that may be a variable of this instance."""
+        return matches(self._publisher)
+
+    def look(self) -> bool:
+        """Find the variables that have subscribers, for `update`; return whether they are others than before."""
+        subscribed_now = subscribed(self._session, str(self._keys.every)) if self.is_followed else frozenset()
+        if subscribed_now == self._subscribed:
+            return False
+        matching = [pair for asked in subscribed_now for pair in self._keys.matching(zenoh.KeyExpr(asked))]
+        self._wanted = {variable.name: zenoh.KeyExpr(key) for key, variable in sorted(matching, key=itemgetter(0))}
+        self._subscribed = subscribed_now  # last: the main thread may look as well
+        return True
 
     def update(self) -> None:
-        """On the main thread, between steps: find the variables that have subscribers, and read them from now on."""
-        active = tuple(name for name, publisher in self._publishers.items() if matches(publisher))
-        if active == self._active:
+        """On the main thread, between steps: from now on, read the variables that have subscribers."""
+        active = self._wanted
+        if active.keys() == self._active.keys():
             return
-        watched = tuple(name for name in active if name not in self.runner.outputs.layout.names)
-        if watched != (self.runner.watched.layout.names if self.runner.watched is not None else ()):
+        watched = tuple(name for name in active if name not in self.runner.outputs.layout)
+        if {*watched} != {*(self.runner.watched.layout.names if self.runner.watched is not None else ())}:
             self.runner.watch(watched)
         if not self._active:
             self._next = self.runner.step
@@ -102,27 +139,34 @@ class InstanceStreams:
         kept = min(self.runner.outputs.rows, watched.rows if watched is not None else end)
         self._dropped += max(0, end - kept - first)
         first = max(first, end - kept)  # older rows are overwritten
-        if waiting_rows > MAX_WAITING_ROWS:
+        if waiting_rows > min(MAX_WAITING_ROWS, _MAX_WAITING_VALUES // len(self._active)):
             self._dropped += end - first
             return None
         steps = np.arange(first, end)
-        return self, steps, {name: self._column(name, steps) for name in self._active}
+        return self, steps, [(key, self._column(name, steps)) for name, key in self._active.items()]
 
     def _column(self, name: str, steps: NDArray[np.intp]) -> NDArray[Any]:
         ring = self.runner.outputs
-        if name not in ring.layout.names and self.runner.watched is not None:
+        if name not in ring.layout and self.runner.watched is not None:
             ring = self.runner.watched
         part, first, size, shape = ring.layout.place(name)
         values: NDArray[Any] = ring.parts[part][steps & ring.mask, first : first + size]
         return values.reshape(len(steps), *shape)
 
-    def publish(self, steps: NDArray[np.intp], columns: dict[str, NDArray[Any]]) -> None:
+    def publish(self, steps: NDArray[np.intp], columns: list[tuple[zenoh.KeyExpr, NDArray[Any]]]) -> None:
         """On the server's thread: publish what `collect` returned."""
-        lists = [(self._publishers[name].put, column.tolist()) for name, column in columns.items()]
+        put = partial(
+            self._session.put,
+            encoding=json_encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=PRIORITY,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+        lists = [(key, column.tolist()) for key, column in columns]
         for offset, point in enumerate((steps * self.runner.plan.step_points).tolist()):
             stamp = attachment(point, self._grid.time(point))
-            for put, values in lists:
-                put(encode_value(values[offset]), attachment=stamp)
+            for key, values in lists:
+                put(key, encode_value(values[offset]), attachment=stamp)
 
     def take_dropped(self) -> int:
         """Number of rows that were dropped since the last call."""
@@ -130,5 +174,5 @@ class InstanceStreams:
         return dropped
 
     def close(self) -> None:
-        """Undeclare all publishers."""
-        undeclare_all(self._listeners, self._publishers.values())
+        """Undeclare the publisher."""
+        undeclare_all([self._listener, self._publisher])

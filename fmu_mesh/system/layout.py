@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import cached_property
 from typing import NamedTuple
 
 import msgspec
@@ -65,10 +66,10 @@ class Place(NamedTuple):
     shape: tuple[int, ...]
 
 
-class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The columns of a row, grouped by type in the order of `TYPES`, Float64 first.
 
-    Make it with `of`, which sorts the columns.
+    Make it with `of`, which sorts the columns. What follows from them is computed once: a row may have 60,000 columns.
     """
 
     columns: tuple[Column, ...] = ()
@@ -81,7 +82,7 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         made = [Column(c.name, c.type, c.shape, c.max_size) if isinstance(c, Variable) else Column(*c) for c in columns]
         return cls(tuple(sorted(made, key=lambda column: TYPES.index(column.type))))
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """All column names, Float64 ones first."""
         return tuple(column.name for column in self.columns)
@@ -94,7 +95,7 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             for column in self.columns
         )
 
-    @property
+    @cached_property
     def parts(self) -> tuple[Part, ...]:
         """The parts that have columns, in their order in memory and in a frame."""
         by_type: dict[VariableType, list[Column]] = {}
@@ -102,16 +103,19 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             by_type.setdefault(column.type, []).append(column)
         return tuple(Part(type_, tuple(own), sum(c.size for c in own)) for type_, own in by_type.items())
 
+    def __contains__(self, name: str) -> bool:
+        """Whether a variable has a column; an element of an array has none of its own."""
+        return name in self._found
+
     def column(self, name: str) -> Column:
         """The column of a variable, or of the array that ``name`` is an element of.
 
         Raises:
             KeyError: there is none.
         """
-        by_name = {column.name: column for column in self.columns}
-        if name not in by_name and (parts := split_element(name)) is not None:
-            return by_name[parts[0]]
-        return by_name[name]
+        if name not in self._found and (parts := split_element(name)) is not None:
+            name = parts[0]
+        return self._found[name][0]
 
     def place(self, name: str) -> Place:
         """The place of a variable, or of an array element such as `y[2]`, unless a variable has exactly that name.
@@ -119,17 +123,21 @@ class Layout(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Raises:
             KeyError: there is no such column.
         """
-        wanted = self.column(name)
+        if name in self._found:
+            return self._found[name][1]
+        array, index = split_element(name) or (name, ())
+        part, first, _, shape = self._found[array][1]
+        return Place(part, first + int(np.ravel_multi_index(index, shape)), 1, ())
+
+    @cached_property
+    def _found(self) -> dict[str, tuple[Column, Place]]:
+        found = {}
         for number, part in enumerate(self.parts):
             first = 0
             for column in part.columns:
-                if column == wanted:
-                    if name == column.name:
-                        return Place(number, first, column.size, column.shape)
-                    _, index = split_element(name) or ("", ())
-                    return Place(number, first + int(np.ravel_multi_index(index, column.shape)), 1, ())
+                found[column.name] = column, Place(number, first, column.size, column.shape)
                 first += column.size
-        raise KeyError(name)
+        return found
 
 
 def row_offsets(layout: Layout) -> list[int]:

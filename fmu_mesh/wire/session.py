@@ -34,6 +34,7 @@ __all__ = [
     "open_session",
     "own_endpoints",
     "run_router",
+    "subscribed",
     "tokens",
     "undeclare_all",
 ]
@@ -196,6 +197,25 @@ def matches(entity: zenoh.Publisher | zenoh.Querier) -> bool:
     """Whether this publisher or querier has a receiver."""
     # The stub says bool, but it is an object that is always true (zenoh-python 1.10).
     return bool(entity.matching_status.matching)  # type: ignore[attr-defined]  # the stub is wrong
+
+
+def subscribed(session: zenoh.Session, key: str) -> frozenset[str]:
+    """The key expressions of the subscribers of other sessions that match ``key``, as this session knows them now.
+
+    The admin space of the session answers, without a message on a link. A matching listener would need a publisher and
+    a thread for every key. The session knows the subscribers of keys that it has declared a publisher for.
+    """
+    own, found, answered = str(session.zid()), list[zenoh.Reply](), threading.Event()
+    root = f"@/{own}/*/subscriber/"
+    # Not with a channel: the answers come within this call, so a full channel would block it for ever.
+    session.get(root + key, Callback(found.append, answered.set, indirect=False), timeout=_OWN_S)
+    answered.wait(_OWN_S)
+    samples = [reply.ok for reply in found if reply.ok is not None]
+    return frozenset(
+        str(sample.key_expr).split("/", root.count("/"))[-1]
+        for sample in samples
+        if any({*zids} - {own} for zids in json.loads(sample.payload.to_bytes()).values())
+    )
 
 
 def tokens(session: zenoh.Session, key: str, timeout_s: float = _TOKENS_S) -> list[str]:

@@ -101,7 +101,7 @@ def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(
     monkeypatch.setattr(answering, "instance_info", lambda _plan, _runner: 5)
     ring = Ring(Layout.of([("y", "Float64")]), ROWS)
     ring.put(0, "y", 2.5)
-    description = SimpleNamespace(variables=[Y])
+    description = SimpleNamespace(variables=[Y], variable={"y": Y}.get)
     runner = SimpleNamespace(
         name="unit",
         outputs=ring,

@@ -8,12 +8,13 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
 import zenoh
+from zenoh.handlers import Callback
 
 from ...errors import DeadlineExceeded, MessageRefused
 from ..keys import Keys
@@ -58,20 +59,29 @@ class Follower(Generic[Item]):
     ) -> None:
         self._stack.close()
 
-    def subscribe(self, key: str, decode: Callable[[zenoh.Sample], Item | None]) -> None:
-        """From now on the samples of a key arrive, as ``decode`` returns them; not those that it refuses.
+    def subscribe(
+        self, keys: Collection[str], decode: Callable[[zenoh.Sample], Item | None], through: str | None = None
+    ) -> None:
+        """From now on the samples of these keys arrive, as ``decode`` returns them; not those that it refuses.
 
         A reader that is much too slow loses samples, because a thread of Zenoh must not wait for it.
+
+        Args:
+            keys: what arrives.
+            decode: of each sample what arrives.
+            through: one key expression to subscribe to instead of each key.
         """
 
         def take(sample: zenoh.Sample) -> None:
-            if str(sample.key_expr) != key or self.arrived.qsize() >= _WAITING_SAMPLES:
+            if str(sample.key_expr) not in keys or self.arrived.qsize() >= _WAITING_SAMPLES:
                 return
             with suppress(MessageRefused):
                 if (item := decode(sample)) is not None:
                     self.arrived.put(item)
 
-        self._stack.callback(self._session.declare_subscriber(key, take).undeclare)
+        directly = Callback(take, indirect=False)  # no thread for each of 1,000 keys
+        for key in keys if through is None else (through,):
+            self._stack.callback(self._session.declare_subscriber(key, directly).undeclare)
 
     def to_the_last(self, deadline: float | None = None) -> Iterator[Item]:
         """Everything that arrives until the mesh has ended, and shortly after, unless the mesh starts again.

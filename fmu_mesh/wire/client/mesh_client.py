@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
@@ -68,6 +68,8 @@ class MeshClient:
         self.endpoints = tuple(endpoints)
         self._session = session
         self._timeout_s = timeout_s
+        self._known: dict[str, dict[str, Target]] = {}
+        self._known_run = ""
 
     @property
     def session(self) -> zenoh.Session:
@@ -152,14 +154,14 @@ class MeshClient:
         reference = self._within(reference)
         if not is_key(reference, self.keys):
             return self._targets_by_name(reference)
-        asked = key_expression(reference)
+        asked, info = key_expression(reference), self.info()
         instances = [
-            name for name in self.info().instances if asked.intersects(zenoh.KeyExpr(f"{self.keys.instance(name)}/**"))
+            name for name in info.instances if asked.intersects(zenoh.KeyExpr(f"{self.keys.instance(name)}/**"))
         ]
         if not instances:
             chunk = reference.removeprefix(self.keys.root + "/").partition("/")[0]
             raise self._unknown_instance(chunk)
-        found = [target for name in instances for target in self._variables(name)]
+        found = [target for name in instances for target in self._variables(name, info.run).values()]
         matching = [target for target in found if asked.intersects(zenoh.KeyExpr(target.key))]
         if not matching:
             raise _unknown(f"no variable has the key '{reference}'", reference, [target.key for target in found])
@@ -217,7 +219,7 @@ class MeshClient:
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
         with Follower[MeshStatus](self._session, self.keys) as follower:
-            follower.subscribe(self.keys.mesh_key("status"), partial(_decoded, kind=MeshStatus))
+            follower.subscribe({self.keys.mesh_key("status")}, partial(_decoded, kind=MeshStatus))
             there = follower.there.wait(min(timeout_s, self._timeout_s))
             yield follower.to_the_last(deadline) if there else iter(())
 
@@ -228,8 +230,13 @@ class MeshClient:
         A reader that is much too slow loses the newest samples; the points show which.
         """
         with Follower[Reading](self._session, self.keys) as follower:
+            by_instance: dict[str, dict[str, Target]] = {}
             for target in targets:
-                follower.subscribe(target.key, partial(reading_of, target))
+                by_instance.setdefault(target.instance, {})[target.key] = target
+            for name, own in by_instance.items():
+                every = len(own) == len(self._known.get(name, ()))
+                through = f"{self.keys.instance(name)}/*/*" if every else None
+                follower.subscribe(own.keys(), partial(_reading_among, own), through)
             there = follower.there.wait(self._timeout_s)
             if there:
                 # An answer of a node comes after the subscribers of this session have come to it.
@@ -242,7 +249,7 @@ class MeshClient:
         """The log messages that the mesh has kept, the oldest first; then all new ones until it ends, if ``follow``."""
         with Follower[LogLine](self._session, self.keys) as follower:
             if follow:  # from before the question, so that no message is missing between the two
-                follower.subscribe(self.keys.mesh_key("log"), partial(_decoded, kind=LogLine))
+                follower.subscribe({self.keys.mesh_key("log")}, partial(_decoded, kind=LogLine))
             kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
             last = kept[-1].number if kept else 0
             there = follow and follower.there.wait(self._timeout_s)
@@ -260,7 +267,8 @@ class MeshClient:
 
     def _targets_by_name(self, reference: str) -> list[Target]:
         instance, _, name = reference.partition(".")
-        names = self.info().instances
+        info = self.info()
+        names = info.instances
         if not name and not is_pattern(reference):
             known = instance if instance in names else "INSTANCE"
             raise ConfigurationError(
@@ -269,8 +277,10 @@ class MeshClient:
         if instance not in names and not is_pattern(reference):
             raise self._unknown_instance(instance, names)
         instances = [instance] if instance in names else names
-        found = {target.name: target for each in instances for target in self._variables(each)}
-        meant = [found[full_name] for full_name in matching(reference, [*found])]
+        found: dict[str, Target] = {}
+        for each in instances:
+            found |= self._variables(each, info.run)
+        meant = [found[full_name] for full_name in matching(reference, found)]
         if not meant and instance in names:
             own = [target.variable.name for target in found.values()]
             for clock in self.instance_info(instance).clocks:
@@ -281,9 +291,15 @@ class MeshClient:
             raise _unknown(f"mesh '{self.keys.mesh}' has no variable '{reference}'", reference, [*found])
         return meant
 
-    def _variables(self, instance: str) -> list[Target]:
-        root = self.keys.instance(instance)
-        return [Target(instance, f"{root}/{view.key}", view) for view in self.instance_info(instance).variables]
+    def _variables(self, instance: str, run: str) -> dict[str, Target]:
+        """The variables of an instance by `instance.variable`; asked for once in a run, because there may be 60,000."""
+        if run != self._known_run:
+            self._known, self._known_run = {}, run
+        if instance not in self._known:
+            root, info = self.keys.instance(instance), self.instance_info(instance)
+            found = [Target(instance, f"{root}/{view.key}", view) for view in info.variables]
+            self._known[instance] = {target.name: target for target in found}
+        return self._known[instance]
 
     def _instance_key(self, instance: str) -> str:
         if instance not in (names := self.info().instances):
@@ -360,6 +376,10 @@ def key_expression(text: str) -> zenoh.KeyExpr:
 
 def _decoded(sample: zenoh.Sample, kind: type[View]) -> View:
     return decode_json(sample.payload.to_bytes(), kind)
+
+
+def _reading_among(targets: Mapping[str, Target], sample: zenoh.Sample) -> Reading | None:
+    return reading_of(targets[str(sample.key_expr)], sample)
 
 
 def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:

@@ -64,8 +64,8 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
 def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
     """The samples that arrive after the master's token has gone, until none has arrived for a quarter of a second.
 
-    The loss of the token can overtake samples that were sent earlier: it has a higher priority on the network, and each
-    subscriber has its own thread here. This counts looks into the queue instead of time, because this process may have
+    The loss of the token can overtake samples that were sent earlier: it has a higher priority on the network, and a
+    thread of its own here. This counts looks into the queue instead of time, because this process may have
     had no processor for a while.
     """
     looks = 0

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 
 import zenoh
+from zenoh.handlers import Callback
 
 from .mesh_client import MeshClient
 from .readings import Reading, Target, reading_of
@@ -57,7 +58,8 @@ class ValueStream:
                     self._waiting.append((target, sample))
                     self._arrived.set()
 
-        self._subscribers[target.key] = self._session.declare_subscriber(target.key, arrived)
+        directly = Callback(arrived, indirect=False)  # no thread for each variable
+        self._subscribers[target.key] = self._session.declare_subscriber(target.key, directly)
 
     def leave(self, target: Target) -> None:
         """From now on no value of this variable arrives."""
