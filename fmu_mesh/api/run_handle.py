@@ -241,8 +241,7 @@ class Run:
             5
         """
         client = self._running()
-        targets = {target.key: target for name in names for target in targets_of(client, name)}
-        return Watch(client, targets)
+        return Watch(client, targets_of(client, *names))
 
     def logs(self, *, follow: bool = False) -> Iterator[LogLine]:
         """The log messages of FMUs that the mesh has kept, the oldest first.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -47,13 +47,13 @@ class Watch(Iterator[Sample]):
 
     Args:
         client: the way into the mesh.
-        targets: the variables by their keys.
+        targets: the variables.
     """
 
-    def __init__(self, client: MeshClient, targets: Mapping[str, Target]) -> None:
-        self._targets = targets
+    def __init__(self, client: MeshClient, targets: Sequence[Target]) -> None:
+        self._targets = {target.key: target for target in targets}
         self._stack = ExitStack()
-        self._readings = self._stack.enter_context(client.watch(list(targets.values())))
+        self._readings = self._stack.enter_context(client.watch(targets))
         weakref.finalize(self, self._stack.close)
 
     def __enter__(self) -> Self:
@@ -76,14 +76,14 @@ class Watch(Iterator[Sample]):
         self._stack.close()
 
 
-def targets_of(client: MeshClient, name: str) -> list[Target]:
-    """The variables that a name or a pattern means (`*`: any characters, `?`: one, `re:...`: a regular expression).
+def targets_of(client: MeshClient, *names: str) -> list[Target]:
+    """The variables that names or patterns mean (`*`: any characters, `?`: one, `re:...`: a regular expression).
 
     Raises:
         UnknownName: there is none.
     """
     try:
-        return client.targets(name)
+        return client.targets(*names)
     except ConfigurationError as error:
         raise UnknownName(error.message, hint=error.hint) from error
 

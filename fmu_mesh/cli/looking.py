@@ -252,12 +252,11 @@ def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:
 
 def _selected(references: list[str], meshes: Meshes) -> list[tuple[MeshClient, list[Target]]]:
     """The variables of the references by mesh, without duplicates."""
-    found: dict[str, tuple[MeshClient, dict[str, Target]]] = {}
+    found: dict[str, tuple[MeshClient, list[str]]] = {}
     for reference in references:
         client = meshes.one(reference)
-        _, targets = found.setdefault(client.keys.root, (client, {}))
-        targets.update({target.key: target for target in client.targets(reference)})
-    return [(client, list(targets.values())) for client, targets in found.values()]
+        found.setdefault(client.keys.root, (client, []))[1].append(reference)
+    return [(client, client.targets(*own)) for client, own in found.values()]
 
 
 # --- text

@@ -56,8 +56,11 @@ class ShownMesh:
         self._shift_ns = max(0, -nanoseconds(self._info.start_time))
         self._infos = {name: client.instance_info(name) for name in self._info.instances}
         everything = client.targets("*")
-        chosen = [target for pattern in patterns for target in client.targets(pattern)]
-        offered = chosen if patterns else [target for target in everything if target.variable.causality == "output"]
+        offered = (
+            client.targets(*patterns)
+            if patterns
+            else [target for target in everything if target.variable.causality == "output"]
+        )
         self._targets = {topic_of(target): target for target in offered}
         self._parameters = MeshParameters(
             client, settable(self._infos.values(), everything), self._refused, read_only=read_only

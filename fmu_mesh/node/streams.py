@@ -6,20 +6,25 @@ subscriber that stops loses samples (their points show which), and does not slow
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
-from operator import itemgetter
-from typing import Any, Final
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from itertools import groupby
+from os.path import commonprefix
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
 from zenoh.handlers import Callback
 
+from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import Variable
-from ..wire.keys import Keys, VariableKind, unescape
-from ..wire.session import matches, subscribed, undeclare_all
+from ..variables.value_types import nested
+from ..wire.keys import Keys, VariableKind, escape, unescape
+from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
@@ -40,8 +45,28 @@ _KINDS: Final[dict[str, VariableKind]] = {
     "local": "local",
 }
 
-Batch = tuple["InstanceStreams", NDArray[np.intp], list[tuple[zenoh.KeyExpr, NDArray[Any]]]]
-"""Streams, own steps, and the values of each key."""
+
+_NO_VARIABLE = "%"
+"""No name of a variable ends so in a key, where `%` begins the number of a character."""
+
+
+class Picked(NamedTuple):
+    """The variables of one type in one ring that have subscribers.
+
+    Attributes:
+        part: the array of the ring that has them.
+        elements: their elements there.
+        keys: of each variable its key, the number of its elements, and its shape.
+    """
+
+    ring: Ring
+    part: int
+    elements: NDArray[np.intp]
+    keys: list[tuple[zenoh.KeyExpr, int, tuple[int, ...]]]
+
+
+Batch = tuple["InstanceStreams", NDArray[np.intp], list[tuple[Picked, NDArray[Any]]]]
+"""Streams, own steps, and their rows."""
 
 
 def kind_of(variable: Variable) -> VariableKind | None:
@@ -55,8 +80,13 @@ class VariableKeys:
     def __init__(self, keys: Keys, runner: Runner) -> None:
         self._keys = keys
         self._runner = runner
-        self._root = f"{keys.instance(runner.name)}/"
-        self.every = zenoh.KeyExpr(f"{self._root}*/*")
+        self.root = f"{keys.instance(runner.name)}/"
+        self.every = zenoh.KeyExpr(f"{self.root}*/*")
+
+    def key(self, variable: Variable) -> str | None:
+        """The key of a variable; None for the independent variable."""
+        kind = kind_of(variable)
+        return self._keys.variable(self._runner.name, kind, variable.name) if kind is not None else None
 
     def matching(self, asked: zenoh.KeyExpr) -> Iterator[tuple[str, Variable]]:
         """(key, variable) of all variables that a key expression matches; fast if it is one key, or nothing matches."""
@@ -67,9 +97,8 @@ class VariableKeys:
         own = (description.variable(name),) if "*" not in text else description.variables
         everything = asked.includes(self.every)
         for variable in own:
-            if variable is None or (kind := kind_of(variable)) is None:
+            if variable is None or (key := self.key(variable)) is None:
                 continue
-            key = self._keys.variable(self._runner.name, kind, variable.name)
             if everything or key == text or ("*" in text and asked.intersects(zenoh.KeyExpr(key))):
                 yield key, variable
 
@@ -93,9 +122,10 @@ class InstanceStreams:
         self._dropped = 0
         self._grid = grid
         self._next = 0
-        self._subscribed: frozenset[str] = frozenset()
         self._wanted: dict[str, zenoh.KeyExpr] = {}
+        self._search: tuple[list[str], Iterator[str | None]] | None = None
         self._active: dict[str, zenoh.KeyExpr] = {}
+        self._picked: list[Picked] = []
         self._publisher = session.declare_publisher(
             self._keys.every, priority=PRIORITY, allowed_destination=zenoh.Locality.REMOTE
         )
@@ -107,15 +137,64 @@ class InstanceStreams:
         """Whether somebody subscribes to something that may be a variable of this instance."""
         return matches(self._publisher)
 
-    def look(self) -> bool:
-        """Find the variables that have subscribers, for `update`; return whether they are others than before."""
-        subscribed_now = subscribed(self._session, str(self._keys.every)) if self.is_followed else frozenset()
-        if subscribed_now == self._subscribed:
-            return False
-        matching = [pair for asked in subscribed_now for pair in self._keys.matching(zenoh.KeyExpr(asked))]
-        self._wanted = {variable.name: zenoh.KeyExpr(key) for key, variable in sorted(matching, key=itemgetter(0))}
-        self._subscribed = subscribed_now  # last: the main thread may look as well
-        return True
+    def look(self, seconds: float | None = None) -> bool:
+        """Find the variables that have subscribers; return whether `update` is due.
+
+        On the server's thread.
+
+        Args:
+            seconds: go on with the present search for this time; None: search anew, to the end.
+        """
+        end = time.monotonic() + (seconds if seconds is not None else math.inf)
+        if seconds is None or self._search is None or not self.is_followed:
+            chunks = self._chunks if self.is_followed else {}
+            self._search = [], (key for root, own in chunks.items() for key in self._subscribed(root, own))
+        keys, search = self._search
+        for key in search:
+            if key is not None:
+                keys.append(key)
+            if time.monotonic() > end:
+                return False
+        before, self._wanted = self._wanted, {unescape(key.rpartition("/")[2]): zenoh.KeyExpr(key) for key in keys}
+        self._search = None
+        return before.keys() != self._wanted.keys()
+
+    def look_at(self, names: Iterable[str]) -> bool:
+        """On the server's thread: find those of these variables that have subscribers, as `look` does."""
+        variables = [self.runner.instance.description.variable(name) for name in names]
+        keys = {v.name: self._keys.key(v) for v in variables if v is not None and v.name not in self._wanted}
+        found = {name: zenoh.KeyExpr(key) for name, key in keys.items() if key is not None and self._is_subscribed(key)}
+        self._wanted = {**self._wanted, **found}
+        self._search = None  # it may have passed them already
+        return bool(found)
+
+    def _subscribed(self, root: str, chunks: Sequence[str]) -> Iterator[str | None]:
+        """The keys with one of these sorted last chunks that have subscribers, found by their first letters.
+
+        Of many variables few have subscribers. The admin space has a list of them, but a session that is asked for it
+        while another one subscribes can block for ever (zenoh 1.10). After each question, None is a chance to pause.
+        """
+        common = commonprefix([chunks[0], chunks[-1]])  # noqa: RUF071  they are no paths
+        if not self._is_subscribed(root + (chunks[0] if len(chunks) == 1 else f"{common}$*" if common else "*")):
+            yield None
+        elif len(chunks) == 1 or self._is_subscribed(f"{root}{common}{_NO_VARIABLE}"):  # by a wildcard
+            yield from (root + chunk for chunk in chunks)
+        else:
+            for _, group in groupby(chunks, key=lambda chunk: chunk[len(common) : len(common) + 1]):
+                yield from self._subscribed(root, [*group])
+
+    def _is_subscribed(self, key: str) -> bool:
+        with self._session.declare_publisher(key, allowed_destination=zenoh.Locality.REMOTE) as publisher:
+            return matches(publisher)
+
+    @cached_property
+    def _chunks(self) -> dict[str, list[str]]:
+        """The last chunks of the keys of all variables, sorted, by what is before them."""
+        names: dict[str, list[str]] = {}
+        for variable in self.runner.instance.description.variables:
+            if (kind := kind_of(variable)) is not None:
+                names.setdefault(f"{self._keys.root}{kind}/", []).append(escape(variable.name))
+        return {root: sorted(chunks) for root, chunks in names.items()}
 
     def update(self) -> None:
         """On the main thread, between steps: from now on, read the variables that have subscribers."""
@@ -128,12 +207,16 @@ class InstanceStreams:
         if not self._active:
             self._next = self.runner.step
         self._active = active
+        rings = [ring for ring in (self.runner.outputs, self.runner.watched) if ring is not None]
+        self._picked = [picked for ring in rings for picked in _picked(ring, active)]
 
     def collect(self, waiting_rows: int) -> Batch | None:
         """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
-        first, end = self._next, self.runner.step + 1
+        end, watched = self.runner.step + 1, self.runner.watched
+        first = max(self._next, end - (watched.rows if watched is not None else end))
         if not self._active or first >= end:
             return None
+        self._dropped += first - self._next
         self._next = end
         watched = self.runner.watched
         kept = min(self.runner.outputs.rows, watched.rows if watched is not None else end)
@@ -143,17 +226,10 @@ class InstanceStreams:
             self._dropped += end - first
             return None
         steps = np.arange(first, end)
-        return self, steps, [(key, self._column(name, steps)) for name, key in self._active.items()]
+        rows = [(own, own.ring.parts[own.part][np.ix_(steps & own.ring.mask, own.elements)]) for own in self._picked]
+        return self, steps, rows
 
-    def _column(self, name: str, steps: NDArray[np.intp]) -> NDArray[Any]:
-        ring = self.runner.outputs
-        if name not in ring.layout and self.runner.watched is not None:
-            ring = self.runner.watched
-        part, first, size, shape = ring.layout.place(name)
-        values: NDArray[Any] = ring.parts[part][steps & ring.mask, first : first + size]
-        return values.reshape(len(steps), *shape)
-
-    def publish(self, steps: NDArray[np.intp], columns: list[tuple[zenoh.KeyExpr, NDArray[Any]]]) -> None:
+    def publish(self, steps: NDArray[np.intp], blocks: list[tuple[Picked, NDArray[Any]]]) -> None:
         """On the server's thread: publish what `collect` returned."""
         put = partial(
             self._session.put,
@@ -162,11 +238,14 @@ class InstanceStreams:
             priority=PRIORITY,
             allowed_destination=zenoh.Locality.REMOTE,
         )
-        lists = [(key, column.tolist()) for key, column in columns]
+        lists = [(picked.keys, block.tolist()) for picked, block in blocks]
         for offset, point in enumerate((steps * self.runner.plan.step_points).tolist()):
             stamp = attachment(point, self._grid.time(point))
-            for key, values in lists:
-                put(key, encode_value(values[offset]), attachment=stamp)
+            for keys, rows in lists:
+                row, first = rows[offset], 0
+                for key, size, shape in keys:
+                    put(key, encode_value(nested(row[first : first + size], shape)), attachment=stamp)
+                    first += size
 
     def take_dropped(self) -> int:
         """Number of rows that were dropped since the last call."""
@@ -176,3 +255,11 @@ class InstanceStreams:
     def close(self) -> None:
         """Undeclare the publisher."""
         undeclare_all([self._listener, self._publisher])
+
+
+def _picked(ring: Ring, keys: Mapping[str, zenoh.KeyExpr]) -> Iterator[Picked]:
+    for number, part in enumerate(ring.layout.parts):
+        found = [(keys[column.name], ring.layout.place(column.name)) for column in part.columns if column.name in keys]
+        if found:
+            elements = np.concatenate([np.arange(place.first, place.first + place.size) for _, place in found])
+            yield Picked(ring, number, elements, [(key, place.size, place.shape) for key, place in found])

@@ -13,6 +13,8 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
@@ -22,6 +24,7 @@ from ..node.node import Node
 from ..recorder.growth import GrowthWatch
 from ..recorder.recorder import Recorder
 from ..system.plan import MASTER, RECORDER
+from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
@@ -70,8 +73,10 @@ class _NodeProcess:
         plan, run, process = self._plan, self._run, self._process
         process.cleans_up(self._remove_files)
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
-        own = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
-        session = open_session(patient(own, plan.timeouts, is_node=True))
+        publishes = f"{Keys(plan.key_prefix, plan.mesh).root}/**"
+        ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
+        own = msgspec.structs.replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
+        session = open_session(own)
         process.stack.callback(close_session, session)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)

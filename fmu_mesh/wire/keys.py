@@ -11,13 +11,16 @@ import msgspec
 
 from ..system.memory_map import MASTER, RECORDER
 
-__all__ = ["RUN_ID_BYTES", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
+__all__ = ["RUN_ID_BYTES", "SUBSCRIBED", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
 _UNSAFE = re.compile(r"[/*$?#%]|^@|[\x00-\x20\x7f]")
 _ESCAPED = re.compile(r"%([0-9A-F]{2})")
 _GRANT_CHUNKS = 16
+
+SUBSCRIBED = "subscribed"
+"""Parameter of a query for a status: the node first finds what its sender has subscribed to."""
 
 RUN_ID_BYTES = 8
 """Hexadecimal digits of a run's id. So the id never begins with `@`: wildcards do not match such a chunk."""

@@ -34,7 +34,6 @@ __all__ = [
     "open_session",
     "own_endpoints",
     "run_router",
-    "subscribed",
     "tokens",
     "undeclare_all",
 ]
@@ -83,6 +82,7 @@ class Wiring(msgspec.Struct, frozen=True):
             Grants limit the messages on the way, so only a process that is stopped blocks. Nodes wait for each other;
             the master closes the link of a tool that is stopped.
         waits: whether opening the session waits, half a second at most, for the processes that it connects to.
+        publishes: key expression of many publishers that are declared and undeclared without a message on a link.
     """
 
     mode: str = "peer"
@@ -94,6 +94,7 @@ class Wiring(msgspec.Struct, frozen=True):
     waits: bool = True
     lease_s: float = LEASE_S
     stuck_s: float = _STUCK_S
+    publishes: str | None = None
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
@@ -166,6 +167,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         # Measured: with the implicit shared memory, Python is slower for messages of 3 kB and more.
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": True,
+        "aggregation/publishers": [wiring.publishes] if wiring.publishes is not None else [],
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -197,25 +199,6 @@ def matches(entity: zenoh.Publisher | zenoh.Querier) -> bool:
     """Whether this publisher or querier has a receiver."""
     # The stub says bool, but it is an object that is always true (zenoh-python 1.10).
     return bool(entity.matching_status.matching)  # type: ignore[attr-defined]  # the stub is wrong
-
-
-def subscribed(session: zenoh.Session, key: str) -> frozenset[str]:
-    """The key expressions of the subscribers of other sessions that match ``key``, as this session knows them now.
-
-    The admin space of the session answers, without a message on a link. A matching listener would need a publisher and
-    a thread for every key. The session knows the subscribers of keys that it has declared a publisher for.
-    """
-    own, found, answered = str(session.zid()), list[zenoh.Reply](), threading.Event()
-    root = f"@/{own}/*/subscriber/"
-    # Not with a channel: the answers come within this call, so a full channel would block it for ever.
-    session.get(root + key, Callback(found.append, answered.set, indirect=False), timeout=_OWN_S)
-    answered.wait(_OWN_S)
-    samples = [reply.ok for reply in found if reply.ok is not None]
-    return frozenset(
-        str(sample.key_expr).split("/", root.count("/"))[-1]
-        for sample in samples
-        if any({*zids} - {own} for zids in json.loads(sample.payload.to_bytes()).values())
-    )
 
 
 def tokens(session: zenoh.Session, key: str, timeout_s: float = _TOKENS_S) -> list[str]:

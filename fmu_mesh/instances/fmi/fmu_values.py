@@ -111,10 +111,10 @@ class FmuValues(ABC):
             variables = [self._variables[name] for name in members]
             buffer = self._buffer(type_, variables)
             self._transfer("Get", type_, variables, buffer)
-            elements = self._elements(buffer, members)
+            elements, first = self._elements(buffer, members), 0
             for variable in variables:
-                values[variable.name] = nested(elements[: variable.size], variable.shape)
-                elements = elements[variable.size :]
+                values[variable.name] = nested(elements[first : first + variable.size], variable.shape)
+                first += variable.size
         return [values[name] for name in names]
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:

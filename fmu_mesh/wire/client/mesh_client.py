@@ -26,7 +26,7 @@ import zenoh
 
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
 from ...text import is_pattern, listed, matching, nearest, shown
-from ..keys import Keys
+from ..keys import SUBSCRIBED, Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
 from ..values import encode_origin, encode_value
@@ -112,10 +112,19 @@ class MeshClient:
         """The state, the point and the activity of an instance."""
         return self._view(f"{self._instance_key(instance)}/status", InstanceStatus, f"instance '{instance}'")
 
-    def all_status(self) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
-        """The status of the mesh and of its instances, with one query; instances that do not answer are left out."""
+    def all_status(
+        self, subscribed: Mapping[str, Sequence[str] | None] | None = None
+    ) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
+        """The status of the mesh and of its instances, with one query; instances that do not answer are left out.
+
+        Args:
+            subscribed: by instance, the variables that this session has just subscribed to, so that the nodes know it;
+                None: all of the instance.
+        """
+        key = f"{self.keys.root}/*/status" + (f"?{SUBSCRIBED}" if subscribed is not None else "")
+        names = msgspec.json.encode(subscribed) if subscribed is not None else None
         # A querier does not notice several queryables that match its key (zenoh 1.10), so this is a get.
-        found = {str(s.key_expr): s.payload.to_bytes() for s in self._get(f"{self.keys.root}/*/status")}
+        found = {str(s.key_expr): s.payload.to_bytes() for s in self._get(key, names)}
         mesh = found.pop(self.keys.mesh_key("status"), None)
         status = self.status() if mesh is None else None  # this session does not know the mesh yet, or the mesh is gone
         try:
@@ -145,16 +154,20 @@ class MeshClient:
         name = name.removesuffix("/info").removesuffix("/status")
         return None if name in ("", "mesh") or reference == self.keys.mesh else name
 
-    def targets(self, reference: str) -> list[Target]:
-        """The variables that a reference means: `instance.variable`, `mesh/instance.variable`, or a key.
+    def targets(self, *references: str) -> list[Target]:
+        """The variables that references mean, each once: `instance.variable`, `mesh/instance.variable`, or a key.
 
         All may be patterns: in the short forms `*` means any characters, `?` one, and `re:` begins a regular
         expression; a key has the wildcards of Zenoh.
         """
-        reference = self._within(reference)
+        info = self.info()
+        found = [target for reference in references for target in self._meant(self._within(reference), info)]
+        return [*{target.key: target for target in found}.values()]
+
+    def _meant(self, reference: str, info: MeshInfo) -> list[Target]:
         if not is_key(reference, self.keys):
-            return self._targets_by_name(reference)
-        asked, info = key_expression(reference), self.info()
+            return self._targets_by_name(reference, info)
+        asked = key_expression(reference)
         instances = [
             name for name in info.instances if asked.intersects(zenoh.KeyExpr(f"{self.keys.instance(name)}/**"))
         ]
@@ -231,17 +244,19 @@ class MeshClient:
         """
         with Follower[Reading](self._session, self.keys) as follower:
             by_instance: dict[str, dict[str, Target]] = {}
+            subscribed: dict[str, list[str] | None] = {}
             for target in targets:
                 by_instance.setdefault(target.instance, {})[target.key] = target
             for name, own in by_instance.items():
                 every = len(own) == len(self._known.get(name, ()))
                 through = f"{self.keys.instance(name)}/*/*" if every else None
                 follower.subscribe(own.keys(), partial(_reading_among, own), through)
+                subscribed[name] = None if every else [target.variable.name for target in own.values()]
             there = follower.there.wait(self._timeout_s)
             if there:
                 # An answer of a node comes after the subscribers of this session have come to it.
                 with suppress(ConfigurationError, DeadlineExceeded):  # it is about to end
-                    self.all_status()
+                    self.all_status(subscribed)
             yield follower.to_the_last() if there else iter(())
 
     @contextmanager
@@ -265,9 +280,8 @@ class MeshClient:
             return reference
         return f"{self.keys.root}/{short}" if "/" in short.partition(".")[0] else short
 
-    def _targets_by_name(self, reference: str) -> list[Target]:
+    def _targets_by_name(self, reference: str, info: MeshInfo) -> list[Target]:
         instance, _, name = reference.partition(".")
-        info = self.info()
         names = info.instances
         if not name and not is_pattern(reference):
             known = instance if instance in names else "INSTANCE"
@@ -277,9 +291,8 @@ class MeshClient:
         if instance not in names and not is_pattern(reference):
             raise self._unknown_instance(instance, names)
         instances = [instance] if instance in names else names
-        found: dict[str, Target] = {}
-        for each in instances:
-            found |= self._variables(each, info.run)
+        each = [self._variables(one, info.run) for one in instances]
+        found = each[0] if len(each) == 1 else {full: target for own in each for full, target in own.items()}
         meant = [found[full_name] for full_name in matching(reference, found)]
         if not meant and instance in names:
             own = [target.variable.name for target in found.values()]
@@ -332,10 +345,10 @@ class MeshClient:
         except MeshLost as error:
             raise ConfigurationError(error.message) from error
 
-    def _get(self, key: str) -> list[zenoh.Sample]:
+    def _get(self, key: str, attachment: bytes | None = None) -> list[zenoh.Sample]:
         """The answers of all queryables that exist now; this does not wait for others."""
         try:
-            replies = self._session.get(key, timeout=self._timeout_s)
+            replies = self._session.get(key, timeout=self._timeout_s, attachment=attachment)
             return [sample for reply in replies if (sample := answer_of(reply)) is not None]
         except MeshLost as error:
             raise ConfigurationError(error.message) from error
