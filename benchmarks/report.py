@@ -12,7 +12,7 @@ from benchmarks.jobs import OTHER, Entry, Job
 from benchmarks.running import Measured
 from benchmarks.targets import TARGETS, Target
 
-__all__ = ["Report", "write_docs"]
+__all__ = ["Report", "replace_between", "write_docs"]
 
 _BEGIN = "<!-- measured: begin (written by `python -m benchmarks --write-docs`) -->"
 _END = "<!-- measured: end -->"
@@ -165,13 +165,21 @@ def write_docs(path: Path, report: Report) -> None:
     Raises:
         ValueError: the page has no markers.
     """
-    text = path.read_text()
-    before, begin, rest = text.partition(_BEGIN)
-    _, end, after = rest.partition(_END)
+    replace_between(path, _BEGIN, _END, report.markdown())
+
+
+def replace_between(path: Path, first: str, last: str, new: str) -> None:
+    """Replace what stands between two markers of a documentation page.
+
+    Raises:
+        ValueError: the page has no such markers.
+    """
+    before, begin, rest = path.read_text().partition(first)
+    _, end, after = rest.partition(last)
     if not begin or not end:
         msg = f"{path.name} has no markers for the measured part"
         raise ValueError(msg)
-    path.write_text(f"{before}{_BEGIN}\n\n{report.markdown()}\n\n{_END}{after}")
+    path.write_text(f"{before}{first}\n\n{new}\n\n{last}{after}")
 
 
 def _header(job: Job) -> Row:

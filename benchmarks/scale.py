@@ -3,6 +3,7 @@
 A chain `Integrator -> Gain -> Gain -> …`, each instance in a process of its own, or in groups; recorded is the last
 output. Sizes are interleaved, figures are medians. Every result is compared with that of `launch --local`, row by row.
 A second table tells what a connection costs before the run (`benchmarks.connections`); `--connections` is that alone.
+`--variables` is what an FMU with very many variables costs (`benchmarks.variables`), in a table of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from typing import Any
 
 from benchmarks.connections import measured
 from benchmarks.contestants.entry import FMUS
-from benchmarks.environment import loads, machine
+from benchmarks.environment import ROOT, loads, machine
+from benchmarks.variables import measured as measured_variables
+from benchmarks.variables import write_docs
 
 _SUMMARY = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
 _HEADER = "| instances | nodes | points | points/s | us per point and instance | start and end, s |"
@@ -112,7 +115,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("--repeat", type=int, default=3, metavar="N", help="interleaved rounds (3)")
     parser.add_argument("--connections", action="store_true", help="only what a connection costs before the run")
+    parser.add_argument("--variables", action="store_true", help="only what an FMU with very many variables costs")
+    parser.add_argument("--write-docs", action="store_true", help="put the table of variables into docs/performance.md")
     options = parser.parse_args()
+    if options.variables:
+        table = measured_variables(options.repeat)
+        print(table)
+        if options.write_docs:
+            write_docs(ROOT / "docs" / "performance.md", table)
+        return 0
     before = loads()
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
         for number in range(0 if options.connections else options.repeat):

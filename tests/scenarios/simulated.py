@@ -419,8 +419,8 @@ class _Session:
             self._process.receive_with(handler)
         return _Entity()
 
-    def declare_publisher(self, key: str, **_settings: object) -> _Entity:
-        return _Publisher(self._process, key) if "/@sync/" in key else _Entity()
+    def declare_publisher(self, key: object, **_settings: object) -> _Entity:
+        return _Publisher(self._process, str(key)) if "/@sync/" in str(key) else _Entity()
 
     def declare_queryable(self, _key: str, _handler: object = None) -> _Entity:
         return _Entity()

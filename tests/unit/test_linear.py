@@ -16,6 +16,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.instances.configuration import parse
 from fmu_mesh.system.connections import Variables, resolve_connections
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import make_plan
 from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription, Variable
@@ -78,6 +79,17 @@ def test_a_plan_takes_as_many_times_the_work_as_there_are_connections(system: st
 
     assert few > FEW
     assert many <= GROWTH * few  # less, because a part of the work is for all of them
+
+
+def test_a_place_in_a_row_is_found_without_looking_at_all_columns() -> None:
+    def finding(count: int) -> Callable[[], object]:
+        layout = Layout.of((f"v{number}", "Float64") for number in range(count))
+        return lambda: [(layout.place(name), layout.column(name), name in layout) for name in layout.names]
+
+    few, many = lines_run(finding(FEW)), lines_run(finding(MANY))
+
+    assert few > FEW
+    assert many <= GROWTH * few
 
 
 class Counted(dict[str, Variable]):
