@@ -167,10 +167,10 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
     with RunProcess(config.mesh, run.run) as process:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
         try:
-            own = wiring(zenoh, run.config_file, process.folder, MASTER, ())
-            session = open_session(patient(own, config.timeouts, is_node=False))
+            own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
+            session = open_session(own)
             process.stack.callback(close_session, session)
-            settings = _settings(run, process, own_endpoints(session) if zenoh.mode == "peer" else ())
+            settings = _settings(run, process, own_endpoints(session, own) if zenoh.mode == "peer" else ())
             master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))
             process.stack.callback(master.close)
             master.claim()

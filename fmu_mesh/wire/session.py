@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 import zenoh
@@ -55,6 +55,23 @@ _CANNOT_LISTEN = (
 """Why a session cannot listen at an endpoint: the text of the system, our text, and a hint."""
 
 
+_ADMIN_SPACE_IS_OURS: Final = {
+    "enabled": True,
+    "default_permission": "allow",
+    "rules": [
+        {
+            "id": "admin",
+            "messages": ["query"],
+            "flows": ["ingress"],
+            "permission": "deny",
+            "key_exprs": ["@/**"],
+        }
+    ],
+    "subjects": [{"id": "all"}],
+    "policies": [{"rules": ["admin"], "subjects": ["all"]}],
+}
+"""A session whose admin space others ask for its subscribers, while one comes or goes, stands for ever (zenoh 1.10)."""
+
 _CLOSE_S = 1.0
 _OWN_S = 5.0
 _LOOK_S = 0.05
@@ -95,6 +112,11 @@ class Wiring(msgspec.Struct, frozen=True):
     lease_s: float = LEASE_S
     stuck_s: float = _STUCK_S
     publishes: str | None = None
+
+    @property
+    def asks_itself(self) -> bool:
+        """Whether it listens at addresses of which only the session knows all: a port 0, or all that a host has."""
+        return not all(endpoint.startswith("unixsock-stream/") for endpoint in self.listen)
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
@@ -166,9 +188,11 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         ],
         # Measured: with the implicit shared memory, Python is slower for messages of 3 kB and more.
         "transport/shared_memory/enabled": False,
-        "adminspace/enabled": True,
+        "adminspace/enabled": wiring.asks_itself,
         "aggregation/publishers": [wiring.publishes] if wiring.publishes is not None else [],
     }
+    if wiring.asks_itself and json.loads(config.get_json("access_control/enabled")) is not True:
+        settings["access_control"] = _ADMIN_SPACE_IS_OURS
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
@@ -185,12 +209,14 @@ def close_session(session: zenoh.Session) -> None:
     closing.join(_CLOSE_S)
 
 
-def own_endpoints(session: zenoh.Session) -> tuple[str, ...]:
+def own_endpoints(session: zenoh.Session, wiring: Wiring) -> tuple[str, ...]:
     """The endpoints on which this session listens, with the ports that the system has chosen.
 
     Raises:
         DeadlineExceeded: they are not known in time.
     """
+    if not wiring.asks_itself:
+        return wiring.listen
     answer = ask(session, Question(f"@/{session.zid()}/*", "this Zenoh session", _OWN_S))
     return tuple(str(locator) for locator in json.loads(answer).get("locators", ()))
 
@@ -373,8 +399,9 @@ def run_router(listen: Sequence[str]) -> Iterator[tuple[str, ...]]:
         ConfigurationError: an endpoint cannot be used.
     """
     # Peers that connect to it, such as ROS nodes, find each other here and connect directly; it does not route.
-    session = open_session(Wiring(mode="router", listen=tuple(listen), gossip=True, stuck_s=LEASE_S))
+    wiring = Wiring(mode="router", listen=tuple(listen), gossip=True, stuck_s=LEASE_S)
+    session = open_session(wiring)
     try:
-        yield own_endpoints(session)
+        yield own_endpoints(session, wiring)
     finally:
         session.close()

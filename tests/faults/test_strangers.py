@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import yaml
 import zenoh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -341,6 +342,23 @@ def test_many_subscribers_and_tokens_of_a_stranger_do_no_harm(place: Place, *, s
             session.liveliness().declare_token(f"{root}/x{number}")
             session.liveliness().declare_token(keys.node("left")).undeclare()
             session.liveliness().declare_token(keys.node(f"x{number}"))
+    assert_unharmed(place, config, launched)
+
+
+@pytest.mark.parametrize("listen", [[], ["tcp/127.0.0.1:0"]], ids=["sockets", "network"])
+def test_no_session_of_a_mesh_tells_strangers_about_itself(place: Place, listen: list[str]) -> None:
+    # Zenoh answers with its own tables, and stands for ever when another program subscribes meanwhile.
+    config = config_of(place, shared_memory=True)
+    data = yaml.safe_load(config.read_text())
+    data["zenoh"]["listen"] = listen
+    config.write_text(yaml.safe_dump(data))
+    with paused(place, config) as (launched, stranger):
+        replies = [*stranger.session.get("@/**", timeout=DEADLINE_S)]
+        assert len(place.note().endpoints) == 1 + len(listen)
+        own = f"@/{stranger.session.zid()}/"
+    assert not [
+        key for reply in replies if reply.ok is not None and not (key := str(reply.ok.key_expr)).startswith(own)
+    ]
     assert_unharmed(place, config, launched)
 
 
