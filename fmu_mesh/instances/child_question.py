@@ -9,21 +9,46 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from ..errors import LoadFailed
+import msgspec
 
-__all__ = ["ask_child", "run_child"]
+from ..errors import LoadFailed
+from ..variables.model_description import ModelDescription
+
+__all__ = ["ask_description_of", "described", "run_child"]
 
 _DEADLINE_S = 60.0
 _KILLED_S = 10.0
 _SHOWN_CHARACTERS = 300
 
+_Answer = ModelDescription | tuple[str, str | None]
+"""A description, or why there is none and what to do."""
 
-def ask_child(module: str, request: str, python: str = sys.executable) -> tuple[bytes, str]:
-    """What ``answer_to`` of a module answers to a request in a child process, and as `run_child` how that ended."""
-    return run_child([python, "-Pm", __package__, module, request])
+
+def ask_description_of(what: str, module: str, request: str, python: str = sys.executable) -> ModelDescription:
+    """What ``answer_to`` of a module answers to a request in a child process; ``what`` happens there, as errors say it.
+
+    Raises:
+        LoadFailed: there is no description, or the process ended without an answer; says why.
+    """
+    output, ending = run_child([python, "-Pm", __package__, module, request])
+    try:
+        answer: _Answer = msgspec.msgpack.decode(output, type=_Answer)
+    except msgspec.DecodeError:
+        raise LoadFailed(f"{what} {ending}") from None
+    if isinstance(answer, tuple):
+        raise LoadFailed(answer[0], hint=answer[1])
+    return answer
+
+
+def described(describe: Callable[[], ModelDescription]) -> bytes:
+    """In the child process: the answer to `ask_description_of`."""
+    try:
+        return msgspec.msgpack.encode(describe())
+    except LoadFailed as error:
+        return msgspec.msgpack.encode((error.message, error.hint))
 
 
 def run_child(command: Sequence[str]) -> tuple[bytes, str]:

@@ -17,7 +17,7 @@ import pytest
 from fmu_mesh.config.instance_sections import ActuatorConfig
 from fmu_mesh.errors import LoadFailed, StepFailed
 from fmu_mesh.instances.mujoco.mujoco_section import MujocoConfig
-from fmu_mesh.instances.mujoco.mujoco_world import describe_world
+from fmu_mesh.instances.mujoco.mujoco_world import load_world
 from tests.physics.mujoco_worlds import Driven, body, slider, write_world
 
 HINGE = (
@@ -52,7 +52,7 @@ def test_a_model_is_described_as_an_fmu_is(tmp_path: Path) -> None:
     motor = "<actuator><motor name='motor' joint='joint'/></actuator>"
     path = write_world(tmp_path, HINGE + slider(), rest=sensors + motor)
 
-    description = describe_world(path, SECTION)
+    description = load_world(path, SECTION).description
 
     variables = {variable.name: variable for variable in description.variables}
     assert (description.model_name, description.kind) == ("test", "physics_engine")
@@ -83,23 +83,23 @@ def test_a_model_that_cannot_be_loaded_says_why(tmp_path: Path) -> None:
     broken.write_text("<mujoco><worldbody><body><joint axel='1 0 0'/></body></worldbody></mujoco>", encoding="utf-8")
 
     with pytest.raises(LoadFailed, match="unrecognized attribute: 'axel'"):
-        describe_world(broken, SECTION)
+        load_world(broken, SECTION)
     with pytest.raises(LoadFailed, match="No such file"):
-        describe_world(tmp_path / "absent.xml", SECTION)
+        load_world(tmp_path / "absent.xml", SECTION)
 
 
 def test_without_mujoco_the_way_out_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
 
     with pytest.raises(LoadFailed, match=r"not installed.*pip install 'fmu-mesh\[physics\]'"):
-        describe_world(write_world(tmp_path, slider()), SECTION)
+        load_world(write_world(tmp_path, slider()), SECTION)
 
 
 def test_an_unknown_keyframe_is_refused_with_the_nearest(tmp_path: Path) -> None:
     path = write_world(tmp_path, slider(), rest="<keyframe><key name='moving' qvel='1'/></keyframe>")
 
     with pytest.raises(LoadFailed, match=r"no keyframe 'movin', but moving.*Did you mean 'moving'"):
-        describe_world(path, MujocoConfig(mujoco="world.xml", keyframe="movin"))
+        load_world(path, MujocoConfig(mujoco="world.xml", keyframe="movin"))
 
 
 # --- where it starts
@@ -114,7 +114,7 @@ def test_it_starts_at_the_keyframe_with_start_values_on_top(tmp_path: Path) -> N
     world = Driven(path, outputs=names, config=config, start_values={"slide.velocity": -1.0})
 
     assert list(world.read().values()) == [3.0, -1.0, 0.0, 3.0]
-    start = {v.name: v.start for v in describe_world(path, config).variables}
+    start = {v.name: v.start for v in load_world(path, config).description.variables}
     assert (start["slide.position"], start["slide.velocity"]) == (3.0, 2.0)
 
 
@@ -264,7 +264,7 @@ def test_velocities_are_how_positions_change(tmp_path: Path, seed: int) -> None:
 
 
 def test_a_wind_that_is_connected_is_felt_at_the_first_point(tmp_path: Path) -> None:
-    description = describe_world(write_world(tmp_path, body()), SECTION)
+    description = load_world(write_world(tmp_path, body()), SECTION).description
 
     felt = {v.name for v in description.variables if v.dependencies == ("wind_x", "wind_y", "wind_z")}
 
@@ -438,7 +438,7 @@ def test_what_of_a_model_has_no_variables_is_told(text: str, notes: tuple[str, .
     path = tmp_path / "model.xml"
     path.write_text(text, encoding="utf-8")
 
-    description = describe_world(path, MujocoConfig(mujoco=""))
+    description = load_world(path, MujocoConfig(mujoco="")).description
 
     assert description.problems == notes
     assert ("turn.position" in {v.name for v in description.variables}) == ("robot" in text)

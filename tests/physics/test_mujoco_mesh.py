@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from fmu_mesh.cli.main import main
+from fmu_mesh.errors import LoadFailed
+from fmu_mesh.instances import child_question
+from fmu_mesh.instances.mujoco.mujoco_section import MujocoConfig
+from fmu_mesh.instances.registry import describe
 from tests.helpers import FMUS, Place, row_count, rows_of, wait_until
+from tests.physics.mujoco_worlds import write_world
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs"
@@ -125,15 +129,26 @@ def test_check_shows_a_world_its_couplings_and_its_controllers(capsys: pytest.Ca
 
 
 def test_without_mujoco_check_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco", None)
+    (tmp_path / "mujoco.py").write_text("raise ImportError('not here')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
     assert main(["check", str(CONFIGS / "fluid_body.yaml")]) == 2
 
     message = capsys.readouterr().err
     assert "instances.world.mujoco: MuJoCo is not installed" in message
     assert "pip install 'fmu-mesh[physics]'" in message
+
+
+def test_a_model_that_is_loaded_for_ever_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child_question, "_DEADLINE_S", 3.0)
+    path = write_world(tmp_path, "<replicate count='2000000000'><body><geom size='1'/></body></replicate>")
+
+    with pytest.raises(LoadFailed) as caught:
+        describe(path, MujocoConfig(mujoco=path.name))
+
+    assert str(caught.value) == f"MuJoCo, which loads '{path}', did not end within 3 s"
 
 
 def test_a_world_that_is_not_there_is_refused_with_the_nearest_file(

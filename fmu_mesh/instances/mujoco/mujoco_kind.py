@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
+
 from ...config.mesh import LimitsConfig
 from ...variables.model_description import ModelDescription
+from ..child_question import ask_description_of, described
 from ..contract import Instance, Kind, LogMessage, Opening, Showing
 from .mujoco_section import MujocoConfig
 
@@ -27,14 +30,13 @@ class MujocoKind(Kind[MujocoConfig]):
         limits: LimitsConfig,  # noqa: ARG002  for FMUs
         tell: Callable[[str], None],  # noqa: ARG002  loading a model is fast
     ) -> ModelDescription:
-        """Load the model; its joints, bodies, sensors and actuators are the variables."""
-        from .mujoco_world import describe_world  # noqa: PLC0415  only where there is a world
-
-        return describe_world(path, section)
+        """Load the model in a child process; its joints, bodies, sensors and actuators are the variables."""
+        request = msgspec.json.encode((str(path), section)).decode()
+        return ask_description_of(f"MuJoCo, which loads '{path}',", __name__, request)
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the model and of all files that it includes."""
-        from .mujoco_files import world_content  # noqa: PLC0415  as above
+        from .mujoco_files import world_content  # noqa: PLC0415  only where there is a world
 
         return world_content(path)
 
@@ -60,6 +62,14 @@ class MujocoKind(Kind[MujocoConfig]):
             opening.log(LogMessage(opening.name, status, "engine", text, step))
 
         return MujocoInstance(opening.path, opening.name, opening.section, log, picture)
+
+
+def answer_to(request: str) -> bytes:
+    """In the child process: the description of a model, or why there is none."""
+    from .mujoco_world import load_world  # noqa: PLC0415  as above
+
+    path, section = msgspec.json.decode(request, type=tuple[str, MujocoConfig])
+    return described(lambda: load_world(Path(path), section).description)
 
 
 KIND_OF_MUJOCO = MujocoKind()

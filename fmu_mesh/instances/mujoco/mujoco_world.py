@@ -39,7 +39,7 @@ from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
 from .mujoco_section import MujocoConfig
 
-__all__ = ["MujocoVariable", "Where", "World", "describe_world", "engine", "load_world", "warnings"]
+__all__ = ["MujocoVariable", "Where", "World", "engine", "load_world", "warnings"]
 
 Where = Literal[
     "position",
@@ -98,15 +98,6 @@ class World(msgspec.Struct, frozen=True):
     entries: tuple[MujocoVariable, ...]
     limits: tuple[tuple[int, float, float], ...]
     keyframe: int | None
-
-
-def describe_world(path: Path, config: MujocoConfig) -> ModelDescription:
-    """The model description of the model at ``path``.
-
-    Raises:
-        LoadFailed: MuJoCo is not installed, or cannot load the model.
-    """
-    return load_world(path, config).description
 
 
 def load_world(path: Path, config: MujocoConfig) -> World:

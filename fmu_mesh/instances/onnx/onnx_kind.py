@@ -19,13 +19,10 @@ from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotF
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
-from ..child_question import ask_child
+from ..child_question import ask_description_of, described
 from ..contract import Instance, Kind, Opening
 
 __all__ = ["KIND_OF_ONNX_MODELS", "OnnxConfig"]
-
-_Answer = tuple[ModelDescription | None, str, str | None]
-"""A description, or why there is none, and what to do."""
 
 
 class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="onnx"):
@@ -54,14 +51,7 @@ class OnnxKind(Kind[OnnxConfig]):
     ) -> ModelDescription:
         """Load the model and compute it twice, in a child process; its inputs and outputs are the variables."""
         request = msgspec.json.encode((str(path), limits)).decode()
-        output, ending = ask_child(__name__, request)
-        try:
-            answer: _Answer = msgspec.msgpack.decode(output, type=_Answer)
-        except msgspec.DecodeError:
-            raise LoadFailed(f"onnxruntime, which loads and computes '{path}', {ending}") from None
-        if answer[0] is None:
-            raise LoadFailed(answer[1], hint=answer[2])
-        return answer[0]
+        return ask_description_of(f"onnxruntime, which loads and computes '{path}',", __name__, request)
 
     def content(self, path: Path) -> str:
         """The SHA-256 of the file: nothing else is read."""
@@ -84,11 +74,7 @@ def answer_to(request: str) -> bytes:
     from .onnx_model import OnnxModel  # noqa: PLC0415  onnxruntime is an extra, and slow to import
 
     path, limits = msgspec.json.decode(request, type=tuple[str, LimitsConfig])
-    try:
-        answer: _Answer = (OnnxModel(Path(path), limits).description, "", None)
-    except LoadFailed as error:
-        answer = (None, error.message, error.hint)
-    return msgspec.msgpack.encode(answer)
+    return described(lambda: OnnxModel(Path(path), limits).description)
 
 
 KIND_OF_ONNX_MODELS = OnnxKind()

@@ -14,14 +14,12 @@ import msgspec
 from ... import __version__
 from ...errors import FmuMeshError, LoadFailed
 from ...variables.model_description import ModelDescription
-from ..child_question import ask_child, run_child
+from ..child_question import ask_description_of, described, run_child
 from .component_description import check_arguments
 from .importing import ImportedComponent
 from .python_section import PythonConfig, class_place_of
 
 __all__ = ["answer_to", "ask_description"]
-
-_VERSION = "import fmu_mesh; print(fmu_mesh.__version__)"
 
 
 class _Request(msgspec.Struct, frozen=True):
@@ -30,15 +28,6 @@ class _Request(msgspec.Struct, frozen=True):
     python: str
     path: str
     arguments: dict[str, Any]
-
-
-class _Answer(msgspec.Struct, frozen=True):
-    """The description, or why there is none; ``version`` is that of fmu_mesh in the child process."""
-
-    version: str
-    description: ModelDescription | None = None
-    error: str = ""
-    hint: str | None = None
 
 
 def ask_description(path: Path, section: PythonConfig) -> ModelDescription:
@@ -54,33 +43,26 @@ def ask_description(path: Path, section: PythonConfig) -> ModelDescription:
     target = class_place_of(section.python)
     if target.file and not path.is_file():
         raise LoadFailed("a folder" if path.is_dir() else "no such file")
-    python = section.interpreter or sys.executable
+    if section.interpreter is not None:
+        _check_version(section.interpreter)
     request = msgspec.json.encode(_Request(section.python, str(path), section.arguments)).decode()
-    output, ending = ask_child(__name__, request, python)
-    try:
-        answer = msgspec.msgpack.decode(output, type=_Answer)
-    except msgspec.DecodeError:
-        if section.interpreter is not None:
-            _check_version(python)
-        raise LoadFailed(f"its import {ending}") from None
-    if answer.version != __version__:
-        raise _wrong_version(python, f"has fmu-mesh {answer.version}")
-    if answer.description is None:
-        raise LoadFailed(answer.error, hint=answer.hint)
-    return answer.description
+    return ask_description_of("its import", __name__, request, section.interpreter or sys.executable)
 
 
 def answer_to(request: str) -> bytes:
     """In the child process: import what is asked for; returns the answer."""
     asked = msgspec.json.decode(request, type=_Request)
     component = ImportedComponent(Path(asked.path), class_place_of(asked.python))
-    try:
-        description = component.load()
-        check_arguments(component.cls, asked.arguments)
-        answer = _Answer(__version__, description)
-    except (Exception, SystemExit) as error:  # noqa: BLE001 it is code of the user
-        answer = _Answer(__version__, error=component.told(error), hint=_hint(error))
-    return msgspec.msgpack.encode(answer)
+
+    def describe() -> ModelDescription:
+        try:
+            description = component.load()
+            check_arguments(component.cls, asked.arguments)
+        except (Exception, SystemExit) as error:  # it is code of the user
+            raise LoadFailed(component.told(error), hint=_hint(error)) from error
+        return description
+
+    return described(describe)
 
 
 def _hint(error: BaseException) -> str | None:
@@ -95,12 +77,9 @@ def _check_version(python: str) -> None:
     Raises:
         LoadFailed: it has another one, or none.
     """
-    output, _ = run_child([python, "-c", _VERSION])
+    output, _ = run_child([python, "-Pc", "import fmu_mesh; print(fmu_mesh.__version__)"])
     version = output.decode(errors="replace").strip()
     if version != __version__:
-        raise _wrong_version(python, f"has fmu-mesh {version}" if version else "has no fmu-mesh")
-
-
-def _wrong_version(python: str, what: str) -> LoadFailed:
-    hint = f"Install fmu-mesh {__version__} there: {python} -m pip install fmu-mesh=={__version__}"
-    return LoadFailed(f"the Python '{python}' {what}", hint=hint)
+        has = f"has fmu-mesh {version}" if version else "has no fmu-mesh"
+        hint = f"Install fmu-mesh {__version__} there: {python} -m pip install fmu-mesh=={__version__}"
+        raise LoadFailed(f"the Python '{python}' {has}", hint=hint)
