@@ -14,7 +14,7 @@ from xml.parsers import expat
 
 from lxml import etree
 
-from ..archives.safe_xml import safe_xml
+from ..archives.safe_xml import safe_xml, syntax_error
 from ..errors import LoadFailed
 from ..text import listed, nearest, printable, shown
 from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
@@ -266,7 +266,7 @@ def _add_syntax(data: bytes, file: str, error: LoadFailed, problems: Problems) -
             found = f"the prefix '{unbound[1]}' of {unbound[1]}:{unbound[2]}, which is bound to no namespace"
             problems.add(FilePlace(file, line, ""), found, f'xmlns:{unbound[1]}="..." on it or on an element around it')
         else:
-            problems.add(FilePlace(file, line, ""), f"no well-formed XML: {cause.msg}", "XML 1.0")
+            problems.add(FilePlace(file, line, ""), f"no well-formed XML: {syntax_error(cause)}", "XML 1.0")
         return
     text = data.replace(b"\0", b"")  # in UTF-16 every second byte of it
     match = _DOCUMENT_TYPE.search(text)

@@ -19,7 +19,7 @@ from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFail
 from fmu_mesh.instances.gazebo import gazebo_process
 from fmu_mesh.instances.gazebo.gazebo_classic import GazeboClassicInstance
 from fmu_mesh.instances.gazebo.gazebo_section import GazeboClassicConfig
-from fmu_mesh.instances.gazebo.gazebo_world import describe_gazebo_world, load_gazebo_world
+from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import Options
@@ -93,7 +93,7 @@ def test_an_example_world_has_the_joints_and_bodies_of_its_twin(name: str) -> No
     bodies = {model.body(number).name: float(model.body_mass[number]) for number in range(1, model.nbody)}
     joints = {model.joint(number).name for number in range(model.njnt)} - {""}
 
-    variables = describe_gazebo_world(WORLDS / f"{name}.sdf", GazeboClassicConfig(gazebo_classic="")).variables
+    variables = load_gazebo_world(WORLDS / f"{name}.sdf", GazeboClassicConfig(gazebo_classic="")).description.variables
 
     names = {variable.name for variable in variables}
     assert {name.removesuffix(".effort") for name in names if name.endswith(".effort")} == joints
@@ -104,7 +104,7 @@ def test_an_example_world_has_the_joints_and_bodies_of_its_twin(name: str) -> No
 def test_names_that_two_models_share_are_told_apart_by_the_model(tmp_path: Path) -> None:
     path = write_world(tmp_path, arm("left") + arm("right") + arm("third", "wrist", kind="prismatic"))
 
-    description = describe_gazebo_world(path, GazeboClassicConfig(gazebo_classic=""))
+    description = load_gazebo_world(path, GazeboClassicConfig(gazebo_classic="")).description
 
     positions = [v for v in description.variables if v.name.endswith(".position")]
     assert [(v.name, v.unit) for v in positions] == [
@@ -118,7 +118,7 @@ def test_names_that_two_models_share_are_told_apart_by_the_model(tmp_path: Path)
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("no xml", "cannot be read as an SDF world: syntax error"),
+        ("no xml", "cannot be read: Start tag expected"),
         ("<sdf version='1.6'><model name='m'/></sdf>", "is no SDF file with one world"),
         (
             "<sdf version='1.6'><world name='w'><include><uri>model://house</uri></include></world></sdf>",
@@ -144,6 +144,14 @@ def test_names_that_two_models_share_are_told_apart_by_the_model(tmp_path: Path)
             "<sdf version='1.6'><world name='w'><physics><max_step_size>fast</max_step_size></physics></world></sdf>",
             "has 'fast' where a number should be",
         ),
+        (
+            f"<sdf version='1.6'><world name='w'>{'<model>' * 5000}{'</model>' * 5000}</world></sdf>",
+            "elements are nested more than 255 deep",
+        ),
+        (
+            "<!DOCTYPE l [<!ENTITY a 'b'>]><sdf version='1.6'><world name='&a;'/></sdf>",
+            "declares a document type, with which XML can expand without limit",
+        ),
     ],
 )
 def test_a_file_that_gazebo_could_not_load_by_itself_is_refused(text: str, expected: str, tmp_path: Path) -> None:
@@ -151,7 +159,7 @@ def test_a_file_that_gazebo_could_not_load_by_itself_is_refused(text: str, expec
     path.write_text(text, encoding="utf-8")
 
     with pytest.raises(LoadFailed) as caught:
-        describe_gazebo_world(path, GazeboClassicConfig(gazebo_classic=""))
+        load_gazebo_world(path, GazeboClassicConfig(gazebo_classic=""))
 
     assert expected in caught.value.message
 

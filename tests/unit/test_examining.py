@@ -59,6 +59,19 @@ def test_a_build_description_with_a_document_type_is_refused(tmp_path: Path) -> 
         read_description(path)
 
 
+@pytest.mark.parametrize(
+    "content", ["<a>" * 5000 + "</a>" * 5000, f"<a b='{'x' * 11_000_000}'/>"], ids=["deep", "a large attribute"]
+)
+def test_a_limit_that_a_description_exceeds_is_in_the_error(content: str, tmp_path: Path) -> None:
+    path = repacked(tmp_path / "hostile.fmu", description=lambda text: text.replace("<ModelVariables>", content, 1))
+
+    with pytest.raises(LoadFailed) as caught:
+        read_description(path)
+
+    assert "nested more than 255 deep, or a tag, an attribute or a text has more than 10 million" in str(caught.value)
+    assert "XML_PARSE_HUGE" not in str(caught.value)
+
+
 CANNOT_RUN = [
     pytest.param(("<?xml", "<<?xml"), "cannot be read: ", id="XML that is not well-formed"),
     pytest.param(

@@ -28,9 +28,9 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
         tell: Callable[[str], None],  # noqa: ARG002  reading a world is fast
     ) -> ModelDescription:
         """Read the world; its joints and links are the variables. Gazebo is not needed for that."""
-        from .gazebo_world import describe_gazebo_world  # noqa: PLC0415  only where there is a world
+        from .gazebo_world import load_gazebo_world  # noqa: PLC0415  only where there is a world
 
-        return describe_gazebo_world(path, section)
+        return load_gazebo_world(path, section).description
 
     def content(self, path: Path) -> str:
         """The SHA-256 of the file: nothing else is read, see `fmu_mesh.instances.gazebo.gazebo_world`."""

@@ -15,6 +15,7 @@ from urllib.parse import unquote
 
 import msgspec
 
+from ...archives.safe_xml import safe_xml
 from ...errors import LoadFailed
 from ...files import opened
 
@@ -80,7 +81,8 @@ def read_world(path: Path) -> SdfWorld:
     try:
         with opened(path) as file:
             source = file.read()
-        root = ET.fromstring(source)  # noqa: S314  a file of the user's own; it is run as a simulation anyway
+        safe_xml(source, f"'{path}'")
+        root = ET.fromstring(source)  # noqa: S314  it was parsed safely
     except (OSError, ET.ParseError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise LoadFailed(f"'{path}' cannot be read as an SDF world: {reason}") from error

@@ -24,7 +24,7 @@ from ...variables.model_description import Causality, DefaultExperiment, ModelDe
 from .gazebo_sdf import GazeboModel, read_world
 from .gazebo_section import GazeboClassicConfig
 
-__all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "describe_gazebo_world", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
@@ -83,15 +83,6 @@ class GazeboWorld(msgspec.Struct, frozen=True):
     links: tuple[GazeboLink, ...]
     description: ModelDescription
     places: dict[str, GazeboPlace]
-
-
-def describe_gazebo_world(path: Path, config: GazeboClassicConfig) -> ModelDescription:
-    """The model description of the world at ``path``.
-
-    Raises:
-        LoadFailed: it is no world that Gazebo could load without looking elsewhere.
-    """
-    return load_gazebo_world(path, config).description
 
 
 def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
