@@ -6,7 +6,6 @@ is made of what is there, and never waits for the mesh.
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections import OrderedDict, deque
@@ -268,7 +267,7 @@ class MeshFollower:
     # --- on the thread of the samples
 
     def _sample(self, run: Run, info: MeshInfo, ended: threading.Event) -> None:
-        path = Path(info.result_file) if info.result_file is not None and info.host == socket.gethostname() else None
+        path = Path(info.result_file) if info.result_file is not None and info.is_here else None
         source = ResultSource(path)
         try:
             while not (self._closing.is_set() or self._next_run.is_set()):

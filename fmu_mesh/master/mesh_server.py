@@ -22,6 +22,7 @@ from ..system.plan import Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
+from ..wire.runtime import this_host
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine, MeshInfo, MeshStatus
@@ -185,4 +186,5 @@ def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], 
         pid=os.getpid(),
         host=socket.gethostname(),
         shared_memory=tuple(shared),
+        host_id=this_host(),
     )

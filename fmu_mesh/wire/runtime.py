@@ -40,6 +40,7 @@ __all__ = [
     "run_name",
     "runtime_folder",
     "socket_endpoint",
+    "this_host",
     "tidy_run_folder",
     "write_note",
 ]
@@ -111,11 +112,11 @@ def run_folder(mesh: str, run: str) -> Path:
 def run_name() -> str:
     """A name for a run of this process: the process id, the host, and from the second run on the number of the run."""
     number = next(_runs)
-    return f"{os.getpid()}-{_this_host()}" + (f"-{number}" if number > 1 else "")
+    return f"{os.getpid()}-{this_host()}" + (f"-{number}" if number > 1 else "")
 
 
 @cache
-def _this_host() -> str:
+def this_host() -> str:
     """Six digits for all processes that see the same process ids: those of one boot of a host, or of one container."""
     facts = socket.gethostname()
     with suppress(OSError):  # the system has no /proc
@@ -127,7 +128,7 @@ def _this_host() -> str:
 def _launcher_of(folder: Path) -> int | None:
     """The process id of the launcher of the run that a folder belongs to; None without a launcher on this host."""
     pid, _, rest = folder.suffix.removeprefix(".").partition("-")
-    return int(pid) if pid.isdigit() and rest.startswith(_this_host()) else None
+    return int(pid) if pid.isdigit() and rest.startswith(this_host()) else None
 
 
 def _private(folder: Path) -> Path:
@@ -266,7 +267,7 @@ def _socket_name(node: str) -> str:
 def write_note(folder: Path, note: MeshNote) -> None:
     """Write the note of a running mesh atomically, so that no reader gets an incomplete one."""
     temporary = folder / "mesh.json.new"
-    note = msgspec.structs.replace(note, host=_this_host())
+    note = msgspec.structs.replace(note, host=this_host())
     temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
     temporary.replace(folder / "mesh.json")
 
@@ -309,7 +310,7 @@ def _own_note(file: Path) -> MeshNote | None:
         note = msgspec.json.decode(file.read_bytes(), type=MeshNote)
     except (OSError, msgspec.DecodeError):
         return None
-    return note if note.host == _this_host() else None
+    return note if note.host == this_host() else None
 
 
 def is_alive(pid: int) -> bool:

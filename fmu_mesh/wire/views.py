@@ -9,6 +9,7 @@ import msgspec
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
+from .runtime import this_host
 
 __all__ = [
     "GOING_ON",
@@ -155,6 +156,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
         result_files: all of them.
         shared_memory: the processes that exchange values, grants and progress through the memory of the master's host;
             all others do it through Zenoh. Empty until all nodes are ready.
+        host_id: of the master's host; ``host`` is a name, which two hosts can have.
     """
 
     mesh: str
@@ -175,6 +177,12 @@ class MeshInfo(msgspec.Struct, frozen=True):
     host: str
     shared_memory: tuple[str, ...] = ()
     result_files: tuple[str, ...] = ()
+    host_id: str = ""
+
+    @property
+    def is_here(self) -> bool:
+        """Whether the master runs on this host, so that its paths are those of this process."""
+        return self.host_id == this_host()
 
 
 class MeshStatus(msgspec.Struct, frozen=True):

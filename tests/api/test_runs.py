@@ -7,6 +7,7 @@ import sys
 import threading
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -222,6 +223,16 @@ def test_a_cancelled_wait_leaves_the_run() -> None:
     with steered(stop_time=None).start(record="memory") as run:
         asyncio.run(cancelled(run))
         assert run.get("gain.y") == 0.0
+
+
+def test_a_host_is_told_by_its_id_and_not_by_its_name() -> None:
+    with steered().start(record="memory", paused=True) as run:
+        here = run.info()
+
+    elsewhere = msgspec.structs.replace(here, host_id="another")
+
+    assert (here.is_here, elsewhere.is_here) == (True, False)
+    assert here.host == elsewhere.host
 
 
 def test_one_of_several_meshes_is_found_by_its_name() -> None:
