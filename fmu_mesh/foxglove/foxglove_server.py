@@ -27,7 +27,7 @@ from ..errors import ConfigurationError
 from ..wire.views import LogLine
 from .mesh_parameters import MeshParameters
 from .mesh_topics import STATUS_SCHEMA
-from .relay import Relay
+from .relay import Relay, let_in
 
 __all__ = ["PORT", "FoxgloveServer"]
 
@@ -284,8 +284,15 @@ def _listening(host: str, port: int) -> socket.socket:
     """A socket that listens.
 
     Raises:
-        ConfigurationError: the port is in use, or the address is none of this host.
+        ConfigurationError: the port is in use, the address is none of this host, or there are no socket filters.
     """
+    try:
+        with socket.socket() as own:
+            let_in(own, None)
+    except OSError as error:
+        text = f"the kernel lets nobody protect the server with a socket filter: {error.strerror}."
+        hint = "Start it with --connect where a usual Linux kernel runs; `fmu-mesh dashboard` needs no filter."
+        raise ConfigurationError(text, hint=hint) from error
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:

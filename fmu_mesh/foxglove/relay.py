@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["Relay", "is_loopback"]
+__all__ = ["Relay", "is_loopback", "let_in"]
 
 _OURS: Final = ("https://app.foxglove.dev",)
 _HEAD_BYTES: Final = 16 << 10
@@ -48,7 +48,7 @@ class Relay:
         self._port = port
         self._token = token.encode()
         self._origins = {*_OURS, *origins}
-        _let_in(self._inner, None)
+        let_in(self._inner, None)
         self._loop = asyncio.new_event_loop()
         self._connecting = asyncio.Lock()
         self._thread = threading.Thread(target=self._run, name="relay", daemon=True)
@@ -99,14 +99,14 @@ class Relay:
             own = socket.socket()
             own.settimeout(0)
             own.bind((_LOCAL, 0))
-            _let_in(self._inner, own.getsockname()[1])
+            let_in(self._inner, own.getsockname()[1])
             try:
                 await self._loop.sock_connect(own, (_LOCAL, self._port))
                 reader, writer = await asyncio.open_connection(sock=own)
                 writer.write(head)  # without the token, which goes no further
                 client.write(await reader.read(_HEAD_BYTES))
             finally:
-                _let_in(self._inner, None)
+                let_in(self._inner, None)
         return reader, writer
 
 
@@ -138,7 +138,7 @@ def _listening_at(port: int) -> socket.socket:
     raise RuntimeError(f"no socket of this process listens at port {port}")
 
 
-def _let_in(listener: socket.socket, port: int | None) -> None:
+def let_in(listener: socket.socket, port: int | None) -> None:
     """From now on, the kernel drops all packets to a listening socket but those from a port of 127.0.0.1.
 
     A connection keeps the filter that it was made with.

@@ -15,6 +15,8 @@ from websockets.exceptions import InvalidHandshake
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
+from fmu_mesh.cli.main import main
+from fmu_mesh.foxglove import relay
 from tests.foxglove_client import FoxgloveClient
 from tests.helpers import DEADLINE_S, Launched, Place, assert_readable, rows_of, wait_until, write_config
 
@@ -314,3 +316,22 @@ def test_nobody_passes_by_the_token_at_the_port_behind_it(place: Place) -> None:
 
     assert len(ports) == 1
     assert gets_in(url)
+
+
+def test_without_filters_for_sockets_it_ends_with_a_way_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(relay, "_SO_ATTACH_FILTER", 9999)  # an option that no kernel has
+    before = listening_ports()
+
+    assert main(["foxglove", "--port", "0"]) == 2
+
+    told = capsys.readouterr().err
+    assert "the kernel lets nobody protect the server with a socket filter: Protocol not available." in told
+    assert "Start it with --connect where a usual Linux kernel runs" in told
+    assert listening_ports() == before
+
+
+def listening_ports() -> list[int]:
+    """The ports at which this process listens."""
+    return [one.laddr.port for one in psutil.Process().net_connections("tcp") if one.status == psutil.CONN_LISTEN]
