@@ -10,6 +10,8 @@ from .. import files
 from ..config.findings import Findings
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, Finding
+from ..instances.configuration import examine_data
+from ..run.allowed_code import check_code
 from ..run.options import Options, with_needed
 from ..ssp.configuration_files import RESULT_BESIDE_PACKAGE, named_package, read_configuration
 from ..text import short_path
@@ -51,7 +53,7 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
         simulation: keys of the section `simulation`, in the place of what ``source`` says.
 
     Returns:
-        What ``source`` says and ``target`` does not.
+        What ``source`` says and ``target`` does not, and the code that only ``target`` may name.
 
     Raises:
         ConfigurationError: ``source`` is wrong, or ``target`` cannot be written; nothing is left of it.
@@ -72,6 +74,8 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
         return mesh.to_ssp(target, version=version)
     if isinstance(given.data, dict) and given.data.get("record") == {"file": RESULT_BESIDE_PACKAGE}:
         del given.data["record"]  # the result file of the new configuration is beside that
+    told: list[str] = []
+    check_code(examine_data(given)[0], Findings(""), told.append, "which this file may name, as it is your own")
     text = "".join(f"# {line}\n" if line else "#\n" for line in _comment(source, ssd, given)) + mesh.to_yaml(
         target.parent
     )
@@ -80,7 +84,7 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
             draft.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigurationError(f"'{target}' cannot be written: {error.strerror}") from error
-    return given.warnings
+    return *given.warnings, *(Finding(str(target), "", text, "") for text in told)
 
 
 def _comment(source: Path, ssd: str | None, given: PlainConfig) -> Iterator[str]:

@@ -23,14 +23,14 @@ from ..errors import ConfigurationError
 __all__ = ["check_code", "check_owner", "names_code"]
 
 
-def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], None], *, allow_code: bool) -> None:
+def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], None], allowed: str) -> None:
     """Check that all code of a configuration may run: add a finding for each instance whose code may not.
 
     Args:
         loaded: the configuration, with absolute paths of interpreters.
         findings: those of the configuration.
         tell: called with what runs only because it is allowed.
-        allow_code: whether the user allows it.
+        allowed: why it is allowed, in words, such as "because of `--allow-code`"; empty if it is not.
     """
     source = loaded.foreign or _other_owner(loaded.file)
     for name, section in loaded.config.instances.items():
@@ -44,12 +44,12 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
             mode = stat.S_IMODE(open_path.stat().st_mode)
             found = f"other users can write '{open_path}', which has mode {mode:04o}"
             expected = f"one that only you can write (`chmod go-w {open_path}`), or `--allow-code`"
-        if not allow_code:
+        if not allowed:
             findings.add(f"instances.{name}.{key}", found, expected)
             continue
         code = getattr(section, key).replace(section.path, str(path or ""), 1)
         by = f" with {section.interpreter}" if section.interpreter is not None else ""
-        tell(f"instance '{name}' runs {code}{by}, because of `--allow-code` ({found})")
+        tell(f"instance '{name}' runs {code}{by}, {allowed} ({found})")
 
 
 def names_code(loaded: LoadedConfig) -> bool:

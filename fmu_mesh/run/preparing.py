@@ -153,7 +153,7 @@ def planned(
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded = _located(with_options(loaded, options, findings))
-    check_code(loaded, findings, tell, allow_code=options.allow_code)
+    check_code(loaded, findings, tell, "because of `--allow-code`" if options.allow_code else "")
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
     known = known or KnownModels()

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import fmu_mesh
+from fmu_mesh.cli.main import main
 from fmu_mesh.run import allowed_code
 from fmu_mesh.sweeps.planned_sweep import continued_sweep
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
@@ -56,6 +57,18 @@ def test_a_rerun_runs_code_only_if_it_is_allowed(interpreter: dict[str, str]) ->
     by = f" with {sys.executable}" if interpreter else ""
     runs = f"instance 'wave' runs {Path.cwd()}/wave.py:wave{by}, because of `--allow-code`"
     assert told == [f"{runs} (Python code, in the result 'pair.csv')"]
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to another user")
+def test_what_runs_from_a_converted_file_of_another_user_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    config = config_with()
+    os.chown(config, 54321, 54321)
+
+    assert main(["convert", str(config), "own.yaml"]) == 0
+
+    told = f"instance 'wave' runs {Path.cwd()}/wave.py:wave, which this file may name, as it is your own"
+    assert f"warning: own.yaml: {told} (Python code, in a file of the user 54321)" in capsys.readouterr().err
+    assert not Path("ran").exists()
 
 
 def test_the_folder_of_a_sweep_cannot_allow_its_own_code() -> None:
