@@ -263,6 +263,22 @@ def test_a_traceback_is_printable(here: Path, place: Place) -> None:
     assert_harmless(done.errors)
 
 
+def test_the_node_of_ros_prints_a_traceback_as_text(tmp_path: Path) -> None:
+    (tmp_path / "rclpy.py").write_text(r"raise ValueError('\x1b[2J')", encoding="utf-8")
+
+    ended = subprocess.run(
+        [sys.executable, "-m", "fmu_mesh.ros.node"],
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+
+    assert "ValueError" in ended.stderr
+    assert_harmless(ended.stderr)
+
+
 def test_a_log_message_begins_no_line_of_its_own() -> None:
     program = (
         "import logging\nfrom fmu_mesh.run.program import exit_code_of\n"
