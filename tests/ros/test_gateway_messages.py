@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import struct
 from random import Random
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +17,7 @@ from fmu_mesh.ros.messages.cdr import CdrError, Codec
 from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
 from fmu_mesh.ros.messages.topics import Port, Topic
 from fmu_mesh.variables.model_description import Variable, VariableType
+from fmu_mesh.variables.value_types import DTYPES
 
 TYPES = MessageTypes("kilted")
 TWIST = "geometry_msgs/msg/TwistStamped"
@@ -55,6 +58,33 @@ def test_a_message_of_two_variables_holds_values_of_one_point_whatever_comes_fir
         (3.0, -3.0),
     ]
     assert messages[1]["header"] == {"stamp": {"sec": 0, "nanosec": 250_000_000}, "frame_id": "base"}
+
+
+SPECIAL = [1.5, -0.0, math.inf, -math.inf, math.nan, 5e-324]
+
+
+@pytest.mark.parametrize(
+    ("message", "type_", "elements", "packed"),
+    [
+        ("Float64MultiArray", "Float64", SPECIAL, "6d"),
+        ("Float32MultiArray", "Float32", SPECIAL, "6f"),
+        ("Int8MultiArray", "Int8", [-128, 127, 0, 1, 2, 3], "6b"),
+        ("UInt64MultiArray", "UInt64", [2**64 - 1, 0, 1, 2, 3, 4], "6Q"),
+    ],
+)
+def test_a_block_of_numpy_has_the_bytes_of_its_elements(
+    message: str, type_: VariableType, elements: list[Any], packed: str
+) -> None:
+    array = port("data", kind=type_, shape=(2, 3))
+    assembler = Assembler(topic(f"std_msgs/msg/{message}", array), TYPES)
+
+    block = assembler.make([np.array(elements, DTYPES[type_])], 0.0)
+    lists = assembler.make([[elements[:3], elements[3:]]], 0.0)
+
+    expected = np.array(elements, DTYPES[type_]).tolist()
+    assert block == lists
+    assert block.endswith(struct.pack(f"<{packed}", *expected))
+    assert [own["size"] for own in decoded(f"std_msgs/msg/{message}", block)["layout"]["dim"]] == [2, 3]
 
 
 def test_the_value_of_a_slower_instance_holds_until_its_next() -> None:

@@ -23,7 +23,6 @@ from ...errors import ConfigurationError
 from ...files import Kept, open_alone
 from ...system.recording import Columns, Recording
 from ...variables.model_description import ModelDescription
-from ...variables.value_types import nested
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver
 from ..messages.assembling import Assembler
@@ -143,15 +142,15 @@ class McapFile:
             self._mcap.add_metadata(RECORDING, self._about)
             for entry in self._waiting:
                 self._add_note(entry)
-        rows = zip(*(column.tolist() for column in columns), strict=True) if columns else iter([()] * len(times))
-        for time, row in zip(times.tolist(), rows, strict=True):
+        values = [topic.values(columns) for topic in self._topics]
+        for row, time in enumerate(times.tolist()):
             point, stamp = self._first + self.rows * self._every, nanoseconds(time)
             before = point - self._every if self.rows else -1
             if self._clock_points is not None and has_passed(self._clock_points, before, point):
                 self._add(self._clock_channel, stamp, self._clock.encode({"clock": to_stamp(time)}), point)
-            for topic in self._topics:
+            for topic, fields in zip(self._topics, values, strict=True):
                 if topic.due(before, point):
-                    self._add(topic.channel, stamp, topic.message(row, time), point)
+                    self._add(topic.channel, stamp, topic.message([field[row] for field in fields], time), point)
             self.rows += 1
 
     def note(self, entry: Mapping[str, Any]) -> None:
@@ -202,20 +201,19 @@ class _RecordedTopic:
         self.channel = channel
         self._steps = sorted({port.step_points for port in topic.ports})
         self._columns = [[index[f"{port.instance}.{name}"] for name in port.variable.elements] for port in topic.ports]
-        self._shapes = [port.variable.shape for port in topic.ports]
-        self._assembler = Assembler(topic, types)
+        self._are_arrays = [bool(port.variable.shape) for port in topic.ports]
+        self.message = Assembler(topic, types).make
 
     def due(self, before: int, point: int) -> bool:
         """Whether one of the variables has a new value at ``point`` that it did not have at the point ``before``."""
         return any(has_passed(step, before, point) for step in self._steps)
 
-    def message(self, row: Sequence[Any], time: float) -> bytes:
-        """The message of a row."""
-        values = [
-            nested([row[column] for column in columns], shape)
-            for columns, shape in zip(self._columns, self._shapes, strict=True)
+    def values(self, columns: Sequence[NDArray[Any]]) -> list[Sequence[Any]]:
+        """The value of each field in each row: of an array all elements, as a row of one block."""
+        return [
+            np.stack([columns[column] for column in own], axis=1) if is_array else columns[own[0]].tolist()
+            for own, is_array in zip(self._columns, self._are_arrays, strict=True)
         ]
-        return self._assembler.make(values, time)
 
 
 def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:

@@ -137,7 +137,7 @@ def _field_columns(
         texts[:] = [value if isinstance(value, str) else np.asarray(value, np.uint8).tobytes() for value in values]
         return {names[0]: texts[held]}
     table = np.array(values).reshape(len(values), len(names)).astype(DTYPES[type_])
-    return {name: table[held, place] for place, name in enumerate(names)}
+    return dict(zip(names, np.ascontiguousarray(table[held].T), strict=True))
 
 
 def _value(message: Any, path: Sequence[str | int]) -> Any:  # noqa: ANN401  any field

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...variables.model_description import Value
-from ...variables.value_types import flattened, nested
+from ...variables.value_types import DTYPES, flattened, nested
 from .cdr import CdrError, Codec, Message
 from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
 from .stamp import from_stamp, to_stamp
@@ -88,7 +88,7 @@ class Assembler:
                 yield self.make([head[2] for head in heads], stamp), stamp
 
     def make(self, values: list[Any], time: float) -> bytes:
-        """Make the message with these values, one per port, at ``time`` in s.
+        """Make the message with these values, one per port, at ``time`` in s; arrays as lists, or flat in numpy.
 
         Raises:
             CdrError: a value does not fit into its field.
@@ -106,6 +106,7 @@ class Assembler:
         kind = types.field(self.topic.message, port.path)
         element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
         floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
+        dtype = np.float64 if floats else DTYPES[port.variable.type]
         shape = port.variable.shape
         if shape and "layout" in self._message:
             self._message["layout"]["dim"] = [
@@ -113,11 +114,12 @@ class Assembler:
                 for axis, size in enumerate(shape)
             ]
 
-        def one(value: Any) -> Any:  # noqa: ANN401 a value of any variable
-            return _FLOATS[value] if floats and isinstance(value, str) else value
-
         def put(value: Any) -> None:  # noqa: ANN401 a value of any variable
-            container[last] = [one(own) for own in flattened(value, len(shape))] if shape else one(value)
+            if shape:
+                elements = value if isinstance(value, np.ndarray) else flattened(value, len(shape))
+                container[last] = np.asarray(elements, dtype)  # "-INF" becomes a float, too
+            else:
+                container[last] = _FLOATS[value] if floats and isinstance(value, str) else value
 
         return put
 
