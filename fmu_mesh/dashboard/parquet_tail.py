@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from ..system.arrow import open_parquet
+from ..system.arrow import open_parquet, places_of, values_at
 
 __all__ = ["ParquetTail"]
 
@@ -36,10 +36,13 @@ class ParquetTail:
     """
 
     def __init__(self, path: Path, batches: _Stream | _Groups) -> None:
-        columns = [field for field in batches.schema if field.name != _TIME]
+        types = {field.name: str(getattr(field.type, "value_type", field.type)) for field in batches.schema}
         self.path = path
+        self._places = places_of(batches.schema)
         self.names: Sequence[str] = [
-            field.name for field in columns if not (pa.types.is_string(field.type) or pa.types.is_binary(field.type))
+            name
+            for name, (field, _) in self._places.items()
+            if name != _TIME and types[field] not in ("string", "binary")
         ]
         self._batches = batches
 
@@ -70,9 +73,9 @@ class ParquetTail:
         Returns:
             The times in s, shape `(rows,)`, and the values, shape `(columns, rows)`.
         """
-        is_over = self._batches.is_over  # asked before the last batch is
+        places, is_over = self._places, self._batches.is_over  # asked before the last batch is
         try:
-            batch = self._batches.next([_TIME, *columns])
+            batch = self._batches.next([_TIME, *dict.fromkeys(places[name][0] for name in columns)])
         except (pa.ArrowException, OSError, ValueError):  # it is damaged
             batch = None
         if batch is None:
@@ -81,7 +84,8 @@ class ParquetTail:
                 self._batches.close()
                 self._batches = file
             return None
-        table = np.array([batch.column(name).to_numpy(zero_copy_only=False) for name in (_TIME, *columns)], float)
+        arrays = [values_at(batch, places[name]) for name in (_TIME, *columns)]
+        table = np.array([array.to_numpy(zero_copy_only=False) for array in arrays], float)
         return table[0], table[1:]
 
     def close(self) -> None:
@@ -205,7 +209,7 @@ def _opened(kind: type[_Batches], path: Path) -> _Batches | None:
     with ExitStack() as stack:
         try:
             opened = kind(path, stack.enter_context(path.open("rb")))
-            if not opened.schema.names:  # or they are no text
+            if not places_of(opened.schema):  # or its names are no text
                 return None
         except (OSError, ValueError, pa.ArrowException):
             return None

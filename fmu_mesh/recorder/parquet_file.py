@@ -1,5 +1,7 @@
 """Results as Parquet: one column for the time, and one for each variable, with its own type and its unit.
 
+The rows of an array are lists of one size, unless only some of its elements are recorded: these have a column each.
+
 A Parquet file cannot be read without its end. While a run goes on, its rows are in an Arrow IPC stream beside it,
 `<file>.arrows`, in batches that the operating system has after every `flush`. The same rows are compressed into a draft
 of the Parquet file, group by group; `close` writes its end, renames it and removes the stream. After the writer was
@@ -16,6 +18,7 @@ import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -26,10 +29,10 @@ from numpy.typing import NDArray
 from ..config.findings import Findings
 from ..errors import ConfigurationError
 from ..files import Kept, decoded_json, exists, is_file, open_alone, opened
-from ..system.arrow import open_parquet, parquet_batches, parquet_module, pyarrow_module
+from ..system.arrow import DIMENSIONS, elements_of, open_parquet, parquet_batches, parquet_module, pyarrow_module
 from ..system.recording import Columns, Recording, joined, with_notes
 from ..variables.model_description import Variable
-from ..variables.value_types import DTYPES, VariableType, is_text
+from ..variables.value_types import DTYPES, VariableType, element_name
 from .parquet_groups import KEY, GroupWriter, decoded
 
 __all__ = ["ParquetFile"]
@@ -65,8 +68,7 @@ class ParquetFile:
 
     Args:
         path: the file; its folder is created, and the first row replaces an older file.
-        columns: (name, type) of every column but `time`.
-        schema: the same with `time`, as pyarrow has it.
+        schema: the columns as pyarrow has them, the time first.
 
     Attributes:
         path: the file.
@@ -77,16 +79,17 @@ class ParquetFile:
         ConfigurationError: the file cannot be written, or another run writes it.
     """
 
-    def __init__(self, path: Path, columns: Sequence[tuple[str, VariableType]], schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
+    def __init__(self, path: Path, schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
         parquet_module()  # importing it with the first rows would delay the run
         self.path = path
         self.rows = 0
         self.kept = Kept()
-        types: list[VariableType] = ["Float64", *(type_ for _, type_ in columns)]
-        row_bytes = sum(np.dtype(DTYPES[type_]).itemsize for type_ in types)
-        self._block_rows = min(max(1, _BLOCK_BYTES // row_bytes), _BLOCK_ROWS)
-        self._block = [np.empty(self._block_rows, DTYPES[type_]) for type_ in types]
-        self._texts = [place for place, type_ in enumerate(types) if is_text(type_)]
+        shapes = [(field.type.list_size,) if DIMENSIONS in field.metadata else () for field in schema]
+        dtypes = [np.dtype(DTYPES[field.metadata[b"type"].decode()]) for field in schema]
+        row = [np.empty(shape, dtype) for shape, dtype in zip(shapes, dtypes, strict=True)]
+        self._block_rows = min(max(1, _BLOCK_BYTES // sum(own.nbytes for own in row)), _BLOCK_ROWS)
+        self._block = [np.empty((self._block_rows, *own.shape), own.dtype) for own in row]
+        self._texts = [place for place, own in enumerate(row) if own.dtype == object]
         self._waiting = 0
         self._notes: list[Mapping[str, Any]] = []
         self._noted: list[Mapping[str, Any]] = []
@@ -98,10 +101,9 @@ class ParquetFile:
         self._stream_only = False  # the draft could not be written
 
     @classmethod
-    def check(cls, recording: Recording, findings: Findings) -> None:
-        """Check that pyarrow is installed, and that no array is too large."""
+    def check(cls, recording: Recording, findings: Findings) -> None:  # noqa: ARG003  it can hold everything
+        """Check that pyarrow is installed."""
         pyarrow_module()
-        recording.check_arrays(findings)
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
@@ -109,7 +111,7 @@ class ParquetFile:
         if exists(path) and not is_file(path):
             hint = "Record into a .csv file."
             raise ConfigurationError(f"'{path}' is not a file, and a Parquet file cannot replace it.", hint=hint)
-        return cls(path, recording.columns, _schema_of(recording))
+        return cls(path, _schema_of(recording))
 
     @staticmethod
     def growing_file(path: Path) -> Path:
@@ -146,22 +148,26 @@ class ParquetFile:
         stream = ParquetFile.growing_file(path)
         if stream.is_file() and not path.exists():
             with _Stream(stream) as batches:
-                none = _columns_of(path, batches.schema)
+                none, names = _columns_of(path, batches.schema)
                 for batch in batches:
-                    yield none._replace(**_arrays_of(batch))
+                    yield none._replace(**_arrays_of(batch, names))
                 yield none._replace(metadata=with_notes(none.metadata, batches.notes))
             return
         with opened(path) as file:
             content = open_parquet(file)
-            none = _columns_of(path, content.schema_arrow)._replace(metadata=decoded(content.metadata))
+            none, names = _columns_of(path, content.schema_arrow)
+            none = none._replace(metadata=decoded(content.metadata))
             if not content.metadata.num_rows:
                 yield none
             for batch in parquet_batches(content):
-                yield none._replace(**_arrays_of(batch))
+                yield none._replace(**_arrays_of(batch, names))
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
-        arrays, done = [times, *columns], 0
+        left, done = iter((times, *columns)), 0
+        arrays = [
+            next(left) if own.ndim == 1 else np.stack([*islice(left, own.shape[1])], axis=1) for own in self._block
+        ]
         if not self.rows:
             with suppress(FileNotFoundError):
                 Path(os.path.realpath(self.path)).unlink()  # the first row replaces it, as in all formats
@@ -250,7 +256,7 @@ class ParquetFile:
     @staticmethod
     def _rows_of_texts(columns: Sequence[NDArray[Any]]) -> int:
         """How many of these rows fit into a batch; at least one."""
-        sizes = np.cumsum([sum(map(len, row)) for row in zip(*(column.tolist() for column in columns), strict=True)])
+        sizes = np.cumsum([sum(map(len, row)) for row in np.column_stack(columns).tolist()])
         return max(1, int(np.searchsorted(sizes, _BLOCK_BYTES, side="right")))
 
 
@@ -319,12 +325,20 @@ class _Sink(io.RawIOBase):
 def _schema_of(recording: Recording) -> Any:  # noqa: ANN401  pyarrow has no types
     """The columns of a recording as pyarrow has them, with what is known of each variable."""
     pa = pyarrow_module()
-    fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata={"unit": "s"})]
-    for (instance, name), (column, type_) in zip(recording.recorded, recording.columns, strict=True):
+    fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata={"type": "Float64", "unit": "s"})]
+    recorded, place = recording.recorded, 0
+    while place < len(recorded):
+        instance, name = recorded[place]
         variable = recording.descriptions[instance].variable_of(name)
         assert variable is not None  # the system is valid
-        arrow_type = getattr(pa, _ARROW_TYPES[type_])()
-        fields.append(pa.field(column, arrow_type, nullable=False, metadata=_about(variable)))
+        arrow_type, about, end = getattr(pa, _ARROW_TYPES[variable.type])(), _about(variable), place + variable.size
+        is_first = bool(variable.shape) and name == element_name(variable.name, (0,) * len(variable.shape))
+        if is_first and recorded[place:end] == tuple((instance, element) for element in variable.elements):
+            arrow_type = pa.list_(pa.field("element", arrow_type, nullable=False), variable.size)
+            about[DIMENSIONS.decode()] = msgspec.json.encode(variable.shape).decode()
+            name, place = variable.name, end - 1
+        fields.append(pa.field(f"{instance}.{name}", arrow_type, nullable=False, metadata=about))
+        place += 1
     return pa.schema(fields, {KEY: msgspec.json.encode(recording.metadata)})
 
 
@@ -342,6 +356,9 @@ def _about(variable: Variable) -> dict[str, str]:
 def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyarrow has no types
     """A copy of the values as pyarrow has it. `pyarrow.array` would import pandas, which takes half a second."""
     pa = pyarrow_module()
+    if values.ndim > 1:
+        elements = _arrow_array(values.reshape(-1), type_.value_type)
+        return pa.Array.from_buffers(type_, len(values), [None], null_count=0, children=[elements])
     if values.dtype == object:
         texts = [value.encode() if isinstance(value, str) else value for value in values.tolist()]
         ends = np.zeros(1 + len(texts), np.int32)
@@ -354,18 +371,28 @@ def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyar
     return pa.Array.from_buffers(type_, len(values), [None, *map(pa.py_buffer, buffers)], null_count=0)
 
 
-def _columns_of(path: Path, schema: Any) -> Columns:  # noqa: ANN401  pyarrow has no types
-    """The columns without rows."""
+def _columns_of(path: Path, schema: Any) -> tuple[Columns, list[tuple[str, ...]]]:  # noqa: ANN401  pyarrow has no types
+    """The columns without rows, and the names of those of each field."""
     pa = pyarrow_module()
     if not schema.names or schema.names[0] != _TIME or not pa.types.is_float64(schema[0].type):
         raise _no_result(path, f"its first column is not '{_TIME}' in float64")
-    units = {f.name: f.metadata[_UNIT].decode() for f in schema if f.metadata and _UNIT in f.metadata}
-    return Columns(**_arrays_of(schema.empty_table()), units=units, metadata=decoded(schema))
+    names = [elements_of(field) for field in schema]
+    known = [(field.metadata or {}).get(_UNIT) for field in schema]
+    units = {name: unit.decode() for unit, own in zip(known, names, strict=True) if unit is not None for name in own}
+    return Columns(**_arrays_of(schema.empty_table(), names), units=units, metadata=decoded(schema)), names
 
 
-def _arrays_of(batch: Any) -> dict[str, Any]:  # noqa: ANN401  pyarrow has no types
-    """The times and values of a batch, as numpy has them."""
-    arrays = dict(zip(batch.schema.names, map(_array, batch.columns), strict=True))
+def _arrays_of(batch: Any, names: Sequence[tuple[str, ...]]) -> dict[str, Any]:  # noqa: ANN401  pyarrow has no types
+    """The times and values of a batch, as numpy has them; ``names`` are those of the columns of each field."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, own, column in zip(batch.schema.names, names, batch.columns, strict=True):
+        if own == (name,):
+            arrays[name] = _array(column)
+        else:
+            from pyarrow.compute import list_flatten  # noqa: PLC0415  an optional dependency, slow to import
+
+            table = _array(list_flatten(column)).reshape(len(column), len(own))
+            arrays |= zip(own, np.ascontiguousarray(table.T), strict=True)
     return {"times": arrays.pop(_TIME), "values": arrays}
 
 

@@ -43,8 +43,12 @@ class GroupWriter:
         self._schema = schema
         self._levels: list[list[Any]] = [[]]
         self._rows = self._size = self._written = 0
-        floats = [field.name for field in schema if str(field.type) in ("double", "float")]
-        others = [field.name for field in schema if field.name not in floats]
+        floats: list[str] = []
+        others: list[str] = []
+        for field in schema:
+            element = getattr(field.type, "value_type", None)  # of lists
+            column = field.name if element is None else f"{field.name}.list.element"
+            (floats if str(element or field.type) in ("double", "float") else others).append(column)
         ways = {
             "compression": "zstd",
             "compression_level": 1,

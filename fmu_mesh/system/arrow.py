@@ -8,16 +8,33 @@ thread, and files of results are opened nowhere else.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
-from ..errors import ConfigurationError
+import msgspec
 
-__all__ = ["open_parquet", "parquet_batches", "parquet_module", "pyarrow_module"]
+from ..errors import ConfigurationError
+from ..variables.value_types import MAX_ELEMENTS, element_names
+
+__all__ = [
+    "DIMENSIONS",
+    "elements_of",
+    "open_parquet",
+    "parquet_batches",
+    "parquet_module",
+    "places_of",
+    "pyarrow_module",
+    "values_at",
+]
+
+DIMENSIONS: Final = b"dimensions"
+"""The metadata of a field that has all elements of an array, row by row, in lists of one size: `[2,3]`."""
 
 _BATCH_VALUES: Final = 1 << 20
-"""A batch has about so many values."""
+_LEAST_ROWS: Final = 8
+"""A batch has about so many values, or so many rows if these are wide: each batch costs some time for each name."""
 
 
 def pyarrow_module() -> Any:  # noqa: ANN401  an optional dependency
@@ -51,6 +68,39 @@ def open_parquet(source: Path | IO[bytes]) -> Any:  # noqa: ANN401  pyarrow has 
 
 def parquet_batches(content: Any, columns: Sequence[str] | None = None) -> Iterator[Any]:  # noqa: ANN401  pyarrow has no types
     """The rows of a file from `open_parquet`; of these columns, if some are named."""
-    size = max(1, _BATCH_VALUES // len(columns or content.schema_arrow.names))
+    fields = [field for field in content.schema_arrow if columns is None or field.name in columns]
+    size = max(_LEAST_ROWS, _BATCH_VALUES // max(1, sum(getattr(field.type, "list_size", 1) for field in fields)))
     rows: Iterator[Any] = content.iter_batches(size, columns=columns, use_threads=False)
     return rows
+
+
+def elements_of(field: Any) -> tuple[str, ...]:  # noqa: ANN401  pyarrow has no types
+    """The names of the columns of a result that a field has: of an array one for each element, as `y[1,2]`.
+
+    Raises:
+        ValueError: its dimensions are not those of its lists.
+    """
+    about = field.metadata or {}
+    if DIMENSIONS not in about or not pyarrow_module().types.is_fixed_size_list(field.type):
+        return (field.name,)
+    shape = msgspec.json.decode(about[DIMENSIONS], type=tuple[int, ...])
+    if min(shape) < 1 or math.prod(shape) != field.type.list_size or field.type.list_size > MAX_ELEMENTS:
+        raise ValueError(f"the dimensions {list(shape)} of '{field.name}' are wrong")
+    return element_names(field.name, shape)
+
+
+def places_of(schema: Any) -> dict[str, tuple[str, int | None]]:  # noqa: ANN401  pyarrow has no types
+    """The field of each column of a result, and which element of its lists it is; None: it has no lists."""
+    return {
+        name: (field.name, index if name != field.name else None)
+        for field in schema
+        for index, name in enumerate(elements_of(field))
+    }
+
+
+def values_at(batch: Any, place: tuple[str, int | None]) -> Any:  # noqa: ANN401  pyarrow has no types
+    """The values at one of the `places_of` a batch or a table, as pyarrow has them."""
+    from pyarrow import compute  # noqa: PLC0415  an optional dependency
+
+    name, index = place
+    return batch.column(name) if index is None else compute.list_element(batch.column(name), index)

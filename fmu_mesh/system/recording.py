@@ -98,9 +98,8 @@ class Recording(msgspec.Struct, frozen=True):
         for array, count in arrays.items():
             if count > _MOST_ELEMENTS:
                 found = f"{count:,} elements of '{array}', for which this format has a column each"
-                expected = (
-                    f"at most {_MOST_ELEMENTS:,} elements, a file ending in .mcap, or variables without '{array}'"
-                )
+                ways = f"a file ending in .parquet or .mcap, or variables without '{array}'"
+                expected = f"at most {_MOST_ELEMENTS:,} elements, {ways}"
                 findings.add(f"{self.place}.variables", found, expected)
 
 

@@ -25,7 +25,7 @@ from ..text import listed, nearest
 from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
 from ..variables.value_types import INTEGERS, is_float
-from .arrow import open_parquet, parquet_batches
+from .arrow import open_parquet, parquet_batches, places_of, values_at
 from .schedule import Course, Schedule, SeriesFile
 
 __all__ = ["SeriesRefused", "columns_of", "content_of", "course_of", "courses_of", "read_series"]
@@ -77,8 +77,7 @@ def columns_of(path: Path) -> list[str]:
     """
     with _reading(path), opened(path) as file:
         if path.suffix.lower() == _PARQUET:
-            names: list[str] = open_parquet(file).schema_arrow.names
-            return names
+            return [*places_of(open_parquet(file).schema_arrow)]
         return _header(file.readline().decode("utf-8-sig"), path)[0]
 
 
@@ -234,11 +233,12 @@ def _parquet_pairs(path: Path, time: str, column: str) -> Iterator[tuple[str, An
     """(where, time, cell) of each row of a Parquet file."""
     with _reading(path), opened(path) as file:
         table = open_parquet(file)
-        names = table.schema_arrow.names
-        _place(names, time, "time", path), _place(names, column, "column", path)
-        row = 0
-        for batch in parquet_batches(table, list(dict.fromkeys([time, column]))):
-            for when, cell in zip(batch.column(time).to_pylist(), batch.column(column).to_pylist(), strict=True):
+        places = places_of(table.schema_arrow)
+        for name, key in ((time, "time"), (column, "column")):
+            _place([*places], name, key, path)
+        row, both = 0, [places[time], places[column]]
+        for batch in parquet_batches(table, list(dict.fromkeys(field for field, _ in both))):
+            for when, cell in zip(*(values_at(batch, place).to_pylist() for place in both), strict=True):
                 row += 1
                 yield f"row {row}", when, cell
 

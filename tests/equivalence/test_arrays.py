@@ -164,16 +164,31 @@ def test_check_and_launch_say_which_ring_does_not_fit(tmp_path: Path, monkeypatc
     assert len(mesh.run(processes=False).times) == 41
 
 
-@pytest.mark.parametrize("file", ["fields.csv", "fields.parquet"])
-def test_a_file_with_columns_refuses_a_large_array(file: str, tmp_path: Path) -> None:
+def test_a_csv_refuses_a_large_array_and_names_other_formats(tmp_path: Path) -> None:
     mesh = mesh_of(tmp_path, 100_000, record=("filter.y", "sum.total"))
 
-    (finding,) = mesh.check(output=tmp_path / file).findings
+    (finding,) = mesh.check(output=tmp_path / "fields.csv").findings
 
     assert finding.path == "record.variables"
     assert "100,000 elements of 'filter.y'" in finding.found
-    assert ".mcap" in finding.expected
-    assert mesh.check(output=tmp_path / "fields.mcap")
+    assert "a file ending in .parquet or .mcap" in finding.expected
+
+
+@pytest.mark.parametrize("ending", ["parquet", "mcap"])
+def test_files_have_the_floats_of_large_arrays(ending: str, tmp_path: Path) -> None:
+    pytest.importorskip("mcap" if ending == "mcap" else "pyarrow")
+    mesh = mesh_of(tmp_path, 12_000, record=("filter.y", "camera.image", "sum.total"))
+
+    launched = mesh.run(stop_time=0.05, output=tmp_path / f"launched.{ending}")
+    local = mesh.run(stop_time=0.05, output=tmp_path / f"local.{ending}", processes=False)
+    memory = mesh.run(stop_time=0.05, record="memory", processes=False)
+
+    assert list(launched) == list(local) == list(memory)
+    assert len(memory) == 24_001
+    for name, column in memory.items():
+        assert launched[name].tobytes() == local[name].tobytes() == column.tobytes(), name
+        assert local[name].dtype == column.dtype
+    assert launched.compare(memory)
 
 
 @pytest.mark.parametrize("processes", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from pyarrow import parquet
 import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.config.loading import LoadedConfig
+from fmu_mesh.dashboard.parquet_tail import ParquetTail
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.instances.configuration import parse
@@ -31,6 +33,8 @@ from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.recorder.parquet_file import ParquetFile
 from fmu_mesh.ros.bags.mcap_file import McapFile
 from fmu_mesh.system.recording import Recording, ResultFile, ResultFormat, with_notes
+from fmu_mesh.system.schedule import SeriesFile
+from fmu_mesh.system.series_files import columns_of, content_of, read_series
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, VariableType, is_float
 from tests.fmus.helpers import find_fmu
@@ -69,6 +73,26 @@ def recording(types: Sequence[VariableType] = TYPES) -> Recording:
     description = ModelDescription("It", "It", "3.0", "co_simulation", "", tuple(variables))
     loaded = LoadedConfig(parse(CONFIG, Path("mesh.yaml")).config, Path("mesh.yaml"))
     return Recording(loaded, {"it": description}, tuple(("it", type_) for type_ in types), metadata=METADATA)
+
+
+def arrays_recording(types: Sequence[VariableType]) -> Recording:
+    """Of each type a matrix of two rows and three columns, and of the first also an array of which an element lacks."""
+    variables = [
+        Variable(type_, number, type_, "output", "discrete", unit="rad" if is_float(type_) else None, shape=(2, 3))
+        for number, type_ in enumerate(types)
+    ]
+    variables.append(Variable("part", len(types), types[0], "output", "discrete", shape=(3,)))
+    names = [name for variable in variables for name in variable.elements]
+    description = ModelDescription("It", "It", "3.0", "co_simulation", "", tuple(variables))
+    loaded = LoadedConfig(parse(CONFIG, Path("mesh.yaml")).config, Path("mesh.yaml"))
+    own = Recording(loaded, {"it": description}, tuple(("it", name) for name in names[:-1]))
+    described = {name: {"type": type_, "unit": "rad" if "Float" in name else None} for name, type_ in own.columns}
+    return msgspec.structs.replace(own, metadata={**METADATA, "variables": described})
+
+
+def arrays_of(recording: Recording, rows: int) -> dict[str, NDArray[Any]]:
+    """The columns of a recording; each element begins with another value of its type."""
+    return {name: np.roll(values_of(type_, rows), place) for place, (name, type_) in enumerate(recording.columns)}
 
 
 def values_of(type_: VariableType, rows: int) -> NDArray[Any]:
@@ -328,6 +352,122 @@ def test_pandas_and_pyarrow_read_a_parquet_file_with_its_types_and_units(tmp_pat
     assert schema.field("it.Enumeration").metadata[b"type"] == b"Enumeration"
     assert msgspec.json.decode(about[b"fmu_mesh"]) == METADATA
     assert fmu_mesh.Result.read(path).units["it.Float64"] == "rad"
+
+
+@pytest.mark.parametrize(
+    ("format_", "name", "types"),
+    [(CsvFile, "a.csv", TYPES), (ParquetFile, "a.parquet", TYPES), (ParquetFile, "a.parquet", ["Float64"])],
+)
+@pytest.mark.parametrize("rows", [1, 20])
+def test_arrays_are_read_element_by_element_as_they_were_written(
+    tmp_path: Path, format_: ResultFormat, name: str, types: list[VariableType], rows: int
+) -> None:
+    recording = arrays_recording(types)
+    columns = arrays_of(recording, rows)
+    file = format_.open(tmp_path / name, recording)
+
+    for first in range(0, rows, 7):
+        part = slice(first, first + 7)
+        file.write(times_of(rows)[part], [column[part] for column in columns.values()])
+        file.flush()
+    growing = fmu_mesh.Result.read(tmp_path / name)
+    file.close()
+
+    whole = fmu_mesh.Result.read(tmp_path / name)
+    for result in (growing, whole):
+        assert list(result) == list(columns)
+        assert all(same(result[name], column) for name, column in columns.items())
+        assert result.units == {name: "rad" if "Float" in name else None for name in columns}
+    assert whole.compare(growing)
+
+
+def test_parquet_has_an_array_as_one_column_of_lists(tmp_path: Path) -> None:
+    path, recording = tmp_path / "a.parquet", arrays_recording(["Float64", "Int8"])
+    columns = arrays_of(recording, 5)
+    file = ParquetFile.open(path, recording)
+    file.write(times_of(5), list(columns.values()))
+    file.close()
+
+    table = parquet.read_table(path)
+
+    assert table.schema.names == ["time", "it.Float64", "it.Int8", "it.part[1]", "it.part[2]"]
+    assert table.schema.field("it.Float64").type == pa.list_(pa.field("element", pa.float64(), nullable=False), 6)
+    assert table.schema.field("it.Int8").metadata[b"dimensions"] == b"[2,3]"
+    rows = np.array(table["it.Int8"].to_pylist(), np.int8)
+    assert rows.tolist() == np.stack([columns[f"it.Int8[{i},{j}]"] for i in (1, 2) for j in (1, 2, 3)], 1).tolist()
+    encodings = parquet.read_metadata(path).row_group(0).column(1).encodings
+    assert "BYTE_STREAM_SPLIT" in encodings
+
+
+def test_elements_of_lists_are_curves_and_scenarios(tmp_path: Path) -> None:
+    path, recording = tmp_path / "a.parquet", arrays_recording(["Float64"])
+    file = ParquetFile.open(path, recording)
+    columns = {name: np.arange(9.0) + place for place, (name, _) in enumerate(recording.columns)}
+    file.write(times_of(9), list(columns.values()))
+    file.flush()
+    tail = ParquetTail.open(path, ParquetFile.growing_file(path))
+    assert tail is not None
+    growing = tail.read(["it.part[1]", "it.Float64[2,1]"])
+    file.close()
+
+    assert tail.read(["it.Float64[2,1]"]) is None
+    again = ParquetTail.open(path, ParquetFile.growing_file(path))
+    assert again is not None
+    source = SeriesFile(str(path), content_of(path), "time", "it.Float64[2,1]")
+    series = read_series(source, Variable("u", 0, "Float64", "input", "continuous"))
+
+    assert list(again.names) == columns_of(path)[1:] == list(columns)
+    assert growing is not None
+    assert growing[1].tolist() == [columns["it.part[1]"].tolist(), columns["it.Float64[2,1]"].tolist()]
+    whole = again.read(["it.Float64[2,1]"])
+    assert whole is not None
+    assert whole[1].tolist() == [columns["it.Float64[2,1]"].tolist()] == [series[1]]
+    tail.close()
+    again.close()
+
+
+def test_a_stream_with_lists_is_recovered(tmp_path: Path) -> None:
+    path, recording = tmp_path / "a.parquet", arrays_recording(TYPES)
+    columns = arrays_of(recording, 6)
+    file = ParquetFile.open(tmp_path / "b.parquet", recording)
+    for row in range(6):
+        file.write(times_of(6)[row : row + 1], [column[row : row + 1] for column in columns.values()])
+        file.flush()
+    whole = ParquetFile.growing_file(tmp_path / "b.parquet").read_bytes()
+    file.close()
+    ParquetFile.growing_file(path).write_bytes(whole[:-100])
+
+    assert fmu_mesh.recover(path) == 5
+
+    result = fmu_mesh.Result.read(path)
+    assert all(same(result[name], column[:5]) for name, column in columns.items())
+
+
+def test_a_file_with_a_column_for_each_element_is_still_read(tmp_path: Path) -> None:
+    path = tmp_path / "old.parquet"
+    names = ["it.y[1,1]", "it.y[1,2]"]
+    fields = [pa.field("time", pa.float64())] + [pa.field(name, pa.float64(), metadata={"unit": "m"}) for name in names]
+    values = [pa.array([0.0, 0.1]), pa.array([-0.0, math.inf]), pa.array([math.nan, 2.0])]
+    pq.write_table(pa.Table.from_arrays(values, schema=pa.schema(fields)), path)
+
+    result = fmu_mesh.Result.read(path)
+
+    assert list(result) == names
+    assert result.units == dict.fromkeys(names, "m")
+    assert same(result["it.y[1,1]"], np.array([-0.0, math.inf]))
+    assert same(result["it.y[1,2]"], np.array([math.nan, 2.0]))
+
+
+@pytest.mark.parametrize("dimensions", ["[4]", "[1000000,1000000]", "nonsense", "[-2,-1]"])
+def test_lists_of_other_dimensions_are_refused(tmp_path: Path, dimensions: str) -> None:
+    path = tmp_path / "wrong.parquet"
+    lists = pa.array([[1.0, 2.0]], pa.list_(pa.float64(), 2))
+    fields = [pa.field("time", pa.float64()), pa.field("y", lists.type, metadata={"dimensions": dimensions})]
+    pq.write_table(pa.Table.from_arrays([pa.array([0.0]), lists], schema=pa.schema(fields)), path)
+
+    with pytest.raises(ConfigurationError, match="is no result file"):
+        fmu_mesh.Result.read(path)
+    assert ParquetTail.open(path, tmp_path / "none") is None
 
 
 def test_a_file_of_another_program_may_have_nulls_and_a_name_twice(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ class _RecordedTopic:
         """Whether one of the variables has a new value at ``point`` that it did not have at the point ``before``."""
         return any(has_passed(step, before, point) for step in self._steps)
 
-    def values(self, columns: Sequence[NDArray[Any]]) -> list[Sequence[Any]]:
+    def values(self, columns: Sequence[NDArray[Any]]) -> list[Any]:
         """The value of each field in each row: of an array all elements, as a row of one block."""
         return [
             np.stack([columns[column] for column in own], axis=1) if is_array else columns[own[0]].tolist()
