@@ -58,7 +58,9 @@ def test_a_run_with_everything_attached_is_that_of_one_process(place: Place, *, 
     dashboard = Dashboard(place)
     watcher = place.start("watch", "pair/*.*", "--json")
     served = place.start("foxglove", "pair", "--port", "0")
-    [url] = wait_until(lambda: re.findall(r"ws://127\.0\.0\.1:\d+/\?token=[\w-]+", served.output)[:1], "the address of the server")
+    [url] = wait_until(
+        lambda: re.findall(r"ws://127\.0\.0\.1:\d+/\?token=[\w-]+", served.output)[:1], "the address of the server"
+    )
     with FoxgloveClient(url) as client:
         client.until(lambda: {"/pendulum/a", "/slow/y"} <= {*client.channels}, "the topics")
         client.subscribe("/pendulum/a", "/slow/y")
