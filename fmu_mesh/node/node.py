@@ -321,8 +321,7 @@ class Node:
             self._heard = self._clock()
             if self._memory is not self._own_memory:
                 return  # the grant itself is in the shared memory; this is a sign of life
-            most = self._progress_sent + self._plan.window
-            if point > most:
+            if point > (most := self._progress_sent + self._plan.window):
                 raise ProtocolBroken(
                     f"the master grants point {point} to node '{self._plan.node}', which may be granted {most} at most",
                     hint="Does another process send messages with its name?",
