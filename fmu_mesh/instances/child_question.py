@@ -27,13 +27,17 @@ _Answer = ModelDescription | tuple[str, str | None]
 """A description, or why there is none and what to do."""
 
 
-def ask_description_of(what: str, module: str, request: str, python: str = sys.executable) -> ModelDescription:
+def ask_description_of(what: str, module: str, request: object, python: str = sys.executable) -> ModelDescription:
     """What ``answer_to`` of a module answers to a request in a child process; ``what`` happens there, as errors say it.
 
     Raises:
         LoadFailed: there is no description, or the process ended without an answer; says why.
     """
-    output, ending = run_child([python, "-Pm", __package__, module, request])
+    try:
+        text = msgspec.json.encode(request).decode()
+    except UnicodeEncodeError as error:
+        raise LoadFailed("its path is no UTF-8", hint="Rename the folder.") from error
+    output, ending = run_child([python, "-Pm", __package__, module, text])
     try:
         answer: _Answer = msgspec.msgpack.decode(output, type=_Answer)
     except msgspec.DecodeError:

@@ -151,6 +151,14 @@ def test_a_model_that_is_loaded_for_ever_is_a_finding(tmp_path: Path, monkeypatc
     assert str(caught.value) == f"MuJoCo, which loads '{path}', did not end within 3 s"
 
 
+def test_a_path_that_is_no_text_is_a_finding(tmp_path: Path) -> None:
+    (folder := tmp_path / "\udcff").mkdir()
+    path = write_world(folder, "")
+
+    with pytest.raises(LoadFailed, match=r"its path is no UTF-8\. Rename the folder"):
+        describe(path, MujocoConfig(mujoco=path.name))
+
+
 def test_a_world_that_is_not_there_is_refused_with_the_nearest_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,8 +31,7 @@ class MujocoKind(Kind[MujocoConfig]):
         tell: Callable[[str], None],  # noqa: ARG002  loading a model is fast
     ) -> ModelDescription:
         """Load the model in a child process; its joints, bodies, sensors and actuators are the variables."""
-        request = msgspec.json.encode((str(path), section)).decode()
-        return ask_description_of(f"MuJoCo, which loads '{path}',", __name__, request)
+        return ask_description_of(f"MuJoCo, which loads '{path}',", __name__, (str(path), section))
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the model and of all files that it includes."""

@@ -50,8 +50,7 @@ class OnnxKind(Kind[OnnxConfig]):
         tell: Callable[[str], None],  # noqa: ARG002  loading a policy is fast
     ) -> ModelDescription:
         """Load the model and compute it twice, in a child process; its inputs and outputs are the variables."""
-        request = msgspec.json.encode((str(path), limits)).decode()
-        return ask_description_of(f"onnxruntime, which loads and computes '{path}',", __name__, request)
+        return ask_description_of(f"onnxruntime, which loads and computes '{path}',", __name__, (str(path), limits))
 
     def content(self, path: Path) -> str:
         """The SHA-256 of the file: nothing else is read."""

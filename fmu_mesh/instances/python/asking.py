@@ -45,7 +45,7 @@ def ask_description(path: Path, section: PythonConfig) -> ModelDescription:
         raise LoadFailed("a folder" if path.is_dir() else "no such file")
     if section.interpreter is not None:
         _check_version(section.interpreter)
-    request = msgspec.json.encode(_Request(section.python, str(path), section.arguments)).decode()
+    request = _Request(section.python, str(path), section.arguments)
     return ask_description_of("its import", __name__, request, section.interpreter or sys.executable)
 
 
