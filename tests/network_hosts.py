@@ -23,6 +23,7 @@ from tests.helpers import DEADLINE_S, Launched, wait_until
 __all__ = ["NEEDS_HOSTS", "NetworkHost", "two_hosts"]
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
+_HIDDEN: Final = "/tmp"  # noqa: S108  of which each host has its own
 _TOOLS: Final = ("unshare", "nsenter", "ip")
 _SPACES: Final = ("--net", "--pid", "--mount", "--uts", "--ipc")
 
@@ -33,7 +34,7 @@ NEEDS_HOSTS = pytest.mark.skipif(
 
 
 class NetworkHost:
-    """One host: commands run in `/tmp/clone`, which has copies of the examples.
+    """One host: commands run in `/tmp/own-clone`, which has copies of the examples.
 
     Args:
         name: its host name.
@@ -48,14 +49,15 @@ class NetworkHost:
     def __init__(self, name: str, folder: Path, shared: Path) -> None:
         self.folder = folder
         for part in ("configs", "fmus"):
-            shutil.copytree(_ROOT / part, folder / "clone" / part)
+            shutil.copytree(_ROOT / part, folder / "own-clone" / part)
         (folder / "etc_hosts").write_text("127.0.0.1 localhost\n10.77.0.1 router\n", encoding="utf-8")
         steps = (
             f"hostname {name}",
             "ip link set lo up",
             f"mount --bind {shared} /mnt",
             f"mount --bind {folder}/etc_hosts /etc/hosts",
-            f"mount --bind {folder} /tmp",
+            *_mounted_checkout(folder),
+            f"mount --rbind {folder} {_HIDDEN}",
             "exec sleep infinity",
         )
         command = ["unshare", *_SPACES, "--mount-proc", "--fork", "--kill-child", "sh", "-ec", "\n".join(steps)]
@@ -67,7 +69,7 @@ class NetworkHost:
         """Start a command there; its first word may be `fmu-mesh`."""
         program = [sys.executable, "-m", "fmu_mesh"] if command[0] == "fmu-mesh" else [command[0]]
         kept = {name: os.environ[name] for name in ("PATH", "COVERAGE_PROCESS_START") if name in os.environ}
-        entered = ["nsenter", f"--target={self.pid}", *_SPACES, "--wdns=/tmp/clone"]
+        entered = ["nsenter", f"--target={self.pid}", *_SPACES, "--wdns=/tmp/own-clone"]
         launched = Launched(
             [*entered, *program, *command[1:]], kept | {"COLUMNS": "1000", "HOME": "/"} | environment, self.folder
         )
@@ -83,6 +85,14 @@ class NetworkHost:
     def _first_process(self) -> int | None:
         children = psutil.Process(self._outer.pid).children()
         return next((child.pid for child in children if child.name() == "sleep"), None)
+
+
+def _mounted_checkout(folder: Path) -> list[str]:
+    """Commands that keep the checkout where it is, if that is below the `/tmp` that the host does not see."""
+    if not _ROOT.is_relative_to(_HIDDEN):
+        return []
+    seen = folder / _ROOT.relative_to(_HIDDEN)
+    return [f"mkdir -p {seen}", f"mount --bind {_ROOT} {seen}"]
 
 
 @contextmanager

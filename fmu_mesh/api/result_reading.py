@@ -73,6 +73,8 @@ def result_pieces(path: Path, types: Mapping[str, VariableType] | None = None) -
 def _csv_pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:
     with opened(path) as file:
         heading = file.readline().removeprefix(BOM_UTF8)  # Excel writes one
+        while heading.count(b'"') % 2 and len(heading) < _PIECE_BYTES and (more := file.readline(_PIECE_BYTES)):
+            heading += more  # a name may contain line ends
         names = next(csv.reader([heading.decode()], strict=True), [])
         if not names or names[0] != _TIME:
             found = f"its first column is '{names[0][:40]}'" if names else "it is empty"
@@ -80,7 +82,8 @@ def _csv_pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Colum
         metadata = read_notes(path)
         about = {name: known for name, known in metadata.get("variables", {}).items() if name in names}
         units = {name: of["unit"] for name, of in about.items() if of.get("unit") is not None}
-        table = _CsvTable(path, names, {name: of["type"] for name, of in about.items()} | dict(types))
+        known = {name: of["type"] for name, of in about.items()} | dict(types)
+        table = _CsvTable(path, names, known, 1 + heading.count(b"\n"))
         data, body = file.read(_PIECE_BYTES), b""
         while True:
             body += data
@@ -112,12 +115,13 @@ class _CsvTable:
         path: the file, for errors.
         names: its columns.
         types: their types by name, as far as they are known.
+        line: the line of the first row, for errors.
     """
 
-    def __init__(self, path: Path, names: Sequence[str], types: Mapping[str, VariableType]) -> None:
+    def __init__(self, path: Path, names: Sequence[str], types: Mapping[str, VariableType], line: int) -> None:
         self._path, self._names, self._known = path, names, types
         self._types: list[VariableType] = []
-        self._line = 2
+        self._line = line
 
     def columns(self, body: bytes) -> Columns:
         """The columns of whole rows, which follow those of the last call."""

@@ -16,7 +16,7 @@ from tests.pages.blocks import ROOT, blocks_of
 pytestmark = NEEDS_HOSTS
 
 CONFIG = "configs/pendulum_delay.yaml"
-RESULT = "clone/results/pendulum_delay.csv"
+RESULT = "own-clone/results/pendulum_delay.csv"
 CONTAINER = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 """A command in front of another one: that one is process 1, and has the host name of this machine."""
 

@@ -165,7 +165,7 @@ def test_a_process_reads_an_fmu_once_for_its_digest(tmp_path: Path, monkeypatch:
     real = hashlib.file_digest
 
     def file_digest(file: BufferedReader, kind: str) -> Any:  # noqa: ANN401 as hashlib has it
-        hashed.append(file.name)
+        hashed.append(str(file.name))
         return real(file, kind)
 
     monkeypatch.setattr(hashlib, "file_digest", file_digest)

@@ -85,6 +85,7 @@ def register_component(component: int, instance: Logged) -> None:
 
 def unregister(instance: Logged) -> None:
     """Discard messages of ``instance`` from now on; tell how many were only counted."""
+    recall()  # or another instance would get them later
     tell_counted(instance)
     _registered.pop(id(instance), None)
     for address in [address for address, one in tuple(_by_address.items()) if one is instance]:
