@@ -104,7 +104,9 @@ class NodeServer:
         self._activity.serve(runners)
         for runner in runners.values():
             self._streams.append(
-                InstanceStreams(runner, self._session, self._keys, self._plan.grid, self._subscribers_changed)
+                InstanceStreams(
+                    runner, self._session, self._keys, self._plan.grid, partial(self._jobs.put, self._search)
+                )
             )
             for kind in ("in", "param"):
                 key = f"{self._keys.instance(runner.name)}/{kind}/*"
@@ -235,9 +237,6 @@ class NodeServer:
         said.wait(_LAST_WORDS_S)
         if heard:
             next(iter(self._session.get(self._keys.mesh_key("status"), timeout=_LAST_WORDS_S)), None)
-
-    def _subscribers_changed(self) -> None:
-        self._jobs.put(self._search)
 
     def _search(self) -> None:
         """Go on looking for new subscribers: Zenoh reports only the first one of an instance, and when all are gone."""

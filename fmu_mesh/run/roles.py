@@ -26,7 +26,7 @@ from ..recorder.recorder import Recorder
 from ..system.plan import MASTER, RECORDER
 from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
-from ..wire.session import RouterLink, close_session, open_session, own_endpoints
+from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .child import is_other_python
 from .events import Event, Log, Reachable, Status
@@ -34,7 +34,7 @@ from .outcome import Outcome
 from .process import RunProcess
 from .results import open_results
 from .run_plan import MANUAL, NodeRun, RunPlan
-from .wiring import is_socket, patient, wiring
+from .wiring import patient, wiring
 
 __all__ = ["prepare_node", "run_master", "run_node"]
 

@@ -17,7 +17,7 @@ from ..config.mesh import TimeoutsConfig, ZenohConfig
 from ..files import beside
 from ..system.plan import MASTER
 from ..wire.runtime import socket_endpoint
-from ..wire.session import Wiring
+from ..wire.session import Wiring, is_socket
 
 __all__ = ["is_socket", "leaves_host", "patient", "wiring"]
 
@@ -64,11 +64,6 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
     is_local = all(map(is_socket, made.connect))
     lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
     return replace(made, lease_s=lease_s, stuck_s=lease_s if is_node else made.stuck_s)
-
-
-def is_socket(endpoint: str) -> bool:
-    """Whether an endpoint is a Unix socket, which is protected by the permissions of its folder."""
-    return endpoint.startswith("unixsock-stream/")
 
 
 def leaves_host(endpoint: str) -> bool:

@@ -30,6 +30,7 @@ __all__ = [
     "answers",
     "ask",
     "close_session",
+    "is_socket",
     "matches",
     "open_session",
     "own_endpoints",
@@ -116,7 +117,12 @@ class Wiring(msgspec.Struct, frozen=True):
     @property
     def asks_itself(self) -> bool:
         """Whether it listens at addresses of which only the session knows all: a port 0, or all that a host has."""
-        return not all(endpoint.startswith("unixsock-stream/") for endpoint in self.listen)
+        return not all(map(is_socket, self.listen))
+
+
+def is_socket(endpoint: str) -> bool:
+    """Whether an endpoint is a Unix socket, which is protected by the permissions of its folder."""
+    return endpoint.startswith("unixsock-stream/")
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
