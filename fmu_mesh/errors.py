@@ -28,6 +28,7 @@ that raise them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
 import msgspec
@@ -163,6 +164,11 @@ class FmuMeshError(Exception):
         self.hint = hint
         return self
 
+    def in_words(self, words: Callable[[str], str]) -> Self:
+        """Say it in the words of whoever reads it, such as flags for options; returns this error."""
+        self.message, self.hint = words(self.message), words(self.hint) if self.hint else self.hint
+        return self
+
     def with_result(self, result: object) -> Self:
         """Set what was recorded before; returns this error."""
         self.result = result
@@ -228,6 +234,14 @@ class ConfigurationError(FmuMeshError):
     def __init__(self, message: str, *, findings: tuple[Finding, ...] = (), hint: str | None = None) -> None:
         super().__init__(message, hint=hint)
         self.findings = findings
+
+    def in_words(self, words: Callable[[str], str]) -> Self:
+        """As for all errors; also the findings."""
+        self.findings = tuple(
+            msgspec.structs.replace(one, path=words(one.path), found=words(one.found), expected=words(one.expected))
+            for one in self.findings
+        )
+        return super().in_words(words)
 
     def __str__(self) -> str:
         listed = [f"  - {text}" for finding in self.findings if (text := str(finding)) != self.message]

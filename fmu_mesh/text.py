@@ -22,6 +22,7 @@ __all__ = [
     "matching",
     "nearest",
     "nearest_file",
+    "option_text",
     "printable",
     "short_number",
     "short_path",
@@ -94,6 +95,17 @@ def shown(value: object) -> str:
         case _:
             text = str(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[: _SHOWN_CHARACTERS - 3]}..."
+
+
+def option_text(name: str, value: object) -> str:
+    """An option and its value as a program gives them, for messages; the command line shows them as a flag.
+
+    Example:
+        >>> option_text("start_values", {"pendulum.l": 2}), option_text("output", Path("a.csv"))
+        ("`start_values={'pendulum.l': 2}`", "`output='a.csv'`")
+    """
+    text = repr(str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value)
+    return f"`{name}={text if len(text) <= _SHOWN_CHARACTERS else f'{text[: _SHOWN_CHARACTERS - 3]}...'}`"
 
 
 def short_number(value: float) -> str:

@@ -12,7 +12,8 @@ from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, Finding
 from ..instances.configuration import examine_data
 from ..run.allowed_code import check_code
-from ..run.options import Options, with_needed
+from ..run.options import PlanOptions
+from ..run.overriding import with_options
 from ..ssp.configuration_files import RESULT_BESIDE_PACKAGE, named_package, read_configuration
 from ..text import short_path
 from .mesh_builder import Mesh
@@ -62,12 +63,12 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
     if suffix not in (*_YAML, _PACKAGE):
         raise ConfigurationError(f"'{target}' is no format of a configuration", hint="Name it .yaml or .ssp.")
     if version is not None and suffix != _PACKAGE:
-        raise ConfigurationError(f"--version is that of a package of SSP, and '{target}' is none")
+        raise ConfigurationError(f"`version=...` is that of a package of SSP, and '{target}' is none")
     given = read_configuration(source, ssd, ssv)
     mesh = Mesh.from_configuration(given)
     if simulation:
         mesh.configure(simulation=dict(simulation))
-    needed = with_needed(given, Options())
+    needed = with_options(given, PlanOptions())
     findings = Findings(str(needed.file), first=needed.findings)
     findings.raise_any()
     if suffix == _PACKAGE:

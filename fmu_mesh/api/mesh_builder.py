@@ -6,25 +6,26 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, cast
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.instance_sections import KIND
 from ..config.loading import PlainConfig, read_text
 from ..config.mesh import LimitsConfig
+from ..config.plain_values import plain
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
-from ..instances.configuration import examine_data
 from ..instances.python.importing import being_imported, component_section
 from ..instances.registry import KINDS, check_engines
-from ..run.options import with_config_values, with_needed
+from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, takes
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import listed, shown
 from .mesh_check import Check
-from .plan_options import PlanOptions, RunOptions, StartOptions, options_of, plain, with_record, with_scenario
+from .plan_options import memory_file, with_record
 from .rebasing import rebased
 from .run_handle import Run
 
@@ -360,7 +361,8 @@ class Mesh:
 
     # --- running
 
-    def check(self, **options: Unpack[PlanOptions]) -> Check:
+    @takes(PlanOptions)
+    def check(self, options: PlanOptions) -> Check:
         """Check the configuration, its models, and that this host can run them; nothing is started.
 
         Example:
@@ -370,10 +372,13 @@ class Mesh:
             >>> for finding in mesh.check().findings:
             ...     print(finding.path, finding.suggestion[-8:])
             instances.gain.fmu Gain.fmu
+
+        Args:
+            options: see `PlanOptions`.
         """
         run, file = None, self._shown_file
         try:
-            run = self.plan(**options)
+            run = self.plan(**options.given())
             system = run.plan.system
             models = {name: (Path(one.fmu), one.description) for name, one in system.instances.items()}
             check_engines(system.config.instances, models, system.config.limits, str(file))
@@ -382,7 +387,8 @@ class Mesh:
             return Check(str(file), error, run)
         return Check(str(file), run=run)
 
-    def plan(self, **options: Unpack[PlanOptions]) -> RunPlan:
+    @takes(PlanOptions)
+    def plan(self, options: PlanOptions) -> RunPlan:
         """Read all models and plan a run, which `Run.start` starts; nothing is started here.
 
         Example:
@@ -403,13 +409,14 @@ class Mesh:
         if (place := being_imported()) is not None:
             hint = 'Write `if __name__ == "__main__":` before what the program does.'
             raise ConfigurationError(f"mesh '{self.name}' would run while '{place}' is imported", hint=hint)
-        chosen = options_of(options)
-        values = with_scenario(self._plain._replace(file=self._shown_file), options)
-        data = with_needed(with_config_values(values, chosen.config_values), chosen)
-        loaded, findings = examine_data(data, chosen.start_values)
-        return planned(loaded, findings, chosen, options.get("on_notice", log.info), self._known)
+        if options.record is not None and options.output is None:
+            names = options.record if options.record != "memory" else None
+            options = replace(options, record=names, output=memory_file())
+        values = self._plain._replace(file=self._shown_file)
+        return planned(values, options, options.on_notice or log.info, self._known)
 
-    def graph(self, **options: Unpack[PlanOptions]) -> SystemGraph:
+    @takes(PlanOptions)
+    def graph(self, options: PlanOptions) -> SystemGraph:
         """The graph of the mesh: instances, connections, processes and cycles, as a picture or as text.
 
         Example:
@@ -429,9 +436,10 @@ class Mesh:
         """
         from .system_graph import graph_of_plan  # noqa: PLC0415  only this needs it
 
-        return graph_of_plan(self.plan(**options).plan)
+        return graph_of_plan(self.plan(**options.given()).plan)
 
-    def run(self, **options: Unpack[RunOptions]) -> Result:
+    @takes(RunOptions)
+    def run(self, options: RunOptions) -> Result:
         """Run the mesh to its end, and return what it has recorded.
 
         Ctrl-C ends the run, and raises `KeyboardInterrupted`.
@@ -452,10 +460,11 @@ class Mesh:
             FmuMeshError: the run ended early; names instance, variable and point, and its `result` has what was
                 recorded up to then.
         """
-        with self.start(**options) as run:
+        with self.start(**options.given()) as run:
             return run.wait()
 
-    def start(self, **options: Unpack[RunOptions]) -> Run:
+    @takes(RunOptions)
+    def start(self, options: RunOptions) -> Run:
         """Start the mesh, and return a handle to look into it, steer it and wait for it.
 
         Use it as a context manager, or call `Run.wait` or `Run.close`. What still runs at the end of the program is
@@ -467,11 +476,12 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
-        how = {name: value for name, value in options.items() if name not in PlanOptions.__annotations__}
-        what = {name: value for name, value in options.items() if name not in how}
-        return Run.start(self.plan(**cast("PlanOptions", what)), **cast("StartOptions", how))
+        given = options.given()
+        how = {name: given.pop(name) for name in StartOptions.__struct_fields__ if name in given}
+        return Run.start(self.plan(**given), **how)
 
-    def open(self, start_values: Mapping[str, Any] | None = None) -> System:
+    @takes(OpenOptions)
+    def open(self, options: OpenOptions) -> System:
         """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
 
         Nothing is recorded into a file, and no other process is started.
@@ -484,7 +494,7 @@ class Mesh:
             (0.2, True)
 
         Args:
-            start_values: start values by `instance.variable`; they come before those of the configuration.
+            options: see `OpenOptions`.
 
         Raises:
             ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
@@ -493,7 +503,7 @@ class Mesh:
         """
         from .open_system import System  # noqa: PLC0415  only this needs it
 
-        return System(self.plan(start_values=start_values or {}))
+        return System(self.plan(**options.given()))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

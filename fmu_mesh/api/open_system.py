@@ -409,7 +409,7 @@ class SystemState:
 
 
 def _opened(run: RunPlan, folder: Path, name: str) -> Guarded:
-    opening = opening_of(run.plan, name, folder, _forward, run.options.showing)
+    opening = opening_of(run.plan, name, folder, _forward, run.showing)
     return Guarded(name, lambda: open_instance(opening), Unwatched(), run.plan.system.config.timeouts)
 
 

@@ -9,8 +9,8 @@ from typing import Any, TypeGuard
 
 from ..config.instance_sections import InstanceSection, key_of, keys_of
 from ..config.loading import PlainConfig
+from ..config.plain_values import plain
 from ..instances.configuration import examine_data
-from .plan_options import plain
 
 __all__ = ["rebased"]
 

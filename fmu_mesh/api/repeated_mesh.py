@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from msgspec.structs import replace
@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from ..errors import CallRefused, FmuError, FmuMeshError
 from ..files import Kept, remove_tree
+from ..run.options import PlanOptions, takes
 from ..run.outcome import Outcome
 from ..run.repeated import RepeatedRuns
 from ..run.results import open_result
 from ..run.run_plan import RunPlan
 from ..variables.value_types import DTYPES
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
-from .plan_options import PlanOptions, memory_of
+from .plan_options import memory_of
 from .result import Result, types_of
 from .result_reading import Columns
 
@@ -83,7 +84,8 @@ class RepeatedMesh:
     ) -> None:
         self.close()
 
-    def run(self, **options: Unpack[PlanOptions]) -> Result:
+    @takes(PlanOptions)
+    def run(self, options: PlanOptions) -> Result:
         """Run the mesh to its end, and return what it has recorded.
 
         The result stays in memory, unless `output` names a file: then it is in both.
@@ -99,9 +101,9 @@ class RepeatedMesh:
         if not self._release.alive or threading.get_ident() != self._thread:
             why = "it belongs to the thread that made it" if self._release.alive else "it is closed"
             raise CallRefused(f"run is not possible, because {why}.")
-        if options.get("output") is None:
-            options["record"] = "memory"
-        plan = self._mesh.plan(**options)
+        if options.output is None and options.record is None:
+            options = replace(options, record="memory")
+        plan = self._mesh.plan(**options.given())
         self._rows = rows = _CollectedRows(plan)
         runs = self._runs(plan.mesh)
         try:

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -19,6 +19,7 @@ from .. import __version__
 from ..config.loading import PlainConfig
 from ..errors import CallRefused, ConfigurationError, Finding, FmuMeshError, MeshLost
 from ..run.allowed_code import check_owner
+from ..run.options import RerunOptions, StartOptions, takes
 from ..run.run_plan import RunPlan
 from ..system.run_metadata import RunMetadata, machine, machine_difference, scenario_files
 from ..text import listed
@@ -30,7 +31,6 @@ from ..wire.client.waiting import rest
 from ..wire.messages import SetValue
 from ..wire.views import Command
 from .mesh_builder import Mesh
-from .plan_options import StartOptions
 from .result import Result
 from .run_handle import Run
 
@@ -61,19 +61,23 @@ class PlannedRerun(NamedTuple):
     last_point: int | None
     first: Result
 
-    def run(self, **how: Unpack[StartOptions]) -> Result:
+    @takes(StartOptions)
+    def run(self, options: StartOptions) -> Result:
         """Run it.
+
+        Args:
+            options: see `StartOptions`.
 
         Raises:
             FmuMeshError: it ended early; its `result` has what was recorded up to then.
         """
-        with Run.start(self.plan, **how) as run:
+        with Run.start(self.plan, **options.given()) as run:
             self.drive(run)
             return run.wait()
 
     def drive(self, run: Run) -> None:
         """Set the values in the run, which is paused at its first point, and stop it where the first one has ended."""
-        if self.plan.options.paused:
+        if self.plan.paused:
             try:
                 run.replay(self.values, self.last_point)
             except FmuMeshError:
@@ -81,14 +85,8 @@ class PlannedRerun(NamedTuple):
                 raise
 
 
-def rerun(
-    result: str | Path,
-    *,
-    output: str | Path | None = None,
-    allow_code: bool = False,
-    on_notice: Callable[[str], None] = log.info,
-    **how: Unpack[StartOptions],
-) -> Result:
+@takes(RerunOptions)
+def rerun(result: str | Path, options: RerunOptions) -> Result:
     """Run again what a result file has recorded: same configuration, models and values that were set from outside.
 
     The rows are the same in every float, unless versions or machines calculate differently; `Result.compare` tells.
@@ -110,10 +108,7 @@ def rerun(
 
     Args:
         result: the result file; a CSV needs the `.json` file beside it.
-        output: the new result file; by default `NAME.rerun` with the same ending, beside the first one.
-        allow_code: run the Python code that the file names; also, run it although another user owns the file.
-        on_notice: called with a sentence about what may make a difference, such as another version of fmu_mesh.
-        how: see `StartOptions`.
+        options: see `RerunOptions`; by default, `output` is `NAME.rerun` with the same ending, beside the first one.
 
     Returns:
         The result of the new run.
@@ -122,7 +117,9 @@ def rerun(
         ConfigurationError: the file does not say how it was made, or a model has changed; names each.
         FmuMeshError: the run ended early, and not where the first one has.
     """
-    return planned_rerun(result, output=output, allow_code=allow_code, on_notice=on_notice).run(**how)
+    given = options.given()
+    how = {name: given.pop(name) for name in StartOptions.__struct_fields__ if name in given}
+    return planned_rerun(result, **given).run(**how)
 
 
 def planned_rerun(
@@ -132,7 +129,14 @@ def planned_rerun(
     allow_code: bool = False,
     on_notice: Callable[[str], None] = log.info,
 ) -> PlannedRerun:
-    """Plan a rerun; the arguments and errors are those of `rerun`."""
+    """Plan a rerun; the arguments and errors are those of `rerun`.
+
+    Args:
+        result: the result file.
+        output: the new result file.
+        allow_code: run the Python code that the file names; also, run it although another user owns the file.
+        on_notice: called with a sentence about what may make a difference, such as another version of fmu_mesh.
+    """
     path = Path(result)
     first = Result.read(path)
     metadata, values = _metadata_of(path, first)
@@ -140,7 +144,7 @@ def planned_rerun(
         check_owner(path, f"'{path}'")
     output = Path(output) if output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
     if output.absolute() == path.absolute():
-        raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with --output.")
+        raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with `output=...`.")
     data = {**metadata.configuration, **_ALONE}
     sections = data.get("record") or {}
     section = sections[metadata.section] if isinstance(sections, list) else sections

@@ -19,6 +19,7 @@ from ..errors import (
     FmuMeshError,
     MeshLost,
 )
+from ..run.options import StartOptions, takes
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
 from ..wire.client.waiting import rest, wait_for, wait_for_start
@@ -43,7 +44,6 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
     from ..ros.bags.playing import Played, PlayOptions
     from ..run.run_plan import RunPlan
     from ..wire.messages import SetValue
-    from .plan_options import StartOptions
     from .result import Result
     from .run_thread import RunThread
     from .system_graph import SystemGraph
@@ -90,19 +90,20 @@ class Run:
         self._ended: Future[Result] | None = own.future if own is not None else None
 
     @classmethod
-    def start(cls, plan: RunPlan, **how: Unpack[StartOptions]) -> Self:
+    @takes(StartOptions)
+    def start(cls, plan: RunPlan, options: StartOptions) -> Self:
         """Start a run that `Mesh.plan` has planned; `Mesh.start` does both.
 
         Args:
             plan: the plan of the run.
-            how: see `StartOptions`.
+            options: see `StartOptions`.
 
         Raises:
             CallRefused: its results do not fit into memory.
         """
-        from .run_thread import RunThread, Settings  # noqa: PLC0415  not for those who attach to a mesh
+        from .run_thread import RunThread  # noqa: PLC0415  not for those who attach to a mesh
 
-        return cls(plan.mesh, own=RunThread(plan, Settings(**how)))
+        return cls(plan.mesh, own=RunThread(plan, options))
 
     def __enter__(self) -> Self:
         return self

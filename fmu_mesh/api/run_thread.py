@@ -9,12 +9,10 @@ import atexit
 import logging
 import sys
 import threading
-from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from shutil import rmtree
 
-import msgspec
 from msgspec.structs import replace
 
 from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
@@ -23,6 +21,7 @@ from ..recorder.arrays_file import bytes_of_a_row, read_arrays
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.in_process import InProcessRun
 from ..run.launcher import Launcher
+from ..run.options import StartOptions
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
@@ -31,34 +30,13 @@ from .plan_options import memory_of
 from .result import Result, result_of, types_of
 from .result_reading import Columns
 
-__all__ = ["RunThread", "Settings"]
+__all__ = ["RunThread"]
 
 log = logging.getLogger("fmu_mesh.run")
-
-MEMORY_LIMIT = 2**30
-"""Default of `memory_limit`, in bytes."""
 
 _WARNED_AT = 0.8
 _JOIN_S = 10.0
 _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.WARNING}
-
-
-class Settings(msgspec.Struct, frozen=True):
-    """How a program wants a run.
-
-    Attributes:
-        processes: False runs everything in this process.
-        restarts: how often a run is started again from its first point if a process of it is lost.
-        memory_limit: the most bytes of results that stay in memory.
-        on_progress: called with every status, on the thread of the run.
-        on_event: called there with every event; without it, the log gets the messages of FMUs.
-    """
-
-    processes: bool = True
-    restarts: int = 0
-    memory_limit: int = MEMORY_LIMIT
-    on_progress: Callable[[MeshStatus], object] | None = None
-    on_event: Callable[[Event], object] | None = None
 
 
 class RunThread:
@@ -76,7 +54,7 @@ class RunThread:
         endpoints: the Zenoh endpoints of the mesh; empty in this process.
     """
 
-    def __init__(self, plan: RunPlan, settings: Settings) -> None:
+    def __init__(self, plan: RunPlan, settings: StartOptions) -> None:
         if not sys.platform.startswith("linux"):
             raise ConfigurationError(f"a mesh runs on Linux, and this system is '{sys.platform}'")
         self.plan = plan

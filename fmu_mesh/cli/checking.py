@@ -12,6 +12,7 @@ from ..config.structure import schema_text
 from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
 from .arguments import CommandParser, Parsers, add_json, add_quiet
+from .output.flag_words import in_flags
 from .output.json_output import Failure, failure_of, print_json
 from .run_options import add_configuration, given_options, mesh_of
 
@@ -30,7 +31,7 @@ class CheckReport(msgspec.Struct, frozen=True):
 
     file: str
     exit_code: int
-    plan: PlanView | None = None
+    plan: PlanView | msgspec.Raw | None = None
     error: Failure | None = None
 
 
@@ -49,14 +50,15 @@ def _check(arguments: argparse.Namespace) -> int:
     try:
         check = mesh_of(arguments).check(**given_options(arguments))
         if not arguments.json and check.run is not None:
-            print(check or check.page)
+            print(in_flags(str(check or check.page)))
         check.require()
     except FmuMeshError as error:
         if arguments.json:
             print_json(CheckReport(str(arguments.config), error.exit_code, error=failure_of(error)))
         raise
     if arguments.json:
-        print_json(CheckReport(str(arguments.config), 0, check.plan))
+        plan = msgspec.Raw(in_flags(msgspec.json.encode(check.plan).decode()).encode())
+        print_json(CheckReport(str(arguments.config), 0, plan))
     return 0
 
 

@@ -14,7 +14,7 @@ from ..ssp.package import DEFAULT, Package
 from ..ssp.system_reading import chosen_description
 from .arguments import CommandParser, Parsers, add_package, add_quiet
 from .output.display import say
-from .run_options import add_options, read_options
+from .run_options import add_options
 
 __all__ = ["PARSERS"]
 
@@ -41,8 +41,7 @@ def _convert(arguments: argparse.Namespace) -> int:
     source, target = arguments.source, arguments.target
     if files.exists(target) and not arguments.force:
         raise ConfigurationError(f"'{target}' exists.", hint="--force overwrites it.")
-    options = read_options(arguments)
-    given = {name: value for name in _TIMES if (value := getattr(options, name)) is not None}
+    given = {name: value for name in _TIMES if (value := getattr(arguments, name)) is not None}
     lost = convert(source, target, ssd=arguments.ssd, ssv=arguments.ssv, version=arguments.version, simulation=given)
     if not arguments.quiet:
         for finding in lost:

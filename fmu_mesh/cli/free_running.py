@@ -62,7 +62,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with RunReporter(wanted=arguments.json) as reporter:
         mesh, options = _mesh(arguments), given_options(arguments)
         front = f"{mesh.name}."  # the only instance has the name of the mesh
-        options["start_values"] = tuple(f"{front}{change}" for change in options["start_values"])
+        options["start_values"] = [(f"{front}{name}", value) for name, value in options.get("start_values", ())]
         try:
             run_mesh(mesh, options, arguments, reporter, {})
         except ConfigurationError as error:
@@ -86,7 +86,7 @@ def _mesh(arguments: argparse.Namespace) -> Mesh:
     except LoadFailed as error:  # a wrong argument: nothing was going to run
         raise ConfigurationError(error.message, hint=error.hint) from error
     except CallRefused as error:
-        raise ConfigurationError(error.message, hint="Give one with --step-size.") from error
+        raise ConfigurationError(error.message, hint="Give one with `step_size=...`.") from error
     if re.search(NAME_PATTERN, mesh.name) is None:
         what = "a name of letters, digits, _ and - that starts with a letter or _"
         raise ConfigurationError(f"'{mesh.name}' is not {what}", hint="Give the mesh such a name with --name.")
@@ -97,7 +97,7 @@ def _as_given(error: ConfigurationError, front: str) -> ConfigurationError:
     """The error with start values as they were given: without the name of the only instance."""
 
     def short(text: str) -> str:
-        return text.replace(f"--set {front}", "--set ", 1)
+        return text.replace(f"`start_values={{'{front}", "`start_values={'", 1)
 
     findings = tuple(replace(finding, path=short(finding.path)) for finding in error.findings)
     return ConfigurationError(short(error.message), findings=findings, hint=error.hint)

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import cast
-
-from msgspec.structs import asdict
 
 from ..api.attaching import attach
 from ..api.drawing import draw
 from ..api.mesh_builder import load
-from ..api.plan_options import PlanOptions
 from ..api.system_graph import SystemGraph
 from ..errors import ConfigurationError
 from ..files import replaced
+from ..run.options import VariantOptions
 from ..ssp.configuration_files import names_package
 from .arguments import CommandParser, Parsers, add_json, add_package, add_quiet, add_reaching
 from .output.json_output import print_json
-from .run_options import add_options, read_options
+from .run_options import add_options, given_options
 
 __all__ = ["PARSERS"]
 
@@ -70,8 +67,8 @@ def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
     if of is None and chooses:
         raise ConfigurationError("--ssd and --ssv choose a variant of a package of SSP, and none is named")
     if of is not None and (chooses or _is_configuration(Path(of))):
-        given = {name: value for name, value in asdict(read_options(arguments)).items() if name in _OF_CONFIG}
-        return load(of, ssd=arguments.ssd, ssv=arguments.ssv).graph(**cast("PlanOptions", given))
+        given = given_options(arguments, VariantOptions)
+        return load(of, ssd=arguments.ssd, ssv=arguments.ssv).graph(**given)
     with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:
         return run.graph()
 

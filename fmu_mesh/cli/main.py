@@ -17,7 +17,7 @@ from pathlib import PurePath
 from typing import Final
 
 from .. import __version__
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, FmuMeshError
 from ..printing import guard_streams
 from ..run.limits import needed_mib
 from ..text import nearest
@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ConfigurationError.exit_code
     from ..run.program import exit_code_of  # noqa: PLC0415 not for `--version` and `--help`
 
-    needed = needed_mib(options.command, local=getattr(options, "local", False))
+    needed = needed_mib(options.command, local=getattr(options, "processes", None) is False)
     return exit_code_of(partial(_run, options), needed, debug=options.debug)
 
 
@@ -94,7 +94,12 @@ def _run(options: argparse.Namespace) -> int:
     """Run the command; with `--quiet` and without `--json`, nothing of what it prints is shown but errors."""
     quiet = getattr(options, "quiet", False) and not getattr(options, "json", False)
     with redirect_stdout(io.StringIO()) if quiet else nullcontext():
-        code: int = options.run_command(options)
+        try:
+            code: int = options.run_command(options)
+        except FmuMeshError as error:
+            from .output.flag_words import in_flags  # noqa: PLC0415  only then
+
+            raise error.in_words(in_flags) from error.__cause__
     return code
 
 

@@ -25,9 +25,9 @@ from ..config.mesh import ConnectionConfig
 from ..config.structure import SCHEMA_ID, schema_text
 from ..config.yaml_text import read
 from ..errors import ConfigurationError, LoadFailed
-from ..instances.configuration import examine_data, installed_config
+from ..instances.configuration import installed_config
 from ..instances.registry import KINDS, describe
-from ..run.options import Options
+from ..run.options import PlanOptions
 from ..run.preparing import planned
 from ..simtime import steps_between
 from ..ssp.configuration_files import names_package
@@ -87,8 +87,7 @@ def _new(arguments: argparse.Namespace) -> int:
         _refuse_to_overwrite(file, schema)
     models = _models(paths, file.absolute().parent, quiet=arguments.quiet)
     text = configuration_for(models, mesh=_name(file.absolute().parent.name, ()), file=file, schema=schema.name)
-    loaded, findings = examine_data(read_text(text, file))
-    plan = planned(loaded, findings, Options()).plan
+    plan = planned(read_text(text, file), PlanOptions()).plan
     try:
         for path, content in ((file, text), (schema, schema_text(installed_config()))):
             with files.replaced(path) as draft:

@@ -23,10 +23,7 @@ __all__ = ["PARSERS"]
 
 def _add_rerun(parser: CommandParser) -> None:
     parser.add_argument("result", type=Path, metavar="RESULT", help="the result file of a run")
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE", help="the new result file; default: RESULT with .rerun in its name"
-    )
-    add_options(parser, "allow_code")
+    add_options(parser, "output", "allow_code", defaults={"output": "RESULT with .rerun in its name"})
     add_output(parser)
     add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
     parser.set_defaults(run_command=_rerun)
@@ -37,7 +34,7 @@ def _rerun(arguments: argparse.Namespace) -> int:
         again = planned_rerun(
             arguments.result,
             output=arguments.output,
-            allow_code=arguments.allow_code,
+            allow_code=bool(arguments.allow_code),
             on_notice=teller(quiet=arguments.quiet),
         )
         reporter.planned(again.plan)

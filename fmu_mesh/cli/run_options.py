@@ -1,24 +1,21 @@
-"""The options of a run as flags of the command line: `Options` says which there are and how they are spelt."""
+"""The options of a run as flags of the command line: their Structs say which there are and how they are spelt."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, cast
-
-from msgspec.structs import asdict
+from typing import Any, Literal
 
 from ..api.mesh_builder import Mesh, load
-from ..api.plan_options import PlanOptions
-from ..config.base import Endpoint
 from ..config.mesh import MAX_WINDOW
+from ..config.yaml_text import Plain, read_value
 from ..errors import ConfigurationError
-from ..run.options import Options, option_fields
-from .arguments import add_package, endpoint, number, whole
+from ..run.options import CallOptions, PlanOptions, RunOptions, option_fields
+from .arguments import add_package, count, endpoint, number, whole
 from .output.display import teller
 
-__all__ = ["add_configuration", "add_options", "given_options", "mesh_of", "read_options"]
+__all__ = ["add_configuration", "add_options", "given_options", "mesh_of"]
 
 
 def add_configuration(parser: argparse.ArgumentParser) -> None:
@@ -50,55 +47,52 @@ def mesh_of(arguments: argparse.Namespace) -> Mesh:
 def add_options(
     parser: argparse._ActionsContainer,
     *names: str,
+    options: type[CallOptions] = RunOptions,
     defaults: Mapping[str, str] | None = None,
     metavars: Mapping[str, str] | None = None,
 ) -> None:
-    """Add flags for options of a run, as `Options` describes them.
+    """Add flags for options, as their Struct describes them.
 
     Args:
         parser: the parser of a command, or a group of its flags.
-        names: the fields of `Options`.
+        names: the fields of the Struct.
+        options: the Struct.
         defaults: by field, the default value for the help.
-        metavars: by field, the name of the value in the help, if it differs from that in `Options`.
+        metavars: by field, the name of the value in the help, if it differs from that in the Struct.
     """
     for name in names:
-        setting = option_fields()[name]
-        flag, kind = setting.flag, setting.type
+        field = option_fields(options)[name]
         default = (defaults or {}).get(name)
-        text = setting.help + (f"; default: {default}" if default is not None else "")
-        details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%")}
-        if kind is bool:
-            parser.add_argument(flag.name, action="store_true", **details)
+        text = (
+            field.text.removeprefix("False: ")
+            + ("; repeatable" if field.repeatable else "")
+            + (f"; default: {default}" if default else "")
+        )
+        flag = field.option.flag or ""
+        details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%"), "default": None}
+        if field.kinds == (bool,):
+            action = "store_false" if field.default else "store_true"
+            parser.add_argument(flag, action=action, **details)
             continue
-        details |= {"metavar": (metavars or {}).get(name, flag.metavar), "type": _READERS.get(kind, str)}
-        if setting.repeatable:
-            details |= {"action": "append", "default": []}
-        if flag.bare is not None:
-            details |= {"nargs": "?", "const": flag.bare, "type": _trace_file}
-        parser.add_argument(flag.name, **details)
+        reader = _READERS.get(name) or next((_OF_TYPE[kind] for kind in field.kinds if kind in _OF_TYPE), str)
+        details |= {"metavar": (metavars or {}).get(name, field.option.metavar), "type": reader}
+        if field.repeatable:
+            details |= {"action": "append"}
+        if field.option.bare is not None:
+            details |= {"nargs": "?", "const": field.option.bare}
+        parser.add_argument(flag, **details)
 
 
-def given_options(arguments: argparse.Namespace) -> PlanOptions:
-    """The options from the arguments of a command, as the library takes them.
+def given_options(arguments: argparse.Namespace, options: type[CallOptions] = PlanOptions) -> dict[str, Any]:
+    """The options from the arguments of a command, as the library takes them; only those that are given.
 
     Raises:
         ConfigurationError: two of them cannot be combined.
     """
-    options = read_options(arguments)
-    if options.view and options.video is not None:
+    given = {name: value for name in option_fields(options) if (value := getattr(arguments, name, None)) is not None}
+    if given.get("view") and "video" in given:
         raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
-    tell = teller(quiet=getattr(arguments, "quiet", False))
-    return cast("PlanOptions", {**asdict(options), "on_notice": tell})
-
-
-def read_options(arguments: argparse.Namespace) -> Options:
-    """The options from the arguments of a command."""
-    given: dict[str, Any] = {}
-    for name, setting in option_fields().items():
-        if hasattr(arguments, name):
-            value = getattr(arguments, name)
-            given[name] = tuple(value) if setting.repeatable else value
-    return Options(**given)
+    return {**given, "on_notice": teller(quiet=getattr(arguments, "quiet", False))}
 
 
 def _trace_file(text: str) -> Path:
@@ -116,10 +110,25 @@ def _window(text: str) -> int | Literal["auto"]:
     return value
 
 
-_READERS: dict[Any, Callable[[str], object]] = {
-    int: _window,
-    float: number,
-    Path: Path,
-    Endpoint: endpoint,
+def _value(text: str) -> tuple[str, Plain]:
+    try:
+        return read_value(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{error}; expected NAME=VALUE") from error
+
+
+_READERS: Mapping[str, Callable[[str], object]] = {
+    "window": _window,
+    "profile": _trace_file,
+    "start_values": _value,
+    "config_values": _value,
+    "max_instances": _value,
+    "listen": endpoint,
+    "connect": endpoint,
+    "restarts": count,
+    "workers": count,
 }
-"""The reader of a value by its type; text for any other type. What words a key allows is checked with the file."""
+"""The readers of values by their options; what a key allows is checked with the file."""
+
+_OF_TYPE: Mapping[object, Callable[[str], object]] = {int: whole, float: number, Path: Path}
+"""The readers of all other values; text for any other type."""

@@ -11,10 +11,9 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..api.mesh_builder import Mesh
-from ..api.plan_options import PlanOptions, StartOptions
 from ..api.run_handle import Run
 from ..errors import ConfigurationError
 from ..run.events import Event, Reachable
@@ -25,7 +24,7 @@ from ..run.roles import run_master, run_node
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..wire.session import run_router
-from .arguments import CommandParser, Parsers, add_json, add_quiet, count, endpoint
+from .arguments import CommandParser, Parsers, add_json, add_quiet, endpoint
 from .output.display import Display, stdout_as_stderr, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
@@ -41,15 +40,8 @@ __all__ = ["PARSERS", "add_output", "interrupted_by_signals", "run_mesh", "show_
 def _add_launch(parser: CommandParser) -> None:
     add_configuration(parser)
     add_options(parser, "paused", "view", "video", "profile")
-    parser.add_argument("--local", action="store_true", help="run everything in this one process")
+    add_options(parser, "processes", "restarts")
     _add_plot(parser)
-    parser.add_argument(
-        "--restarts",
-        type=count,
-        default=0,
-        metavar="N",
-        help="restart from the first point when a node or the master is lost, at most N times",
-    )
     add_output(parser)
     add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
     parser.set_defaults(run_command=_launch)
@@ -105,24 +97,25 @@ def _launch(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _how(arguments: argparse.Namespace) -> StartOptions:
+def _how(arguments: argparse.Namespace) -> dict[str, Any]:
     """How a run is started.
 
     Raises:
         ConfigurationError: two options cannot be combined.
     """
-    if arguments.local and arguments.paused:
+    local = arguments.processes is False
+    if local and arguments.paused:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
-    if arguments.local and arguments.profile:
+    if local and arguments.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
-    if arguments.restarts and (arguments.local or arguments.paused):
-        other = "--local" if arguments.local else "--paused"
+    if arguments.restarts and (local or arguments.paused):
+        other = "--local" if local else "--paused"
         raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
-    return {"processes": not arguments.local, "restarts": arguments.restarts}
+    return {"processes": not local, "restarts": arguments.restarts or 0}
 
 
 def run_mesh(
-    mesh: Mesh, options: PlanOptions, arguments: argparse.Namespace, reporter: RunReporter, how: StartOptions
+    mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace, reporter: RunReporter, how: dict[str, Any]
 ) -> None:
     """Run a mesh, show its events, and at the end what the arguments ask for."""
     plan = _planned(mesh, options, arguments)
@@ -147,7 +140,7 @@ def show_event(reporter: RunReporter, display: Display, event: Event) -> None:
     display.event(event)
 
 
-def _planned(mesh: Mesh, options: PlanOptions, arguments: argparse.Namespace) -> RunPlan:
+def _planned(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:
     """Plan the run of a command, and check what it shows at the end."""
     plan = mesh.plan(**options)
     if not arguments.quiet:
@@ -178,7 +171,8 @@ def interrupted_by_signals() -> Iterator[list[Run | Sweep]]:
 def _finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
     """Show what the options of the command ask for, and print the summary."""
     if outcome.profile is not None:
-        show_profile(plan, outcome.profile, outcome.seconds, arguments.profile)
+        file = arguments.profile if isinstance(arguments.profile, Path) else None
+        show_profile(plan, outcome.profile, outcome.seconds, file)
     if (video := getattr(arguments, "video", None)) is not None:
         print(f"video: {video}")
     plot = getattr(arguments, "plot", None)

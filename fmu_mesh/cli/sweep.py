@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal
 
 import msgspec
-from msgspec.structs import asdict
 
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
-from ..run.options import Options
 from ..sweeps.dask_cluster import dask_executor
 from ..sweeps.planned_sweep import PlannedSweep, SweepOptions, continued_sweep, planned_sweep
 from ..sweeps.slurm_sweep import SlurmOptions, SlurmSweep
@@ -22,11 +20,11 @@ from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
 from ..sweeps.variants import Values, read_values
 from ..text import short_path, shown
 from .arguments import CommandParser, Parsers, add_json, add_package, count, whole
-from .output.display import say, stdout_as_stderr, teller
+from .output.display import say, stdout_as_stderr
 from .output.json_output import Failure, failure_of, print_json
 from .output.progress import SweepProgressLine
 from .output.terminal import error_console
-from .run_options import add_options, mesh_of, read_options
+from .run_options import add_options, given_options, mesh_of
 from .running import add_output, interrupted_by_signals
 
 __all__ = ["PARSERS", "SweepReport"]
@@ -35,8 +33,8 @@ _LOOK_S = 0.1
 _SHOWN_FAILURES = 5
 _HERE = "here"
 """`--dask` without an address."""
-_ASKED = ("ssd", "ssv", "vary", "sampler", "reduce", "no_curves", "processes", "reset", "max_instances", "folder")
-"""What the folder of a sweep says."""
+_OF_FOLDER = {"allow_code", "on_notice", "resume", "workers"}
+"""The options that go with the folder of a sweep, which says all others."""
 
 
 class SweepReport(msgspec.Struct, frozen=True):
@@ -84,34 +82,10 @@ def _add_sweep(parser: CommandParser) -> None:
         help="values of instance.variable or of a key of CONFIG: LOW:HIGH:COUNT, LOW:HIGH:COUNT:log, LOW:HIGH for a "
         "sampler, or VALUE,VALUE; repeatable: all combinations run",
     )
-    what.add_argument(
-        "--sampler", metavar="NAME:COUNT", help="choose COUNT variants: lhs, sobol, halton or random; as in lhs:64"
-    )
-    what.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of the sampler (0)")
-    kept = parser.add_argument_group("what is kept")
-    kept.add_argument(
-        "--reduce",
-        action="append",
-        default=[],
-        metavar="FUNCTION(VARIABLE)",
-        help="a column of the table, such as max(pendulum.a); repeatable; default: the last value of each variable",
-    )
-    kept.add_argument(
-        "--folder", type=Path, metavar="FOLDER", help="folder of the sweep; default: MESH_sweep beside the result file"
-    )
-    kept.add_argument("--no-curves", action="store_true", help="keep the table only")
+    add_options(what, "sampler", "seed", options=SweepOptions)
+    add_options(parser.add_argument_group("what is kept"), "reduce", "folder", "curves", options=SweepOptions)
     how = parser.add_argument_group("how it runs")
-    how.add_argument("--resume", action="store_true", help="keep the runs that FOLDER has, and run what is missing")
-    how.add_argument("--workers", type=count, metavar="N", help="processes of this host; default: one per processor")
-    how.add_argument(
-        "--max-instances",
-        action="append",
-        default=[],
-        metavar="MODEL.fmu=N",
-        help="at most N instances of a model at a time, as its licence may ask; repeatable",
-    )
-    how.add_argument("--processes", action="store_true", help="run each variant in processes, as `launch` does")
-    how.add_argument("--reset", action="store_true", help="reset the instances of FMUs between two runs (fmi2Reset)")
+    add_options(how, "resume", "workers", "max_instances", "processes", "reset", options=SweepOptions)
     how.add_argument(
         "--dask",
         nargs="?",
@@ -172,14 +146,13 @@ def _planned(arguments: argparse.Namespace) -> PlannedSweep:
     Raises:
         ConfigurationError: something is wrong with it, or two arguments cannot be combined.
     """
-    options = read_options(arguments)
+    given = given_options(arguments, SweepOptions)
     if is_sweep(arguments.config):
-        given = [name for name in _ASKED if getattr(arguments, name)]
-        if given or options != Options(allow_code=options.allow_code):
+        if given.keys() - _OF_FOLDER or any(getattr(arguments, name) for name in ("ssd", "ssv", "vary")):
             text = f"'{arguments.config}' is the folder of a sweep, which says what varies"
             raise ConfigurationError(text, hint="Continue it with its folder alone, or give the configuration file.")
-        tell = teller(quiet=arguments.quiet)
-        return continued_sweep(arguments.config, allow_code=options.allow_code, on_notice=tell)
+        allow_code = given.get("allow_code", False)
+        return continued_sweep(arguments.config, allow_code=allow_code, on_notice=given["on_notice"])
     if arguments.part is not None:
         raise ConfigurationError("--part needs the folder of a sweep in place of the configuration file.")
     vary: dict[str, Values] = {}
@@ -188,20 +161,7 @@ def _planned(arguments: argparse.Namespace) -> PlannedSweep:
         if name in vary:
             raise ConfigurationError(f"--vary {name} is there twice", hint="Give all its values at once.")
         vary[name] = values
-    chosen: dict[str, Any] = {**asdict(options), "on_notice": teller(quiet=arguments.quiet)}
-    own = SweepOptions(
-        sampler=arguments.sampler,
-        seed=arguments.seed,
-        reduce=arguments.reduce,
-        folder=arguments.folder,
-        curves=not arguments.no_curves,
-        resume=arguments.resume,
-        processes=arguments.processes,
-        reset=arguments.reset,
-        max_instances=dict(map(_limit, arguments.max_instances)),
-    )
-    base = {name: chosen[name] for name in SweepOptions.__annotations__ if name in chosen}
-    return planned_sweep(mesh_of(arguments), vary, **cast("SweepOptions", {**base, **own}))
+    return planned_sweep(mesh_of(arguments), vary, **given)
 
 
 @contextmanager
@@ -290,24 +250,11 @@ def _show(sweep: Sweep) -> None:
     )
 
 
-def _limit(text: str) -> tuple[str, int]:
-    name, equals, number = text.rpartition("=")
-    if not (name and equals and whole(number) > 0):
-        raise ConfigurationError(f"--max-instances {text}: expected MODEL.fmu=N, such as gain.fmu=2")
-    return name, int(number)
-
-
 def _part(text: str) -> SweepPart:
     number, slash, of = text.partition("/")
     if not (slash and 1 <= whole(number) <= whole(of)):
         raise argparse.ArgumentTypeError(f"'{text}' is no part such as 1/8")
     return SweepPart(int(number), int(of))
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is no whole number of at least 0")
-    return int(text)
 
 
 PARSERS: Parsers = {"sweep": _add_sweep}

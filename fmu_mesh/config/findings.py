@@ -75,7 +75,7 @@ class Findings:
         if any(_same_place(path, settled) for settled in self._settled):
             return
         self._places.add(path)
-        if path.startswith("--"):
+        if path.startswith("`"):
             origin = ValueOrigin("", None, path)
         else:
             origin = located(path, self._file, self._lines, self._replaced, self._origins)
@@ -134,11 +134,11 @@ def located(
     """Where the value at ``path`` of a configuration was written, or the innermost part around it that is known.
 
     Example:
-        >>> lines, options = {"": 1, "instances": 3}, {"instances.gain.start_values.k": "--set gain.k=2"}
+        >>> lines, options = {"": 1, "instances": 3}, {"instances.gain.start_values.k": "`start_values=...`"}
         >>> print(located("instances.gain.fmu", "mesh.yaml", lines, options, {}))
         mesh.yaml:3
         >>> print(located("instances.gain.start_values.k", "mesh.yaml", lines, options, {}))
-        --set gain.k=2
+        `start_values=...`
 
     Args:
         path: of the value.

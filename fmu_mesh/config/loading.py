@@ -1,13 +1,13 @@
 """Reading a configuration file: the result is a valid structure, or an error with all findings.
 
-Owns the short form of connections and the start values of the command line. What the names in the file mean is
+Owns the short form of connections and the start values that options give. What the names in the file mean is
 `fmu_mesh.system.system`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from functools import lru_cache
 from pathlib import Path
@@ -25,17 +25,14 @@ from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
 from fmu_mesh.files import archive_on_the_way, beside, opened
-from fmu_mesh.text import listed, nearest, nearest_file, shown
+from fmu_mesh.text import listed, nearest, nearest_file, option_text, shown
 
 __all__ = [
     "MAXIMUM_BYTES",
     "LoadedConfig",
     "PlainConfig",
     "ValueOrigin",
-    "examine",
     "examine_data",
-    "load",
-    "parse",
     "read_file",
     "read_scenario",
     "read_text",
@@ -84,7 +81,7 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         config: the configuration, overrides included.
         file: the file as the user named it.
         lines: line numbers, counted from 1, by path in the file.
-        overrides: the option (`--set pendulum.l=2`) that replaced a value, by path in the file.
+        overrides: the option (`start_values={'pendulum.l': 2}`) that replaced a value, by path in the file.
         origins: where a value was written, by path in the file, if that is another file.
         warnings: findings of the file that do not prevent a run.
         foreign: as in `PlainConfig`.
@@ -124,48 +121,6 @@ class LoadedConfig(msgspec.Struct, frozen=True):
     def resolve(self, relative: str) -> Path:
         """The absolute path for a path in the file, which is relative to the folder of the file."""
         return beside(self.file, relative)
-
-
-def load(path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
-    """Read a configuration file.
-
-    Example:
-        >>> from fmu_mesh.instances.registry import KINDS
-        >>> load(Path("configs/pendulum_delay.yaml"), ["pendulum.l=2"], KINDS).config.mesh
-        'pendulum_delay'
-
-    Args:
-        path: the YAML file.
-        overrides: start values of the command line, each `instance.variable=value` with a YAML scalar.
-        kinds: the kinds of instances.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or its structure is wrong; has all findings.
-    """
-    loaded, findings = examine(path, overrides, kinds)
-    return _right(loaded, findings)
-
-
-def examine(path: Path, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
-    """As `load`, but return a partial configuration with the findings instead of raising an error.
-
-    Pass both to `system.build`, which checks the meaning of the rest and raises one error with all findings. A partial
-    configuration has placeholders (an empty `fmu`, a step size of NaN) and must not be run.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or too little of it is valid.
-    """
-    return examine_data(read_file(path), overrides, kinds)
-
-
-def parse(text: str, path: Path, overrides: Sequence[str], kinds: Kinds) -> LoadedConfig:
-    """As `load`, with the text of the file as an argument; relative paths and errors refer to ``path``.
-
-    Raises:
-        ConfigurationError: the structure is wrong; has all findings.
-    """
-    loaded, findings = examine_data(read_text(text, path), overrides, kinds)
-    return _right(loaded, findings)
 
 
 def read_file(path: Path) -> PlainConfig:
@@ -223,8 +178,17 @@ def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
     return ScenarioSource(converted(plain.data), "", plain.file, plain.lines, {})
 
 
-def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
-    """As `examine`, for values that were read before, or that a program has made."""
+def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
+    """Check values that were read from a file, or that a program has made.
+
+    Returns:
+        The configuration and the findings. Pass both to `system.build`, which checks the meaning of the rest and raises
+        one error with all findings. With a finding, a configuration may be partial: it has placeholders (an empty
+        `fmu`, a step size of NaN) and must not be run.
+
+    Raises:
+        ConfigurationError: too little of it is valid.
+    """
     data, path, lines = plain.data, plain.file, plain.lines
     replaced = dict(plain.overrides)
     findings = Findings(str(path), lines, replaced, plain.findings, plain.origins)
@@ -248,11 +212,6 @@ def examine_data(plain: PlainConfig, overrides: Sequence[str], kinds: Kinds) -> 
 def _type_info(type_: type[Config]) -> inspect.Type:
     """The fields of a type as msgspec sees them; to find them takes longer than to check a configuration."""
     return inspect.type_info(type_)
-
-
-def _right(loaded: LoadedConfig, findings: Findings) -> LoadedConfig:
-    findings.raise_any()
-    return loaded
 
 
 def _text(path: Path, findings: Findings) -> str:
@@ -353,30 +312,26 @@ def _arrow_meant(connection: Plain) -> str | None:
 
 
 def _with_overrides(
-    data: dict[str, Plain], overrides: Sequence[str], replaced: dict[str, str], findings: Findings
+    data: dict[str, Plain], overrides: Mapping[str, Plain], replaced: dict[str, str], findings: Findings
 ) -> dict[str, Plain]:
-    """``data`` with the start values of the command line; adds each option to ``replaced``."""
+    """``data`` with the start values that options give; adds each option to ``replaced``."""
     instances = data.get("instances")
     if not isinstance(instances, dict):
         return data
     instances = dict(instances)
-    for override in overrides:
-        option = f"--set {override}"
-        name, dot, rest = override.partition(".")
-        variable, equals, text = rest.partition("=")
-        if not (name and dot and variable and equals):
-            findings.add(option, "no start value", "instance.variable=value")
-            continue
-        if name not in instances:
+    for path, value in overrides.items():
+        option = option_text("start_values", {path: value})
+        name, _, variable = path.partition(".")
+        if not (name and variable):
+            findings.add(option, f"the name '{path}'", "instance.variable")
+        elif name not in instances:
             expected = f"one of {listed(list(instances))}"
             findings.add(option, f"the unknown instance '{name}'", expected, nearest(name, instances))
-            continue
-        value = read(text, ignored := Findings(option), {})
-        if len(ignored) or not isinstance(value, bool | int | float | str | list):
-            findings.add(option, f"the value {shown(text)}", "a number, text, true or false, or a list")
-            continue
-        _set_start_value(instances, name, variable, value)
-        replaced[f"instances.{name}.start_values.{variable}"] = option
+        elif not isinstance(value, bool | int | float | str | list):
+            findings.add(option, f"the value {shown(value)}", "a number, text, true or false, or a list")
+        else:
+            _set_start_value(instances, name, variable, value)
+            replaced[f"instances.{name}.start_values.{variable}"] = option
     return {**data, "instances": instances}
 
 

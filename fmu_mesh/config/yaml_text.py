@@ -31,7 +31,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.yaml_errors import in_words
 from fmu_mesh.text import shown
 
-__all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read", "written"]
+__all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read", "read_value", "written"]
 
 Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
@@ -82,6 +82,22 @@ def written(value: Plain) -> str:
     yaml.default_flow_style = None
     yaml.dump(value, text)
     return text.getvalue()
+
+
+def read_value(text: str) -> tuple[str, Plain]:
+    """A name and a value from a text such as the command line takes: `NAME=VALUE`, the value in YAML.
+
+    Raises:
+        ValueError: it is none; says why.
+    """
+    name, equals, written = text.partition("=")
+    if not (name and equals and written):
+        msg = f"'{text}' is no value of a name"
+        raise ValueError(msg)
+    value = read(written, wrong := Findings(text), {})
+    if len(wrong):
+        raise ValueError(f"'{text}': {next(iter(wrong)).found}; expected a value in YAML")
+    return name, value
 
 
 def resolve(text: str) -> Plain:

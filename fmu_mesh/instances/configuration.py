@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from ..config import loading
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig, PlainConfig
 from ..config.mesh import Config, config_type
+from ..config.yaml_text import Plain
 from .registry import KINDS
 
-__all__ = ["examine", "examine_data", "installed_config", "load", "parse"]
+__all__ = ["examine_data", "installed_config", "parse"]
 
 
-def load(path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
-    """Read a configuration file; see `fmu_mesh.config.loading.load`."""
-    return loading.load(path, overrides, KINDS)
-
-
-def examine(path: Path, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
-    """As `load`, but go on where the structure is wrong; see `fmu_mesh.config.loading.examine`."""
-    return loading.examine(path, overrides, KINDS)
-
-
-def examine_data(plain: PlainConfig, overrides: Sequence[str] = ()) -> tuple[LoadedConfig, Findings]:
-    """As `examine`, for values that were read before; see `fmu_mesh.config.loading.examine_data`."""
+def examine_data(
+    plain: PlainConfig, overrides: Mapping[str, Plain] = MappingProxyType({})
+) -> tuple[LoadedConfig, Findings]:
+    """A configuration and its findings, start values replaced; see `fmu_mesh.config.loading.examine_data`."""
     return loading.examine_data(plain, overrides, KINDS)
 
 
-def parse(text: str, path: Path, overrides: Sequence[str] = ()) -> LoadedConfig:
-    """As `load`, with the text of the file; see `fmu_mesh.config.loading.parse`."""
-    return loading.parse(text, path, overrides, KINDS)
+def parse(text: str, path: Path, overrides: Mapping[str, Plain] = MappingProxyType({})) -> LoadedConfig:
+    """A configuration from the text of a file; relative paths and errors refer to ``path``.
+
+    Raises:
+        ConfigurationError: the structure is wrong; has all findings.
+    """
+    loaded, findings = examine_data(loading.read_text(text, path), overrides)
+    findings.raise_any()
+    return loaded
 
 
 def installed_config() -> type[Config]:

@@ -30,20 +30,20 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         loaded: the configuration, with absolute paths of interpreters.
         findings: those of the configuration.
         tell: called with what runs only because it is allowed.
-        allowed: why it is allowed, in words, such as "because of `--allow-code`"; empty if it is not.
+        allowed: why it is allowed, in words, such as "because of `allow_code=True`"; empty if it is not.
     """
     source = loaded.foreign or _other_owner(loaded.file)
     for name, section in loaded.config.instances.items():
         if not _names_code(section):
             continue
         key, path = key_of(section), loaded.resolve(section.path) if section.path else None
-        found, expected = f"Python code, in {source}", "a file of your own, or `--allow-code`"
+        found, expected = f"Python code, in {source}", "a file of your own, or `allow_code=True`"
         if not source:
             if path is None or (open_path := _writable_by_others(path)) is None:
                 continue
             mode = stat.S_IMODE(open_path.stat().st_mode)
             found = f"other users can write '{open_path}', which has mode {mode:04o}"
-            expected = f"one that only you can write (`chmod go-w {open_path}`), or `--allow-code`"
+            expected = f"one that only you can write (`chmod go-w {open_path}`), or `allow_code=True`"
         if not allowed:
             findings.add(f"instances.{name}.{key}", found, expected)
             continue
@@ -65,7 +65,7 @@ def check_owner(path: Path, what: str) -> None:
     """
     if _other_owner(path):
         raise ConfigurationError(
-            f"{what} belongs to another user", hint="`--allow-code` runs it, with the Python code that it may name."
+            f"{what} belongs to another user", hint="`allow_code=True` runs it, with the Python code that it may name."
         )
 
 

@@ -79,7 +79,7 @@ def _ros_plan(run: RunPlan) -> RosPlan:
 def _master_at(run: RunPlan, process: RunProcess) -> tuple[str, ...]:
     """Where the master can be reached: `--connect`, or the router that all processes use, or its socket."""
     section = run.zenoh(run.loaded.config.zenoh.listen)
-    connect = run.options.connect or (tuple(section.connect) if section.mode == "client" else ())
+    connect = run.connect or (tuple(section.connect) if section.mode == "client" else ())
     if process.is_child or not connect:
         return (socket_endpoint(process.folder, MASTER),)
     return connect

@@ -95,7 +95,7 @@ class InProcessRun:
                 self._progress,
                 on_hang=self._end,
                 parent=fmus,
-                showing=self._run.options.showing,
+                showing=self._run.showing,
                 loaded=self._run.loaded,
                 contents=self._run.contents,
             )

@@ -1,111 +1,315 @@
-"""The options of a run: what may be chosen beside the configuration file.
+"""The options of a run: what may be chosen beside the configuration, each in one field of one Struct.
 
-Owns one list of them. The flags of the command line, their help and the configuration keys that they replace follow
-from the annotations of `Options`. Knows nothing of argparse.
+The flags of the command line, the signatures of the library, their docstrings and the documentation follow from these
+fields. A value is checked where it is given (`takes`); what a key of the configuration may have is checked with the
+file. Knows nothing of argparse.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from functools import cache
+import inspect
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, wraps
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+from types import NoneType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Concatenate,
+    Generic,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    TypeVar,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 import msgspec
-from msgspec import inspect
-from msgspec.structs import replace
+from msgspec.structs import force_setattr
 
-from ..config.base import Base, Endpoint
-from ..config.findings import Findings
-from ..config.loading import LoadedConfig, PlainConfig
-from ..config.mesh import Config, RecordConfig, SimulationConfig, ZenohConfig
-from ..config.structure import check
-from ..config.yaml_text import Plain, read
-from ..instances.contract import Showing
-from ..recorder.arrays_file import ENDING
-from ..text import listed, nearest
+from ..config.plain_values import NOTHING, in_words, kinds_of, taken
+from ..errors import CallRefused
+from ..text import listed, nearest, option_text
 
-__all__ = ["Flag", "OptionField", "Options", "option_fields", "with_config_values", "with_needed", "with_options"]
+if TYPE_CHECKING:
+    from ..config.yaml_text import Plain
+    from ..instances.contract import Showing
+    from ..wire.views import MeshStatus
+    from .events import Event
 
-_SECTIONS: dict[str, type[Base]] = {"simulation": SimulationConfig, "record": RecordConfig, "zenoh": ZenohConfig}
-_NEEDED = ("step_size", "stop_time", "algorithm")
-"""The options that may give what a file leaves out."""
+__all__ = [
+    "CallOptions",
+    "OpenOptions",
+    "Option",
+    "OptionField",
+    "PlanOptions",
+    "RerunOptions",
+    "RunOptions",
+    "StartOptions",
+    "VariantOptions",
+    "option_fields",
+    "takes",
+]
+
+O = TypeVar("O")  # noqa: E741  options
+P = ParamSpec("P")
+R = TypeVar("R")
+S = TypeVar("S")
+T = TypeVar("T")
 
 
-class Flag(NamedTuple):
-    """How an option is written on the command line.
+class Option(NamedTuple):
+    """What an option is besides its name, its type and its default.
 
     Attributes:
-        name: with its dashes.
-        metavar: what stands for its value in the help; None for an option without a value.
+        text: one line about it; None: the description of its key.
+        flag: how the command line spells it, with its dashes; None if only a program has it.
+        metavar: what stands for its value in the help.
         key: key of the configuration that it replaces.
-        text: its help, where that of the key does not fit or there is no key.
         bare: its value where the flag is given without one; None if it needs a value.
+        least: its smallest value, where no key says it.
     """
 
-    name: str
+    text: str | None = None
+    flag: str | None = None
     metavar: str | None = None
     key: str | None = None
-    text: str | None = None
-    bare: Path | None = None
+    bare: object = None
+    least: int | None = None
 
 
-class Options(msgspec.Struct, frozen=True):
-    """What is chosen beside the configuration; None and an empty tuple leave what the configuration says.
+AllowCode = Annotated[
+    bool, Option("run Python code that a file of others names, or that others can write", "--allow-code")
+]
+OnNotice = Annotated[
+    Callable[[str], None] | None,
+    Option("called with a sentence before something that takes long, such as compiling an FMU; None: the log gets it"),
+]
+Output = Annotated[
+    str | Path | None, Option("result file; its ending chooses the format", "--output", "FILE", "record.file")
+]
+StartValues = Annotated[
+    Mapping[str, Any] | Iterable[Any] | None,
+    Option("start values by `instance.variable`", "--set", "INSTANCE.VARIABLE=VALUE"),
+]
+Processes = Annotated[bool, Option("False: run everything in this one process", "--local")]
+MemoryLimit = Annotated[
+    int, Option("the most bytes of results in memory; a run that needs more is refused, or ends there", least=0)
+]
+Restarts = Annotated[
+    int,
+    Option(
+        "restart from the first point when a node or the master is lost, at most so often", "--restarts", "N", least=0
+    ),
+]
+OnProgress = Annotated[
+    Callable[["MeshStatus"], object] | None, Option("called with a `MeshStatus` about ten times per second")
+]
+OnEvent = Annotated[
+    Callable[["Event"], object] | None,
+    Option("called with every event of `fmu_mesh.run.events`; without it, the log gets messages of FMUs"),
+]
+MEMORY_LIMIT = 2**30
 
-    Each field is an option, and its annotation says how the command line spells it.
 
-    Example:
-        >>> Options(window=1, start_values=("gain.k=2.5",)).window
-        1
+class CallOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Base of all options: what is made has values of the types of its fields, whatever was given for them.
+
+    Raises:
+        CallRefused: a value is of another type; names the option.
     """
 
-    algorithm: Annotated[str | None, Flag("--algorithm", "NAME", "simulation.algorithm")] = None
-    step_size: Annotated[float | None, Flag("--step-size", "S", "simulation.step_size")] = None
-    stop_time: Annotated[float | None, Flag("--stop-time", "S", "simulation.stop_time")] = None
-    window: Annotated[int | Literal["auto"] | None, Flag("--window", "N", "simulation.window")] = None
-    real_time_factor: Annotated[float | None, Flag("--real-time-factor", "F", "simulation.real_time_factor")] = None
-    update_period: Annotated[float | None, Flag("--update-period", "S", "simulation.update_period")] = None
-    catch_up: Annotated[float | None, Flag("--catch-up", "S", "simulation.catch_up")] = None
-    start_values: Annotated[
-        tuple[str, ...], Flag("--set", "INSTANCE.VARIABLE=VALUE", text="start value of a variable")
-    ] = ()
+    def __post_init__(self) -> None:
+        for name, field in option_fields(type(self)).items():
+            if (value := getattr(self, name)) is not field.default:
+                force_setattr(self, name, field.taken(value))
+
+    def given(self) -> dict[str, Any]:
+        """The options that have another value than their default."""
+        fields = option_fields(type(self))
+        return {name: value for name in fields if (value := getattr(self, name)) != fields[name].default}
+
+
+class VariantOptions(CallOptions, frozen=True, kw_only=True):
+    """What any run takes, also each run of a sweep; None leaves what the configuration says."""
+
+    algorithm: Annotated[str | None, Option(None, "--algorithm", "NAME", "simulation.algorithm")] = None
+    step_size: Annotated[float | None, Option(None, "--step-size", "S", "simulation.step_size")] = None
+    stop_time: Annotated[float | None, Option(None, "--stop-time", "S", "simulation.stop_time")] = None
+    window: Annotated[int | Literal["auto"] | None, Option(None, "--window", "N", "simulation.window")] = None
+    start_values: StartValues = None
     config_values: Annotated[
-        tuple[str, ...],
-        Flag("--set-config", "KEY=VALUE", text="any key by its path, as in simulation.window=16; the value is YAML"),
-    ] = ()
-    output: Annotated[
-        Path | None, Flag("--output", "FILE", "record.file", "result file; its ending chooses the format")
+        Mapping[str, Any] | Iterable[Any] | None,
+        Option("values of any keys by their path, such as simulation.window", "--set-config", "KEY=VALUE"),
     ] = None
-    scenario: Annotated[
-        Path | None, Flag("--scenario", "FILE", text="values of inputs and parameters over time, from this file")
-    ] = None
-    listen: Annotated[tuple[Endpoint, ...], Flag("--listen", "ENDPOINT", "zenoh.listen")] = ()
-    connect: Annotated[tuple[Endpoint, ...], Flag("--connect", "ENDPOINT", "zenoh.connect")] = ()
-    paused: Annotated[
-        bool, Flag("--paused", text="stay paused at the first point until `resume`, `step` or `play`")
-    ] = False
-    allow_code: Annotated[
-        bool, Flag("--allow-code", text="run Python code that a file of others names, or that others can write")
-    ] = False
-    view: Annotated[bool, Flag("--view", text="show the world of the physics engine in a window")] = False
-    video: Annotated[
-        Path | None, Flag("--video", "FILE.mp4", text="film that world into a file, .mp4 or .gif; needs no screen")
-    ] = None
-    profile: Annotated[
-        Path | None,
-        Flag(
-            "--profile",
-            "FILE.json",
-            text="show where the time went; with a file, also write a trace for Perfetto",
-            bare=Path(),
-        ),
-    ] = None
+    allow_code: AllowCode = False
+    on_notice: OnNotice = None
 
     @property
-    def showing(self) -> Showing:
+    def starts(self) -> "dict[str, Plain]":
+        """The start values by `instance.variable`, as a file has them."""
+        return dict(cast("Mapping[str, Plain]", self.start_values or {}))
+
+    @property
+    def keys(self) -> "dict[str, Plain]":
+        """The values of keys by their path, as a file has them."""
+        return dict(cast("Mapping[str, Plain]", self.config_values or {}))
+
+
+class OpenOptions(VariantOptions, frozen=True):
+    """What `Mesh.open` takes."""
+
+    start_values: StartValues = None
+
+
+class PlanOptions(VariantOptions, frozen=True, kw_only=True):
+    """What `Mesh.plan` and `Mesh.check` take; each option of the configuration replaces its key for this run.
+
+    Example:
+        >>> PlanOptions(window=1, start_values=[("gain.k", 2.5)]).given()
+        {'window': 1, 'start_values': {'gain.k': 2.5}}
+    """
+
+    real_time_factor: Annotated[
+        float | None, Option(None, "--real-time-factor", "F", "simulation.real_time_factor")
+    ] = None
+    update_period: Annotated[float | None, Option(None, "--update-period", "S", "simulation.update_period")] = None
+    catch_up: Annotated[float | None, Option(None, "--catch-up", "S", "simulation.catch_up")] = None
+    record: Annotated[
+        Literal["memory"] | Sequence[str] | None,
+        Option(
+            'variables to record, in the place of those of the configuration, or "memory": those of the configuration; '
+            "the result has them as arrays, and there is no file unless `output` names one"
+        ),
+    ] = None
+    output: Output = None
+    scenario: Annotated[
+        str | Path | Mapping[str, Any] | None,
+        Option(
+            "values of inputs and parameters over time: a file, or a mapping as in such a file", "--scenario", "FILE"
+        ),
+    ] = None
+    listen: Annotated[Sequence[str] | None, Option(None, "--listen", "ENDPOINT", "zenoh.listen")] = None
+    connect: Annotated[Sequence[str] | None, Option(None, "--connect", "ENDPOINT", "zenoh.connect")] = None
+    paused: Annotated[bool, Option("stay paused at the first point until `resume`, `step` or `play`", "--paused")] = (
+        False
+    )
+    view: Annotated[bool, Option("show the world of the physics engine in a window", "--view")] = False
+    video: Annotated[
+        str | Path | None,
+        Option("film that world into a file, .mp4 or .gif; needs no screen", "--video", "FILE.mp4"),
+    ] = None
+    profile: Annotated[
+        bool | str | Path,
+        Option(
+            "show where the time went; with a file, also write a trace for Perfetto",
+            "--profile",
+            "FILE.json",
+            bare=True,
+        ),
+    ] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.record == "memory" and self.output is not None:
+            raise CallRefused('`output` and `record="memory"` exclude each other', hint="Leave one of them out.")
+
+    @property
+    def showing(self) -> "Showing":
         """Whether and how a physics engine shows its world."""
-        return Showing(view=self.view, video=self.video.absolute() if self.video is not None else None)
+        from ..instances.contract import Showing  # noqa: PLC0415  slow to import, and only for a plan
+
+        return Showing(view=self.view, video=Path(self.video).absolute() if self.video is not None else None)
+
+
+class StartOptions(CallOptions, frozen=True, kw_only=True):
+    """What `Run.start` takes."""
+
+    processes: Processes = True
+    memory_limit: MemoryLimit = MEMORY_LIMIT
+    restarts: Restarts = 0
+    on_progress: OnProgress = None
+    on_event: OnEvent = None
+
+
+class RunOptions(PlanOptions, frozen=True, kw_only=True):
+    """What `Mesh.run` and `Mesh.start` take: what `Mesh.plan` takes, and what `Run.start` takes."""
+
+    processes: Processes = True
+    memory_limit: MemoryLimit = MEMORY_LIMIT
+    restarts: Restarts = 0
+    on_progress: OnProgress = None
+    on_event: OnEvent = None
+
+
+class RerunOptions(StartOptions, frozen=True, kw_only=True):
+    """What `fmu_mesh.rerun` takes."""
+
+    output: Output = None
+    allow_code: AllowCode = False
+    on_notice: OnNotice = None
+
+
+class takes(Generic[P, O]):  # noqa: N801  a decorator
+    """Lets a method or a function whose last parameter are options take each of them by name.
+
+    Example:
+        >>> @takes(StartOptions)
+        ... def start(plan: str, options: StartOptions) -> int:
+        ...     return options.restarts
+        >>> start("plan", restarts=3)
+        3
+        >>> start("plan", restart=3)
+        Traceback (most recent call last):
+        fmu_mesh.errors.CallRefused: `start` has no option `restart`. Did you mean `restarts`?
+
+    Args:
+        options: the Struct of the options, all of which become parameters; in the docstring, they are listed in the
+            place of the line `options: ...`.
+    """
+
+    def __init__(self, options: Callable[P, O]) -> None:
+        self._options = options
+
+    @overload
+    def __call__(self, call: Callable[[S, O], R]) -> Callable[Concatenate[S, P], R]: ...
+    @overload
+    def __call__(self, call: Callable[[S, T, O], R]) -> Callable[Concatenate[S, T, P], R]: ...
+    def __call__(self, call: Callable[..., R]) -> Callable[..., R]:
+        """The call with the options as parameters."""
+        options, name = self._options, call.__qualname__
+        assert isinstance(options, type)
+        assert issubclass(options, CallOptions)
+        fields = option_fields(options)
+        *own, _ = signature(call).parameters.values()
+
+        @wraps(call)
+        def checked(*values: Any, **named: Any) -> R:  # noqa: ANN401  checked below
+            first = list(values[: len(own)])
+            first += [named.pop(one.name) for one in own[len(first) :] if one.name in named]
+            if len(first) < len(own):
+                raise CallRefused(f"`{name}` needs `{own[len(first)].name}`")
+            for other in named.keys() - fields.keys():
+                near = nearest(other, fields)
+                hint = f"Did you mean `{near}`?" if near else f"There are {listed([*fields])}."
+                raise CallRefused(f"`{name}` has no option `{other}`", hint=hint)
+            try:
+                chosen = options(*values[len(own) :], **named)
+            except TypeError as error:
+                raise CallRefused(f"`{name}` takes its options by name: {error}") from error
+            return call(*first, chosen)
+
+        parameters = [*own, *(field.parameter for field in fields.values())]
+        shown = signature(call).replace(parameters=parameters)
+        checked.__signature__ = shown  # type: ignore[attr-defined]  # which the type of a function does not have
+        lines = [f"\\1{field.name}: {field.text}\n" for field in fields.values()]
+        checked.__doc__ = re.sub(r"(?m)^( +)options: .*\n", "".join(lines), call.__doc__ or "")
+        return checked
 
 
 class OptionField(NamedTuple):
@@ -113,196 +317,74 @@ class OptionField(NamedTuple):
 
     Attributes:
         name: that of its field.
-        type: what a value is; for an option that may be repeated, what each value is.
-        repeatable: whether it may be given more than once.
-        flag: how the command line spells it.
-        help: one line about it.
+        kinds: the types that it takes.
+        default: its value where it is not given.
+        parameter: it as a parameter of a call.
+        option: what else there is to say about it.
     """
 
     name: str
-    type: Any
-    repeatable: bool
-    flag: Flag
-    help: str
+    kinds: tuple[Any, ...]
+    default: Any
+    parameter: Parameter
+    option: Option
+
+    @property
+    def text(self) -> str:
+        """One line about it."""
+        return self.option.text or _description(self.option.key or "")
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether its flag may be given more than once."""
+        return not {Mapping, Sequence}.isdisjoint(map(get_origin, self.kinds)) and Path not in self.kinds
+
+    def taken(self, value: object) -> Any:  # noqa: ANN401  of one of its types
+        """A value that was given for it.
+
+        Raises:
+            CallRefused: it is of another type.
+        """
+        own, least = taken(value, self.kinds), self.option.least
+        if own is NOTHING or (least is not None and own is not None and own < least):
+            words = [word for kind in self.kinds for word in get_args(kind) if get_origin(kind) is Literal]
+            near = nearest(value, words) if isinstance(value, str) else None
+            expected = " or ".join(dict.fromkeys(map(in_words, self.kinds)))
+            expected += f" from {least} on" if least is not None else ""
+            hint = f"Did you mean {option_text(self.name, near)}?" if near else None
+            raise CallRefused(f"{option_text(self.name, value)}: expected {expected}", hint=hint)
+        return own
 
 
 @cache
-def option_fields() -> dict[str, OptionField]:
-    """All options by the names of their fields."""
-    found = {}
-    for name, hint in get_type_hints(Options, include_extras=True).items():
-        kind, flag = hint.__origin__, hint.__metadata__[0]
-        repeatable = getattr(kind, "__origin__", None) is tuple
-        value = kind.__args__[0] if repeatable else next((a for a in _alternatives(kind) if a is not type(None)), kind)
-        text = flag.text or _description(flag.key)
-        found[name] = OptionField(name, value, repeatable, flag, f"{text}; repeatable" if repeatable else text)
-    return found
+def option_fields(options: type[CallOptions]) -> dict[str, OptionField]:
+    """The options of a Struct, by name."""
+    annotations = {
+        name: one
+        for base in reversed(options.__mro__)
+        for name, one in inspect.get_annotations(base, eval_str=True).items()
+    }
+    fields = {}
+    for name, default in zip(options.__struct_fields__, options.__struct_defaults__, strict=True):
+        kind, option = annotations[name].__origin__, annotations[name].__metadata__[0]
+        kinds = kinds_of(kind)
+        text = " | ".join("None" if one is NoneType else inspect.formatannotation(one) for one in kinds)
+        text = re.sub(r"\b(?:[a-z_]+\.)+(?=[A-Z])|'(?=MeshStatus|Event|\], object)", "", text)
+        by = Parameter.POSITIONAL_OR_KEYWORD if name in options.__match_args__ else Parameter.KEYWORD_ONLY
+        fields[name] = OptionField(name, kinds, default, Parameter(name, by, default=default, annotation=text), option)
+    return fields
 
 
-def with_config_values(plain: PlainConfig, config_values: Sequence[str]) -> PlainConfig:
-    """The values of a configuration with keys replaced by `--set-config`; they are checked with the others.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from fmu_mesh.config.loading import read_text
-        >>> plain = read_text("simulation: {step_size: 0.1}", Path("mesh.yaml"))
-        >>> with_config_values(plain, ["simulation.window=16", "zenoh={mode: client}"]).data
-        {'simulation': {'step_size': 0.1, 'window': 16}, 'zenoh': {'mode': 'client'}}
-
-    Args:
-        plain: the values of the file.
-        config_values: `KEY=VALUE` each: the path of a key in the file, and its value as YAML.
-    """
-    findings = Findings(str(plain.file))
-    data, overrides = plain.data, dict(plain.overrides)
-    for text in config_values:
-        option, (path, equals, written) = f"--set-config {text}", text.partition("=")
-        keys = path.split(".")
-        value = read(written, wrong := Findings(option), {})
-        if not (equals and written and all(keys)):
-            findings.add(option, "no value of a key", "KEY=VALUE, such as simulation.window=16")
-        elif "[" in path:
-            findings.add(option, "a key inside a list", f"the whole list, as in {path.partition('[')[0]}=[...]")
-        elif keys[2:3] == ["start_values"]:
-            findings.add(option, "a start value", f"--set {'.'.join((keys[1], *keys[3:]))}={written}")
-        elif len(wrong):
-            findings.add(option, next(iter(wrong)).found, "a value in YAML")
-        elif (problem := _obstacle(data, keys)) is not None:
-            findings.add(option, *problem)
-        else:
-            data = _replaced(data, keys, value)
-            overrides[path] = option
-    return plain._replace(data=data, findings=(*plain.findings, *findings), overrides=overrides)
-
-
-def with_needed(plain: PlainConfig, options: Options) -> PlainConfig:
-    """The values of a configuration with the times and the algorithm that only the options give.
-
-    A key that the file cannot have, and that no option gives either, becomes a finding.
-
-    Example:
-        >>> from pathlib import Path
-        >>> plain = PlainConfig({"mesh": "m"}, Path("m.ssp"), needed={"simulation.step_size": "`--step-size S`"})
-        >>> with_needed(plain, Options(step_size=0.1)).data
-        {'mesh': 'm', 'simulation': {'step_size': 0.1}}
-        >>> print(*with_needed(plain, Options()).findings)
-        m.ssp: simulation.step_size: the package gives none; expected `--step-size S`
-    """
-    data, overrides = plain.data, dict(plain.overrides)
-    for name in _NEEDED:
-        setting, value = option_fields()[name], getattr(options, name)
-        key = setting.flag.key
-        if key is not None and value is not None and _is_absent(data, key):
-            data = _replaced(data, key.split("."), value)
-            overrides[key] = _as_option(setting, value)
-    findings = Findings(str(plain.file), plain.lines, overrides, plain.findings, plain.origins)
-    findings.explain(plain.explained)
-    for key, option in plain.needed.items():
-        if _is_absent(data, key):
-            findings.add(key, "the package gives none", option)
-    return plain._replace(data=data, findings=tuple(findings), overrides=overrides)
-
-
-def _is_absent(data: Plain, key: str) -> bool:
-    """Whether a key of a section is not there; false if the section is no mapping, which is another error."""
-    section, _, name = key.partition(".")
-    inner = data.get(section, {}) if isinstance(data, dict) else None
-    return isinstance(inner, dict) and name not in inner
-
-
-def _obstacle(data: Plain, keys: Sequence[str]) -> tuple[str, str, str | None] | None:
-    """Why a key cannot be replaced: what was found, what was expected, and the nearest name."""
-    for depth, key in enumerate(keys):
-        if not isinstance(data, dict | None):
-            where = ".".join(keys[:depth])
-            what = "a list" if isinstance(data, list) else "a single value"
-            return f"a key inside '{where}', which is {what}", f"{where}=VALUE", None
-        if keys[0] == "instances" and depth == 1 and key not in (names := list(data or {})):
-            return f"the unknown instance '{key}'", f"one of {listed(names)}", nearest(key, names)
-        data = (data or {}).get(key)
-    return None
-
-
-def _replaced(data: Plain, keys: Sequence[str], value: Plain) -> Plain:
-    """Nested mappings with another value of one key; mappings on the way are made where there are none."""
-    if not keys:
-        return value
-    section = data if isinstance(data, dict) else {}
-    return {**section, keys[0]: _replaced(section.get(keys[0]), keys[1:], value)}
-
-
-def with_options(loaded: LoadedConfig, options: Options, findings: Findings | None = None) -> LoadedConfig:
-    """The configuration with its keys replaced by the options that are given.
-
-    Args:
-        loaded: the configuration, whose start values were replaced when it was read.
-        options: what replaces its keys.
-        findings: collects what is wrong with the values of options; None where they were checked before.
-    """
-    config, overrides = loaded.config, dict(loaded.overrides)
-    if options.scenario is not None:
-        overrides["scenario"] = f"--scenario {options.scenario}"
-        config = replace(config, scenario=str(options.scenario.absolute()))
-    for setting in option_fields().values():
-        value, flag = getattr(options, setting.name), setting.flag
-        if flag.key is None or value in (None, ()):
-            continue
-        section, _, key = flag.key.partition(".")
-        place = f"{next(iter(config.records), section)}.{key}" if section == "record" else flag.key
-        option = _as_option(setting, value)
-        if overrides.get(place, option) != option and findings is not None:
-            findings.add(place, f"replaced by {flag.name} as well", "one of the two options")
-        overrides[place] = option
-        plain = list(value) if setting.repeatable else str(value.absolute()) if isinstance(value, Path) else value
-        if section == "record":
-            config = replace(config, record=_with_output(config, str(plain)))
-        else:
-            config = replace(config, **{section: replace(getattr(config, section), **{key: plain})})
-        if findings is not None:
-            wrong = Findings(str(loaded.file), loaded.lines, overrides)
-            if place not in findings.places:  # the value of a key that the file does not have is checked with the file
-                check(plain, _type_of(section, key), place, wrong)
-            findings.merge(wrong)
-    return replace(loaded, config=config, overrides=overrides)
-
-
-def _with_output(config: Config, file: str) -> RecordConfig | list[RecordConfig]:
-    """The section `record` with another first file; of what stays in memory there is one."""
-    first, *others = (*config.records.values(),) or (RecordConfig(),)
-    first = replace(first, file=file)
-    if isinstance(config.record, RecordConfig):
-        return first
-    return [first] if file.endswith(ENDING) else [first, *others]
-
-
-def _alternatives(kind: Any) -> tuple[Any, ...]:  # noqa: ANN401 a type, which has no common class
-    return getattr(kind, "__args__", (kind,))
-
-
-def _type_of(section: str, key: str) -> inspect.Type:
-    kind = inspect.type_info(_SECTIONS[section])
-    assert isinstance(kind, inspect.StructType)
-    return next(field.type for field in kind.fields if field.encode_name == key)
-
-
+@cache
 def _description(key: str) -> str:
     """What the configuration says about a key, as help: no full stop, and nothing about null, which no option takes."""
     section, _, name = key.partition(".")
-    hint = get_type_hints(_SECTIONS[section], include_extras=True)[name]
-    text: str = next(meta.description for meta in hint.__metadata__)
+    text: str = next(meta.description for meta in _hints(section)[name].__metadata__)
     return f"{text[0].lower()}{text[1:]}".partition("; null:")[0].removesuffix(".")
 
 
-def _as_option(setting: OptionField, value: object) -> str:
-    """An option as it is written on the command line."""
-    return f"{setting.flag.name} {_written(value)}"
+@cache
+def _hints(section: str) -> dict[str, Any]:
+    from ..config.mesh import Config  # noqa: PLC0415  slow to import, and only for the help
 
-
-def _written(value: object) -> str:
-    match value:
-        case float():
-            return f"{value:g}"
-        case tuple():
-            return ", ".join(value)
-        case _:
-            return str(value)
+    return get_type_hints(next(one for one in kinds_of(get_type_hints(Config)[section])), include_extras=True)

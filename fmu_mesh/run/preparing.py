@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
-from ..config.loading import LoadedConfig, read_scenario
+from ..config.loading import LoadedConfig, PlainConfig, read_scenario
 from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
@@ -32,7 +32,8 @@ from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
 from .allowed_code import check_code
-from .options import Options, with_config_values, with_needed, with_options
+from .options import PlanOptions
+from .overriding import with_options
 from .results import check_results
 from .run_plan import RunPlan
 
@@ -106,7 +107,7 @@ class KnownModels:
 
 def prepare(
     path: Path,
-    options: Options = Options(),  # noqa: B008 a frozen Struct
+    options: PlanOptions = PlanOptions(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
 ) -> Plan:
     """As `plan_run`, for callers that need only the plan of the mesh."""
@@ -115,45 +116,42 @@ def prepare(
 
 def plan_run(
     path: Path,
-    options: Options = Options(),  # noqa: B008 a frozen Struct
+    options: PlanOptions = PlanOptions(),  # noqa: B008 a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
 ) -> RunPlan:
     """Read, check and plan the configuration at ``path``.
 
     Args:
         path: the YAML file, or a package of SSP.
-        options: what the command line changes.
+        options: what replaces values of the file.
         tell: called before something that takes long, such as compiling an FMU.
 
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    plain = with_needed(with_config_values(read_configuration(path), options.config_values), options)
-    loaded, findings = examine_data(plain, options.start_values)
-    return planned(loaded, findings, options, tell)
+    return planned(read_configuration(path), options, tell)
 
 
 def planned(
-    loaded: LoadedConfig,
-    findings: Findings,
-    options: Options,
+    values: PlainConfig,
+    options: PlanOptions,
     tell: Callable[[str], None] = lambda _text: None,
     known: KnownModels | None = None,
 ) -> RunPlan:
-    """Check and plan a configuration whose structure was examined.
+    """Check and plan a configuration.
 
     Args:
-        loaded: the configuration.
-        findings: those of its structure.
-        options: what the command line changes.
+        values: the values of the configuration.
+        options: what replaces some of them.
         tell: called before something that takes long, such as compiling an FMU.
         known: model descriptions that were read before; those that are read now are added. None: all are read.
 
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded = _located(with_options(loaded, options, findings))
-    check_code(loaded, findings, tell, "because of `--allow-code`" if options.allow_code else "")
+    loaded, findings = examine_data(with_options(values, options), options.starts)
+    loaded = _located(loaded)
+    check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
     if not len(findings):  # otherwise the world may be what is wrong
         check_showing(loaded.config.instances, options.showing)
     known = known or KnownModels()
@@ -175,7 +173,15 @@ def planned(
     warnings = loaded.findings()
     warn_of_point_loops(plan, warnings)
     plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))
-    return RunPlan(loaded, options, plan, contents)
+    return RunPlan(
+        loaded,
+        plan,
+        contents,
+        showing=options.showing,
+        paused=options.paused,
+        profile=options.profile is not False,
+        connect=tuple(options.connect or ()),
+    )
 
 
 def _scenario(

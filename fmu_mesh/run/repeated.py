@@ -297,7 +297,7 @@ class _Run:
         run, around = self._run, self._around
         if around.open_instance is not None:
             return around.open_instance(name)
-        opening = opening_of(self._plan, name, around.scratch, around.log, run.options.showing)
+        opening = opening_of(self._plan, name, around.scratch, around.log, run.showing)
         return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
     def _initialize(self, memory: HostMemory) -> Engine:

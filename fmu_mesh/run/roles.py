@@ -221,8 +221,8 @@ def _settings(run: RunPlan, process: RunProcess, own: tuple[str, ...]) -> Master
         endpoints=tuple(sorted(endpoints, key=is_socket, reverse=True)),
         config_file=str(run.loaded.file),
         launch=process.launch,
-        profile=run.options.profile is not None,
-        paused=run.options.paused,
+        profile=run.profile,
+        paused=run.paused,
     )
 
 

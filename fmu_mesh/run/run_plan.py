@@ -22,7 +22,6 @@ from ..system.plan import RECORDER, NodePlan, Plan
 from ..text import listed, nearest
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
-from .options import Options
 
 __all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "read_node", "read_run"]
 
@@ -73,24 +72,30 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that follows from a configuration and the options of one run.
 
     ```python
-    run = plan_run(Path("configs/pendulum_delay.yaml"), Options(window=64))
+    run = plan_run(Path("configs/pendulum_delay.yaml"), PlanOptions(window=64))
     file = run.write(folder)
     read_node(file, "pendulum").plan.window  # in another process
     ```
 
     Attributes:
         loaded: the configuration, options applied.
-        options: what the command line changed.
         plan: the plan of the mesh.
         contents: the SHA-256 of the model of each instance, by instance name.
+        showing: whether and how a physics engine shows its world.
+        paused: whether it stays paused at its first point.
+        profile: whether it measures where the time goes.
+        connect: Zenoh endpoints that an option gives.
         run: name of the run: that of the launcher (`run_name`), or `MANUAL`.
         restarts: how often the run was started before.
     """
 
     loaded: LoadedConfig
-    options: Options
     plan: Plan
     contents: dict[str, str]
+    showing: Showing = Showing()
+    paused: bool = False
+    profile: bool = False
+    connect: tuple[str, ...] = ()
     run: str = MANUAL
     restarts: int = 0
 
@@ -138,7 +143,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             config_file=self.config_file,
             run=self.run,
             zenoh=self.zenoh(),
-            showing=self.options.showing,
+            showing=self.showing,
             plan=replace(plan.nodes[name], restarts=self.restarts),
             models={item.name: self._model(item.name) for item in plan.nodes[name].instances},
         )
@@ -156,7 +161,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             run=self.run,
             restarts=self.restarts,
             zenoh=self.loaded.config.zenoh,
-            showing=self.options.showing,
+            showing=self.showing,
             nodes={name: _encoded(plan) for name, plan in self.plan.nodes.items()},
             models={name: _encoded(self._model(name)) for name in system.instances},
             rest=_encoded(rest),

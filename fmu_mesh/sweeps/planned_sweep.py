@@ -3,26 +3,25 @@
 All that is wrong with the mesh, the parameters, or the columns is told here, before anything runs.
 """
 
-from __future__ import annotations
-
 import logging
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypedDict, Unpack, cast
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
 
 from .. import __version__
 from ..api.mesh_builder import Mesh, load
-from ..api.plan_options import PlanOptions, options_of
 from ..api.result import Result, types_of
 from ..config.loading import PlainConfig
 from ..config.mesh import Config
-from ..errors import ConfigurationError, Finding, FmuError
+from ..errors import ConfigurationError, FmuError
 from ..run.allowed_code import check_owner
 from ..run.one_process import apart
-from ..run.options import Options
+from ..run.options import Option, VariantOptions, takes
 from ..run.run_plan import RunPlan
 from ..text import listed, nearest
 from .reductions import check_reductions, read_reduction
@@ -34,56 +33,62 @@ __all__ = ["Own", "PlannedSweep", "SweepOptions", "continued_sweep", "planned_sw
 
 log = logging.getLogger("fmu_mesh.run")
 
+_OPTION = re.compile(r"`(start_values|config_values)=\{'([^']+)': ")
+
 Own = Callable[[Result], object]
 """A reduction of the user: a function of a module, since workers import it."""
 
-_PLAN_KEYS = PlanOptions.__annotations__.keys()
+_OF_EACH_RUN = [name for name in VariantOptions.__struct_fields__ if name != "on_notice"]
 
 
-class SweepOptions(TypedDict, total=False):
-    """What `fmu_mesh.sweep` takes beside the mesh and what varies.
+class SweepOptions(VariantOptions, frozen=True, kw_only=True):
+    """What `fmu_mesh.sweep` takes beside the mesh and what varies."""
 
-    Attributes:
-        sampler: "lhs:64", "sobol:64", "halton:64" or "random:64": so many variants, spread over the ranges; without it,
-            every combination of all values.
-        seed: of the sampler; the same seed gives the same variants (0).
-        reduce: columns of the table: texts such as "max(pendulum.a)", or functions of a `Result` that return a number,
-            a truth value or a text; by default the last value of each recorded variable.
-        folder: the folder of the sweep; by default `<mesh>_sweep` beside the result file of the configuration.
-        curves: whether the recorded variables of each run are kept as a CSV (True).
-        resume: keep the runs that are in the folder already, and run what is missing.
-        processes: start the processes of the mesh for each run, as `Mesh.run` does; by default each run takes place in
-            one process, unless its instances cannot share one.
-        reset: reset the instances of FMUs between two runs, and do not make new ones (fmi2Reset; FMI 2.0, 2.1.6).
-        max_instances: by the file name of a model, how many instances of it may exist at a time: a licence server may
-            allow no more.
-        start_values: start values of all runs by `instance.variable`; or texts as `--set` has them.
-        config_values: values of any keys for all runs; or texts as `--set-config` has them.
-        algorithm: "jacobi" or "gauss_seidel".
-        step_size: base communication step size in s.
-        stop_time: time of the last communication point in s.
-        window: how many points a node may run ahead of the slowest one, or "auto".
-        allow_code: run Python code that a package or a file of another user names, or that other users can write.
-        on_notice: called with a sentence before something that takes long, such as compiling an FMU.
-    """
-
-    sampler: str | None
-    seed: int
-    reduce: Sequence[str | Own]
-    folder: str | Path | None
-    curves: bool
-    resume: bool
-    processes: bool
-    reset: bool
-    max_instances: Mapping[str, int]
-    start_values: Mapping[str, Any] | Sequence[str]
-    config_values: Mapping[str, Any] | Sequence[str]
-    algorithm: str | None
-    step_size: float | None
-    stop_time: float | None
-    window: int | Literal["auto"] | None
-    allow_code: bool
-    on_notice: Callable[[str], None]
+    executor: Annotated[
+        Executor | None,
+        Option(
+            "where the variants run, such as `dask.distributed.Client(...).get_executor()`; it is not shut down; None: "
+            "processes of this host"
+        ),
+    ] = None
+    workers: Annotated[
+        int | None, Option("processes of this host; None: one per processor", "--workers", "N", least=1)
+    ] = None
+    sampler: Annotated[
+        str | None,
+        Option(
+            "choose COUNT variants, spread over the ranges: lhs, sobol, halton or random, as in lhs:64; None: all "
+            "combinations",
+            "--sampler",
+            "NAME:COUNT",
+        ),
+    ] = None
+    seed: Annotated[int, Option("seed of the sampler; the same seed gives the same variants", "--seed", "N")] = 0
+    reduce: Annotated[
+        Sequence[str | Own],
+        Option(
+            "columns of the table, such as max(pendulum.a); in a program also functions of a `Result` in a module; "
+            "default: the last value of each variable",
+            "--reduce",
+            "FUNCTION(VARIABLE)",
+        ),
+    ] = ()
+    folder: Annotated[
+        str | Path | None,
+        Option("folder of the sweep; default: MESH_sweep beside the result file", "--folder", "FOLDER"),
+    ] = None
+    curves: Annotated[bool, Option("False: keep the table only", "--no-curves")] = True
+    resume: Annotated[bool, Option("keep the runs that the folder has, and run what is missing", "--resume")] = False
+    processes: Annotated[bool, Option("run each variant in processes, as `Mesh.run` does", "--processes")] = False
+    reset: Annotated[bool, Option("reset the instances of FMUs between two runs (fmi2Reset)", "--reset")] = False
+    max_instances: Annotated[
+        Mapping[str, int] | Iterable[Any],
+        Option(
+            "at most so many instances of a model file at a time, as its licence may ask",
+            "--max-instances",
+            "MODEL.fmu=N",
+        ),
+    ] = ()
 
 
 class PlannedSweep(NamedTuple):
@@ -110,10 +115,9 @@ class PlannedSweep(NamedTuple):
     found: dict[str, Row]
 
 
+@takes(SweepOptions)
 def planned_sweep(
-    mesh: Mesh | str | Path,
-    vary: Mapping[str, Any] | Iterable[Mapping[str, Any]],
-    **options: Unpack[SweepOptions],
+    mesh: Mesh | str | Path, vary: Mapping[str, Any] | Iterable[Mapping[str, Any]], options: SweepOptions
 ) -> PlannedSweep:
     """Plan a sweep.
 
@@ -126,13 +130,13 @@ def planned_sweep(
         ConfigurationError: the mesh, a parameter, or a column is wrong; or the folder holds another sweep.
     """
     own = mesh if isinstance(mesh, Mesh) else load(mesh)
-    variants = variants_of(vary, options.get("sampler"), options.get("seed", 0))
+    variants = variants_of(vary, options.sampler, options.seed)
     _check_names(own, list(variants[0]))
-    base = options_of(cast("PlanOptions", {key: value for key, value in options.items() if key in _PLAN_KEYS}))
-    given, reductions = options.get("folder"), options.get("reduce", ())
-    folder = SweepFolder(Path(given).absolute() if given is not None else _usual_folder(own, base))
-    if is_sweep(folder.path) and not options.get("resume", False):
-        hint = "Continue it with `resume` (`--resume`), or choose another folder with `folder` (`--folder`)."
+    given = options.given()
+    base = {name: given[name] for name in _OF_EACH_RUN if name in given}
+    folder = SweepFolder(Path(options.folder).absolute() if options.folder is not None else _usual_folder(own, base))
+    if is_sweep(folder.path) and not options.resume:
+        hint = "Continue it with `resume=True`, or choose another folder with `folder=...`."
         raise ConfigurationError(f"there is a sweep in '{folder.path}' already", hint=hint)
     wanted = Wanted(
         version=__version__,
@@ -142,22 +146,22 @@ def planned_sweep(
         options=base,
         names=tuple(variants[0]),
         variants=tuple(tuple(variant.values()) for variant in variants),
-        curves=options.get("curves", True),
-        processes=options.get("processes", False),
-        reset=options.get("reset", False),
-        most_instances=dict(options.get("max_instances", {})),
+        curves=options.curves,
+        processes=options.processes,
+        reset=options.reset,
+        most_instances=dict(options.max_instances),
     )
-    tell = options.get("on_notice", log.info)
+    tell = options.on_notice or log.info
     plan = _any_plan(own, base, wanted, tell)
     if not wanted.processes and (why := apart(plan.plan)):
         tell(f"each run of the sweep starts processes, because {why[0]}")
         wanted = replace(wanted, processes=True)
     recorded = types_of(plan.plan.system) or {}
-    asked = reductions or [f"last({name})" for name in recorded]
+    asked = options.reduce or [f"last({name})" for name in recorded]
     texts = [one for one in asked if isinstance(one, str)]
     check_reductions([read_reduction(text) for text in texts], recorded)
     wanted = replace(wanted, recorded=tuple(recorded), reductions=tuple(texts), units=_units(plan, wanted.names))
-    functions = {_column(one): one for one in reductions if not isinstance(one, str)}
+    functions = {_column(one): one for one in options.reduce if not isinstance(one, str)}
     return _planned(own, plan, wanted, folder, functions)
 
 
@@ -179,7 +183,7 @@ def continued_sweep(
     source = f"the sweep in '{own.path}'"
     if not allow_code:
         check_owner(own.wanted_file, source)
-    wanted = replace(wanted, options=replace(wanted.options, allow_code=allow_code))  # a file cannot allow its own code
+    wanted = replace(wanted, options={**wanted.options, "allow_code": allow_code})  # a file cannot allow its own code
     mesh = Mesh.from_configuration(PlainConfig(wanted.data, Path(wanted.file), foreign=source))
     return _planned(mesh, _any_plan(mesh, wanted.options, wanted, on_notice), wanted, own, {})
 
@@ -231,7 +235,7 @@ def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
             raise ConfigurationError(f"{found}.", hint=f"Did you mean '{near}{dot}{rest}'?" if near else there)
 
 
-def _any_plan(mesh: Mesh, base: Options, wanted: Wanted, tell: Callable[[str], None] = log.info) -> RunPlan:
+def _any_plan(mesh: Mesh, base: Mapping[str, Any], wanted: Wanted, tell: Callable[[str], None] = log.info) -> RunPlan:
     """The plan of the first variant, or of the last one: one of them may have values that are refused.
 
     Args:
@@ -260,16 +264,13 @@ def _any_plan(mesh: Mesh, base: Options, wanted: Wanted, tell: Callable[[str], N
 
 
 def _as_asked(error: ConfigurationError, names: Sequence[str]) -> ConfigurationError:
-    """The error of a variant as one about what varies: nobody has written `--set` or `--set-config`."""
-    findings: list[Finding] = []
-    for finding in error.findings:
-        option, _, rest = finding.path.partition(" ")
-        name = rest.partition("=")[0]
-        is_asked = option in {"--set", "--set-config"} and name in names
-        findings.append(replace(finding, path=f"--vary {rest}") if is_asked else finding)
-    if len(findings) != 1:
-        return ConfigurationError(error.message, findings=tuple(findings), hint=error.hint)
-    return ConfigurationError(str(findings[0]), findings=tuple(findings), hint=error.hint)
+    """The error of a variant as one about what varies: that is not what the program has given for other options."""
+
+    def asked(text: str) -> str:
+        return _OPTION.sub(lambda found: found[0].replace(found[1], "vary", 1) if found[2] in names else found[0], text)
+
+    findings = tuple(replace(finding, path=asked(finding.path)) for finding in error.findings)
+    return ConfigurationError(asked(error.message), findings=findings, hint=error.hint)
 
 
 def _identities(mesh: Mesh, plan: RunPlan, wanted: Wanted) -> tuple[str, ...]:
@@ -317,7 +318,7 @@ def _at_once(plan: RunPlan, most_instances: Mapping[str, int]) -> int | None:
     return min(limits, default=None)
 
 
-def _usual_folder(mesh: Mesh, base: Options) -> Path:
+def _usual_folder(mesh: Mesh, base: Mapping[str, Any]) -> Path:
     """`<mesh>_sweep` beside the result file of the configuration; without one in the current folder."""
     options = options_of_variant(base, mesh.instances, {})
     try:

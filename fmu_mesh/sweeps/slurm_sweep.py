@@ -90,7 +90,7 @@ class SlurmSweep(Sweep):
                 raise ConfigurationError(text, hint="Give each task fewer workers.")
         command = [sys.executable, "-Pm", "fmu_mesh", "sweep", str(planned.folder.path), "--part", PART]
         command += ["--workers", str(options.workers), "--no-progress"]
-        if planned.wanted.options.allow_code or not planned.plan.loaded.foreign:  # the tasks see only the folder
+        if planned.wanted.options.get("allow_code") or not planned.plan.loaded.foreign:  # the tasks see only the folder
             command.append("--allow-code")
         job = submit(
             planned.folder.path,

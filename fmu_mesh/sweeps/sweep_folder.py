@@ -24,11 +24,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
-from msgspec.structs import replace
 
 from ..errors import ConfigurationError
 from ..files import decoded_json, is_file, replaced
-from ..run.options import Options
 from .variant_run import Cell, Row, curves_of, path_of
 from .variants import Parameters
 
@@ -48,7 +46,7 @@ class Wanted(msgspec.Struct, frozen=True):
         mesh: name of the mesh.
         file: file of the configuration, absolute.
         data: the values of the configuration.
-        options: the options of each run.
+        options: the options of each run that have another value than their default.
         names: names of the parameters.
         variants: for each variant the values of the parameters, in this order.
         recorded: names of the recorded variables.
@@ -65,7 +63,7 @@ class Wanted(msgspec.Struct, frozen=True):
     mesh: str
     file: str
     data: Any
-    options: Options
+    options: dict[str, Any]
     names: tuple[str, ...]
     variants: tuple[tuple[Any, ...], ...]
     recorded: tuple[str, ...] = ()
@@ -237,7 +235,7 @@ class RowFile:
             raise self._unwritable(error) from error
 
     def _unwritable(self, error: OSError) -> ConfigurationError:
-        hint = "All rows before are kept: `--resume` runs what is missing."
+        hint = "All rows before are kept: `resume=True` runs what is missing."
         return ConfigurationError(f"'{self._path}' cannot be written: {error.strerror}", hint=hint)
 
 
@@ -268,7 +266,7 @@ def identity_of(wanted: Wanted, parameters: Parameters, contents: Mapping[str, s
         parameters: those of the variant.
         contents: SHA-256 of the model of each instance.
     """
-    options = replace(wanted.options, allow_code=False)  # not what is calculated
+    options = {name: value for name, value in wanted.options.items() if name != "allow_code"}  # not what is calculated
     asked = [wanted.data, options, sorted(parameters.items()), sorted(contents.items())]
     return hashlib.sha256(msgspec.json.encode(asked, enc_hook=str)).hexdigest()[:16]
 

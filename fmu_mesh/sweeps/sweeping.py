@@ -25,10 +25,11 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Final, NamedTuple, Self, Unpack
+from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
+from ..run.options import takes
 from ..wire.runtime import remove_stale_folders
 from .planned_sweep import PlannedSweep, SweepOptions, planned_sweep
 from .sweep_folder import RowFile
@@ -205,7 +206,7 @@ class Sweep(ABC):
 
     def _way_on(self) -> str:
         done, total = len(self._numbers) - self._left, len(self._numbers)
-        return f"{done} of {total} runs are in '{self.folder}'; `resume` (`--resume`) runs the others."
+        return f"{done} of {total} runs are in '{self.folder}'; `resume=True` runs the others."
 
     def _take(self, row: Row) -> None:
         """Count the row of a variant that has ended."""
@@ -354,13 +355,9 @@ class ExecutorSweep(Sweep):
         return MeshLost(text, hint=self._way_on())
 
 
+@takes(SweepOptions)
 def sweep(
-    mesh: Mesh | str | Path,
-    vary: Mapping[str, Any] | Iterable[Mapping[str, Any]],
-    *,
-    executor: Executor | None = None,
-    workers: int | None = None,
-    **options: Unpack[SweepOptions],
+    mesh: Mesh | str | Path, vary: Mapping[str, Any] | Iterable[Mapping[str, Any]], options: SweepOptions
 ) -> Sweep:
     """Run a mesh many times, with other values of its parameters; returns at once.
 
@@ -384,15 +381,13 @@ def sweep(
         vary: the values of each parameter, of which all combinations run: a list, a numpy array, or a `Range`. Or a
             list with the parameters of each variant. `instance.variable` is a start value, and any
             other name a key of the configuration.
-        executor: where the variants run, such as `dask.distributed.Client(...).get_executor()`; it is not shut down.
-            By default, processes of this host.
-        workers: number of these processes; by default one for each processor.
         options: see `SweepOptions`.
 
     Raises:
         ConfigurationError: the mesh, a parameter, or a column is wrong; or the folder holds another sweep.
     """
-    return ExecutorSweep(planned_sweep(mesh, vary, **options), executor=executor, workers=workers)
+    planned = planned_sweep(mesh, vary, **options.given())
+    return ExecutorSweep(planned, executor=options.executor, workers=options.workers)
 
 
 def usual_workers(planned: PlannedSweep) -> int:

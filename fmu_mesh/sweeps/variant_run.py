@@ -17,21 +17,18 @@ from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec.structs import asdict
 
 from .. import __version__
 from ..api.mesh_builder import Mesh
-from ..api.plan_options import PlanOptions, texts_of
 from ..api.repeated_mesh import RepeatedMesh
 from ..api.result import Result
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, NotInOneProcess, from_report
-from ..run.options import Options
 from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
@@ -65,7 +62,7 @@ class SweepTask(msgspec.Struct, frozen=True):
     version: str
     data: Any
     file: Path
-    options: Options
+    options: dict[str, Any]
     reductions: tuple[str, ...] = ()
     curves: Path | None = None
     processes: bool = False
@@ -103,7 +100,7 @@ def encoded_task(task: SweepTask) -> bytes:
     return msgspec.msgpack.encode(task, enc_hook=str)
 
 
-def options_of_variant(options: Options, instances: Sequence[str], parameters: Parameters) -> PlanOptions:
+def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:
     """The options of the run of one variant.
 
     Args:
@@ -113,10 +110,8 @@ def options_of_variant(options: Options, instances: Sequence[str], parameters: P
     """
     start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
     keys = {name: value for name, value in parameters.items() if name not in start}
-    given = {name: value for name, value in asdict(options).items() if value}
-    given["start_values"] = [*options.start_values, *texts_of(start, "start value")]
-    given["config_values"] = [*options.config_values, *texts_of(keys, "value")]
-    return cast("PlanOptions", given)
+    own = {"start_values": start, "config_values": keys}
+    return {**options, **{name: {**options.get(name, {}), **values} for name, values in own.items()}}
 
 
 def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
@@ -238,7 +233,7 @@ class _Loaded:
 
 
 class _Job(NamedTuple):
-    options: PlanOptions
+    options: dict[str, Any]
     ended: Future[Result]
 
 

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..api.plan_options import plain
 from ..config.findings import Findings
+from ..config.plain_values import plain
 from ..config.yaml_text import read
 from ..errors import CallRefused, ConfigurationError
 from ..text import listed, nearest, shown

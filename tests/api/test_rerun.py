@@ -178,12 +178,12 @@ def test_the_metadata_say_how_the_result_was_made(folder: Path) -> None:
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_the_configuration_of_the_metadata_is_that_of_the_run(path: Path) -> None:
-    loaded, findings = examine_data(fmu_mesh.load(path).configuration, ())
+    loaded, findings = examine_data(fmu_mesh.load(path).configuration)
     findings.raise_any()
 
     data = msgspec.json.decode(msgspec.json.encode(configuration_of(loaded)))
 
-    again, findings = examine_data(PlainConfig(data, path), ())
+    again, findings = examine_data(PlainConfig(data, path))
     findings.raise_any()
     assert again.config == loaded.config
 

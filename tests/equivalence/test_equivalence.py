@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from tests.equivalence.reference import Reference, as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place
@@ -74,7 +74,7 @@ def launched(place: Place, config: Path, *arguments: str) -> bytes:
 def in_this_process(place: Place, config: Path) -> bytes:
     """The result of the same plan in one process."""
     output = place.folder / "local.csv"
-    LocalMesh(prepare(config, Options(output=output))).run()
+    LocalMesh(prepare(config, PlanOptions(output=output))).run()
     return output.read_bytes()
 
 

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from tests.fmus.event_fmus import Version
 from tests.helpers import Place
@@ -28,7 +28,7 @@ def both_ways(place: Place, content: Mapping[str, Any], *arguments: str) -> tupl
     config.write_text(yaml.safe_dump({"mesh": "m", **content}, sort_keys=False), encoding="utf-8")
     launched = place.start("launch", config, "--no-progress", "--output", place.folder / "launched.csv", *arguments)
     assert launched.wait(50.0) == 0, launched.errors
-    LocalMesh(prepare(config, Options(output=place.folder / "local.csv"))).run()
+    LocalMesh(prepare(config, PlanOptions(output=place.folder / "local.csv"))).run()
     return (place.folder / "launched.csv").read_bytes(), (place.folder / "local.csv").read_bytes()
 
 

@@ -17,7 +17,7 @@ from fmpy.fmi2 import FMU2Slave
 from examples import integrated_node
 from fmu_mesh import FMIAdapter
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,7 +38,7 @@ def rows_of(path: Path) -> Rows:
 
 def local_rows(config: Path, output: Path) -> Rows:
     """The result of a configuration that runs in this process."""
-    LocalMesh(prepare(config, Options(output=output))).run()
+    LocalMesh(prepare(config, PlanOptions(output=output))).run()
     return rows_of(output)
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from fmu_mesh.api.plan_page import plan_page
-from fmu_mesh.instances.configuration import load
+from fmu_mesh.config.loading import read_file
+from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.plan import RECORDER, Plan
@@ -154,7 +155,9 @@ def test_two_instances_of_an_fmu_that_allows_one_per_process_get_two_nodes(tmp_p
     once = {name for name, own in plan.system.instances.items() if own.description.model_name == "Integrator"}
     edges = [(c.source_instance, c.target_instance) for c in plan.connections]
 
-    nodes = automatic_nodes(load(written(tmp_path)).config, edges, lambda name: {"once": ""} if name in once else {})
+    nodes = automatic_nodes(
+        examine_data(read_file(written(tmp_path)))[0].config, edges, lambda name: {"once": ""} if name in once else {}
+    )
 
     assert nodes == {"sum": "sum-cycle", "loop": "sum-cycle", "position": "position-cycle", "brake": "position-cycle"}
 

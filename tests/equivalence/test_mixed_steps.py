@@ -20,7 +20,7 @@ from fmu_mesh.rings import native
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.local_system import opening_of
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import NodePlan, Plan
 from tests.helpers import FMUS, rows_of
@@ -108,7 +108,7 @@ def test_fmus_and_components_in_one_burst_get_the_values_of_the_reference(
     config = tmp_path / "mixed.yaml"
     config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     output = tmp_path / "local.csv"
-    plan = prepare(config, Options(output=output))
+    plan = prepare(config, PlanOptions(output=output))
     LocalMesh(plan).run()
     with output.open(encoding="utf-8", newline="") as file:
         header = next(csv.reader(file))

@@ -15,7 +15,7 @@ import zenoh
 
 import fmu_mesh
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.wire.session import Wiring, open_session
 from tests.helpers import DEADLINE_S, FMUS, Place, wait_until, write_config
@@ -35,7 +35,7 @@ def test_many_instances_give_the_floats_of_one_process(instances: int, groups: i
     assert place.run("launch", config, "--no-progress", deadline_s=200.0).wait() == 0
 
     local = place.folder / "local.csv"
-    LocalMesh(prepare(config, Options(output=local))).run()
+    LocalMesh(prepare(config, PlanOptions(output=local))).run()
     assert config.with_suffix(".csv").read_bytes() == local.read_bytes()
     place.assert_nothing_left()
 

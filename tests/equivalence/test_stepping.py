@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from fmu_mesh.api.open_system import System
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import plan_run
 from tests.equivalence import test_equivalence as meshes
 from tests.equivalence import test_events as events
@@ -30,7 +30,7 @@ Rows = list[list[Any]]
 
 
 def opened(config: Path, *start_values: str) -> System:
-    return System(plan_run(config, Options(start_values=start_values)))
+    return System(plan_run(config, PlanOptions(start_values=start_values)))
 
 
 def rows_stepped(system: System, columns: list[str], sizes: tuple[int, ...] = (1,)) -> Rows:

@@ -16,7 +16,7 @@ import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import Place
@@ -175,7 +175,7 @@ def test_every_type_is_the_same_over_the_wire_and_in_one_process_and_right() -> 
     with Place() as place:
         config = written(place.folder)
         local = place.folder / "local.csv"
-        LocalMesh(prepare(config, Options(output=local))).run()
+        LocalMesh(prepare(config, PlanOptions(output=local))).run()
         process = place.run("launch", config, "--no-progress")
         assert process.wait() == 0, process.errors
         content = (place.folder / "result.csv").read_bytes()

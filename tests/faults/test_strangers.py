@@ -28,7 +28,7 @@ from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.native import NEVER
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
@@ -86,7 +86,7 @@ def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, **si
 
 def local_result(place: Place, config: Path) -> bytes:
     output = place.folder / "local.csv"
-    LocalMesh(prepare(config, Options(output=output))).run()
+    LocalMesh(prepare(config, PlanOptions(output=output))).run()
     return output.read_bytes()
 
 
@@ -441,7 +441,7 @@ class Intruder:
     """A process of the same user that has opened the memory of a run, and knows what lies where."""
 
     def __init__(self, launched: Launched, config: Path) -> None:
-        plan = prepare(config, Options())
+        plan = prepare(config, PlanOptions())
         node = plan.nodes["left"]
         self.map = node.memory
         self.places = {place.instance: place for own in plan.nodes.values() for place in own.rings}

@@ -19,7 +19,7 @@ from gymnasium.utils.env_checker import check_env
 
 import fmu_mesh
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place
 
@@ -43,7 +43,7 @@ def run(folder: Path, start: dict[str, float], *, pushed: bool) -> dict[str, lis
         content["connections"].remove("policy.force -> cart.force")
     config, output = folder / "balance.yaml", folder / "result.csv"
     config.write_text(yaml.safe_dump(content), encoding="utf-8")
-    LocalMesh(prepare(config, Options(output=output))).run()
+    LocalMesh(prepare(config, PlanOptions(output=output))).run()
     return columns(output)
 
 

@@ -22,7 +22,7 @@ from fmu_mesh.instances.gazebo.gazebo_section import GazeboClassicConfig
 from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
@@ -477,7 +477,7 @@ record: {{file: result.csv, variables: [motor.jointTorque, world.elbow.effort_ap
         encoding="utf-8",
     )
 
-    LocalMesh(prepare(config, Options())).run()
+    LocalMesh(prepare(config, PlanOptions())).run()
 
     rows = [line.split(",") for line in (tmp_path / "result.csv").read_text(encoding="utf-8").splitlines()[1:]]
     assert [float(applied) for _, _, applied in rows[1:]] == [float(torque) for _, torque, _ in rows[1:]]

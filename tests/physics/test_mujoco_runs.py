@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place
 
@@ -51,7 +51,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
             folder = tmp_path_factory.mktemp("run")
             config = changed(name, folder, replaced)
             output = folder / "result.csv"
-            LocalMesh(prepare(config, Options(start_values=start_values, output=output))).run()
+            LocalMesh(prepare(config, PlanOptions(start_values=start_values, output=output))).run()
             known[key] = columns_of(output)
         return known[key]
 

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "path_filter.yaml"
@@ -35,7 +35,7 @@ def columns(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], dict[
     def run(slope_speed: float) -> dict[str, Array]:
         output = folder / f"{slope_speed}.csv"
         if not output.exists():
-            options = Options(start_values=(f"filter.slopeSpeed={slope_speed!r}",), output=output)
+            options = PlanOptions(start_values=(f"filter.slopeSpeed={slope_speed!r}",), output=output)
             LocalMesh(prepare(CONFIG, options)).run()
         with output.open(newline="") as file:
             header, *rows = csv.reader(file)

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from tests.fmus.reference import Pendulum, angle_after
 
@@ -44,7 +44,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         if key not in known:
             output = folder / f"{len(known)}.csv"
             everything = ("record.variables=null",)
-            options = Options(start_values=start_values, config_values=everything, output=output)
+            options = PlanOptions(start_values=start_values, config_values=everything, output=output)
             LocalMesh(prepare(CONFIGS / f"{name}.yaml", options)).run()
             known[key] = columns_of(output)
         return known[key]

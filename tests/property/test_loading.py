@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -20,7 +21,7 @@ from fmu_mesh.instances.configuration import installed_config, parse
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.instances.registry import KINDS
 from fmu_mesh.system.system import build
-from fmu_mesh.text import nearest
+from fmu_mesh.text import nearest, option_text
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 
 FILE = Path("/nowhere/mesh.yaml")
@@ -124,18 +125,18 @@ def as_json(data: object) -> str:
     return json.dumps(data)
 
 
-def findings_of(text: str, *overrides: str) -> tuple[Finding, ...]:
+def findings_of(text: str, start_values: dict[str, Any] | None = None) -> tuple[Finding, ...]:
     """What is wrong with a file; empty if it is right."""
     try:
-        parse(text, FILE, overrides)
+        parse(text, FILE, start_values or {})
     except ConfigurationError as error:
         return error.findings or (Finding(str(FILE), "", "an error without a finding", "a finding"),)
     return ()
 
 
 @relaxed
-@given(st.text() | YAML_MARKS, st.lists(st.text() | YAML_MARKS, max_size=2))
-def test_any_text_is_a_configuration_or_a_configuration_error(text: str, overrides: list[str]) -> None:
+@given(st.text() | YAML_MARKS, st.dictionaries(st.text() | YAML_MARKS, STRUCTURES, max_size=2))
+def test_any_text_is_a_configuration_or_a_configuration_error(text: str, overrides: dict[str, Any]) -> None:
     with contextlib.suppress(ConfigurationError):
         parse(text, FILE, overrides)
 
@@ -166,7 +167,7 @@ def test_what_is_wrong_in_the_structure_is_never_lost_on_the_way_to_a_system(sec
     found = findings_of(text)
     assume(found)
     with contextlib.suppress(ConfigurationError):
-        loaded, findings = examine_data(read_text(text, FILE), (), KINDS)
+        loaded, findings = examine_data(read_text(text, FILE), {}, KINDS)
         with pytest.raises(ConfigurationError) as caught:
             build(loaded, dict.fromkeys(loaded.config.instances, GAIN), findings)
         assert set(found) <= set(caught.value.findings)
@@ -175,8 +176,9 @@ def test_what_is_wrong_in_the_structure_is_never_lost_on_the_way_to_a_system(sec
 @relaxed
 @given(SCALARS)
 def test_any_value_of_an_option_is_taken_or_told_with_the_option(value: object) -> None:
-    override = f"a.k={value}"
-    assert all(finding.path == f"--set {override}" for finding in findings_of(as_json(SECTIONS), override))
+    given = {"a.k": value}
+    option = option_text("start_values", given)
+    assert all(finding.path == option for finding in findings_of(as_json(SECTIONS), given))
 
 
 @relaxed

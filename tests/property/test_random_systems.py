@@ -29,7 +29,6 @@ from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.options import Options
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.repeated import RepeatedRuns
 from fmu_mesh.run.results import open_result
@@ -501,7 +500,7 @@ LIBRARIES = pytest.mark.parametrize(
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_system_gives_the_reference_result_in_each_of_many_runs(library: bool, drawn: Drawn) -> None:  # noqa: FBT001 a parameter of tests
     plan = planned(drawn)
-    run_plan = RunPlan(LoadedConfig(plan.system.config, Path()), Options(), plan, {})
+    run_plan = RunPlan(LoadedConfig(plan.system.config, Path()), plan, {})
     opened: dict[str, Mixer] = {}
 
     def open_instance(name: str) -> Mixer:
@@ -595,7 +594,7 @@ def test_many_runs_end_where_a_run_point_by_point_ends(
         loaded = LoadedConfig(plan.system.config, Path())
         expected = ended(LocalMesh(plan, open_instance=instance, loaded=loaded).run), written()
         runs = RepeatedRuns(Path(folder), open_instance=instance)
-        run_plan = RunPlan(loaded, Options(), plan, {})
+        run_plan = RunPlan(loaded, plan, {})
         for _ in range(2):
             result = open_result(loaded, plan.system)
             assert (ended(lambda result=result: runs.run(run_plan, result)), written()) == expected  # type: ignore[misc]  # the result of this loop

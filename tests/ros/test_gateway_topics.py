@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from fmu_mesh.config.loading import read_file
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.configuration import load
+from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.ros.gateway.mapping import resolve
 from fmu_mesh.ros.messages.topics import RosPlan
 from fmu_mesh.run.preparing import prepare
@@ -28,7 +29,7 @@ def planned(folder: Path, **ros: Any) -> RosPlan:  # noqa: ANN401 what a file ma
 def plan_of(path: Path) -> RosPlan:
     """The plan of a file, with what its instances say of themselves."""
     plan = prepare(path)
-    loaded = load(path)
+    loaded = examine_data(read_file(path))[0]
     found = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, loaded.findings())
     assert found is not None
     return found
@@ -303,7 +304,7 @@ def test_elements_of_arrays_of_messages_are_topics_in_both_directions(tmp_path: 
 
 
 def test_names_that_collide_or_start_with_a_digit_are_told_with_all_else_that_is_wrong(tmp_path: Path) -> None:
-    loaded = load(configured(tmp_path, topics=["pendulum", "delay.nothing"]))
+    loaded = examine_data(read_file(configured(tmp_path, topics=["pendulum", "delay.nothing"])))[0]
     variables = tuple(
         Variable(name=name, value_reference=number, type="Float64", causality="output", variability="continuous")
         for number, name in enumerate(["b.x", "b_x", "1st", "fine"])

@@ -27,7 +27,7 @@ import fmu_mesh
 def wave(time, k=1.0):
     return k * time
 """
-REFUSED = "Python code, in {}; expected a file of your own, or `--allow-code`"
+REFUSED = "Python code, in {}; expected a file of your own, or `allow_code=True`"
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def test_a_rerun_runs_code_only_if_it_is_allowed(interpreter: dict[str, str]) ->
     apart = bool(interpreter)
     assert len(fmu_mesh.rerun("pair.csv", allow_code=True, on_notice=told.append, processes=apart).times) == 11
     by = f" with {sys.executable}" if interpreter else ""
-    runs = f"instance 'wave' runs {Path.cwd()}/wave.py:wave{by}, because of `--allow-code`"
+    runs = f"instance 'wave' runs {Path.cwd()}/wave.py:wave{by}, because of `allow_code=True`"
     assert told == [f"{runs} (Python code, in the result 'pair.csv')"]
 
 
@@ -81,7 +81,7 @@ def test_the_folder_of_a_sweep_cannot_allow_its_own_code() -> None:
         continued_sweep(Path("swept"))
 
     assert not Path("ran").exists()
-    assert continued_sweep(Path("swept"), allow_code=True).wanted.options.allow_code
+    assert continued_sweep(Path("swept"), allow_code=True).wanted.options["allow_code"]
 
 
 def test_no_variant_of_a_foreign_sweep_brings_code() -> None:
@@ -117,7 +117,7 @@ def test_code_that_others_can_write_is_refused(tmp_path: Path, place: str, mode:
 
     there = (inner / place).resolve()
     assert f"other users can write '{there}', which has mode {mode:04o}" in str(refused.value)
-    assert f"(`chmod go-w {there}`), or `--allow-code`" in str(refused.value)
+    assert f"(`chmod go-w {there}`), or `allow_code=True`" in str(refused.value)
     assert not Path("ran").exists()
     Path(place).chmod(mode | 0o1000 if Path(place).is_dir() else 0o644)  # in a sticky folder, only owners replace files
     fmu_mesh.load(config).plan()

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from fmu_mesh.config.loading import read_file
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.configuration import examine, parse
+from fmu_mesh.instances.configuration import examine_data, parse
 from fmu_mesh.instances.position_pid import describe_pid
 from fmu_mesh.system.plan import Plan, make_plan
 from fmu_mesh.system.system import build
@@ -214,7 +215,7 @@ def structure_of(world: str, folder: Path) -> list[str]:
     """Where the structure of a file is wrong."""
     path = folder / "mesh.yaml"
     path.write_text(text(world), encoding="utf-8")
-    return [f"{finding.path}: {finding.found}; {finding.suggestion}" for finding in examine(path)[1]]
+    return [f"{finding.path}: {finding.found}; {finding.suggestion}" for finding in examine_data(read_file(path))[1]]
 
 
 def test_all_that_is_wrong_with_the_structure_of_a_section_is_shown(tmp_path: Path) -> None:

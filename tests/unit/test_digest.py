@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system import digest
 from fmu_mesh.system.digest import difference
@@ -32,7 +32,7 @@ def change(path: Path, old: str, new: str) -> None:
 
 def plan_of(folder: Path, *options: str) -> Plan:
     """The plan of ``mesh.yaml`` in a folder."""
-    return prepare(folder / "mesh.yaml", Options(start_values=options))
+    return prepare(folder / "mesh.yaml", PlanOptions(start_values=options))
 
 
 def write_mesh(folder: Path, instance: dict[str, object]) -> None:

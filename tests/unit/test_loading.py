@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig
+from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig, read_file
 from fmu_mesh.config.mesh import ConnectionConfig
-from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH
+from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH, Plain
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.instances.configuration import load, parse
+from fmu_mesh.instances.configuration import examine_data, parse
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
@@ -26,9 +27,15 @@ connections:
 """
 
 
-def findings_of(text: str, *overrides: str) -> tuple[Finding, ...]:
+def load(path: Path) -> LoadedConfig:
+    loaded, findings = examine_data(read_file(path))
+    findings.raise_any()
+    return loaded
+
+
+def findings_of(text: str, **start_values: Any) -> tuple[Finding, ...]:  # noqa: ANN401 as a file has them
     with pytest.raises(ConfigurationError) as caught:
-        parse(text, Path("mesh.yaml"), overrides)
+        parse(text, Path("mesh.yaml"), start_values)
     return caught.value.findings
 
 
@@ -353,7 +360,7 @@ instances:
 connections: [a.y b.u, {from: a.y}, 3, {to: a.y}]
 mesh: 2
 """
-    findings = findings_of(text, "a", "c.x=1", "a.x={}")
+    findings = findings_of(text, **{"a": 1, "c.x": 1, "a.x": {}})
     assert [(finding.line, finding.path) for finding in findings] == [
         (2, "simulation.stop_time"),
         (2, "simulation.step_size"),
@@ -367,9 +374,9 @@ mesh: 2
         (6, "connections[3].from"),
         (7, "mesh"),
         (7, "mesh"),
-        (None, "--set a"),
-        (None, "--set c.x=1"),
-        (None, "--set a.x={}"),
+        (None, "`start_values={'a': 1}`"),
+        (None, "`start_values={'c.x': 1}`"),
+        (None, "`start_values={'a.x': {}}`"),
     ]
 
 
@@ -387,33 +394,29 @@ def test_a_single_problem_is_the_message(tmp_path: Path) -> None:
 
 
 def test_an_override_takes_the_place_of_a_start_value() -> None:
-    loaded = parse(GOOD, Path("mesh.yaml"), ["pendulum.a=2e-1", "delay.body[1].x=on", "pendulum.a=3"])
+    loaded = parse(GOOD, Path("mesh.yaml"), {"delay.body[1].x": "on", "pendulum.a": 3})
     assert loaded.config.instances["pendulum"].start_values["a"] == 3
     assert loaded.config.instances["delay"].start_values == {"body[1].x": "on"}
-    assert loaded.overrides["instances.pendulum.start_values.a"] == "--set pendulum.a=3"
+    assert loaded.overrides["instances.pendulum.start_values.a"] == "`start_values={'pendulum.a': 3}`"
 
 
 @pytest.mark.parametrize(
-    ("override", "expected"),
+    ("name", "value", "expected"),
     [
-        ("pendulum.a", "--set pendulum.a: no start value; expected instance.variable=value"),
-        ("a=1", "--set a=1: no start value; expected instance.variable=value"),
+        ("pendulum", 1, "the name 'pendulum'; expected instance.variable"),
         (
-            "pendulam.a=1",
-            (
-                "--set pendulam.a=1: the unknown instance 'pendulam'; expected one of pendulum, delay. "
-                "Did you mean 'pendulum'?"
-            ),
+            "pendulam.a",
+            1,
+            "the unknown instance 'pendulam'; expected one of pendulum, delay. Did you mean 'pendulum'?",
         ),
-        ("delay.d=", "--set delay.d=: the value ''; expected a number, text, true or false, or a list"),
-        ("delay.d={}", "--set delay.d={}: the value '{}'; expected a number, text, true or false, or a list"),
-        ("delay.d=[", "--set delay.d=[: the value '['; expected a number, text, true or false, or a list"),
-        ("delay.d=.nan", "--set delay.d=.nan: nan; expected a finite number, true or false, text or a list"),
+        ("delay.d", None, "the value nothing (null); expected a number, text, true or false, or a list"),
+        ("delay.d", {}, "the value a mapping; expected a number, text, true or false, or a list"),
+        ("delay.d", float("nan"), "nan; expected a finite number, true or false, text or a list"),
     ],
 )
-def test_a_wrong_override_is_told_by_its_option(override: str, expected: str) -> None:
-    (finding,) = findings_of(GOOD, override)
-    assert str(finding) == f"mesh.yaml: {expected}"
+def test_a_wrong_override_is_told_by_its_option(name: str, value: Plain, expected: str) -> None:
+    (finding,) = findings_of(GOOD, **{name: value})
+    assert str(finding) == f"mesh.yaml: `start_values={{'{name}': {value!r}}}`: {expected}"
 
 
 def test_a_missing_file_suggests_the_nearest(tmp_path: Path) -> None:

@@ -13,13 +13,14 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.config.findings import Findings, ValueOrigin
 from fmu_mesh.config.loading import PlainConfig
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.run.options import Options, with_needed
+from fmu_mesh.run.options import PlanOptions
+from fmu_mesh.run.overriding import with_options
 from tests.helpers import FMUS
 
 NEEDED = {
-    "simulation.step_size": "`--step-size S`",
-    "simulation.stop_time": "`--stop-time S`",
-    "simulation.algorithm": "`--algorithm NAME`",
+    "simulation.step_size": "`step_size`",
+    "simulation.stop_time": "`stop_time`",
+    "simulation.algorithm": "`algorithm`",
 }
 TIMES = {"step_size": 0.1, "stop_time": 1.0}
 
@@ -88,12 +89,12 @@ def test_check_shows_where_each_start_value_was_written() -> None:
     start = page.index("Start values")
     assert page[start + 1 : start + 3] == [
         "  gain.k  = 2.0  Parameter 'k' (m.ssp/a.ssv:7)",
-        "  gain.u  = 4.0  --set gain.u=4.0",
+        "  gain.u  = 4.0  `start_values={'gain.u': 4.0}`",
     ]
     assert check.plan is not None
     origins = check.plan.instances[0].origins
     assert (origins["k"].file, origins["k"].line, origins["k"].text) == ("m.ssp/a.ssv", 7, "Parameter 'k'")
-    assert (origins["u"].file, origins["u"].line, origins["u"].text) == (None, None, "--set gain.u=4.0")
+    assert (origins["u"].file, origins["u"].line, origins["u"].text) == (None, None, "`start_values={'gain.u': 4.0}`")
 
 
 def test_a_value_that_the_scenario_prescribes_from_the_start_is_that_of_the_scenario() -> None:
@@ -146,7 +147,7 @@ def test_options_give_what_the_package_does_not_say() -> None:
 def test_a_key_that_is_set_by_its_path_is_there_as_well() -> None:
     plain = package(simulation={}, needed=NEEDED)._replace(data={"mesh": "m", "simulation": {"step_size": 0.1}})
 
-    assert [one.path for one in with_needed(plain, Options()).findings] == [
+    assert [one.path for one in with_options(plain, PlanOptions()).findings] == [
         "simulation.stop_time",
         "simulation.algorithm",
     ]
@@ -155,9 +156,9 @@ def test_a_key_that_is_set_by_its_path_is_there_as_well() -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"algorithm": "jacob", "step_size": 0.1}, "--algorithm jacob: 'jacob'; expected "),
-        ({"algorithm": "jacobi", "step_size": -0.1}, "--step-size -0.1: -0.1; expected a step size > 0 in s"),
-        ({"algorithm": "jacobi", "step_size": 0.3}, "--stop-time 1: 1 s between start_time and stop_time"),
+        ({"algorithm": "jacob", "step_size": 0.1}, "`algorithm='jacob'`: 'jacob'; expected "),
+        ({"algorithm": "jacobi", "step_size": -0.1}, "`step_size=-0.1`: -0.1; expected a step size > 0 in s"),
+        ({"algorithm": "jacobi", "step_size": 0.3}, "`stop_time=1.0`: 1 s between start_time and stop_time"),
     ],
 )
 def test_a_wrong_value_of_such_an_option_is_one_finding_that_names_the_option(
@@ -215,4 +216,4 @@ def test_an_option_and_another_one_for_the_same_key_do_not_go_together(tmp_path:
 
     findings = fmu_mesh.load(path).check(**options).findings  # type: ignore[arg-type]  # options by name
 
-    assert [one.found for one in findings] == ["replaced by --step-size as well"]
+    assert [one.found for one in findings] == ["replaced by `step_size=...` as well"]

@@ -13,7 +13,8 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig, read_text
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data, parse
-from fmu_mesh.run.options import Options, with_options
+from fmu_mesh.run.options import PlanOptions
+from fmu_mesh.run.overriding import with_options
 from fmu_mesh.system.recording import result_endings
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import build
@@ -219,8 +220,7 @@ def test_the_rows_of_some_points_are_those_whose_points_are_selected(
     ],
 )
 def test_an_output_replaces_the_first_file(record: str, files: list[str]) -> None:
-    loaded, findings = examined(f"record: {record}")
-    loaded = with_options(loaded, Options(output=Path("/out.csv")), findings)
+    loaded, findings = examined(f"record: {record}", PlanOptions(output=Path("/out.csv")))
 
     system = build(loaded, DESCRIPTIONS, findings)
 
@@ -229,16 +229,16 @@ def test_an_output_replaces_the_first_file(record: str, files: list[str]) -> Non
 
 
 def test_a_wrong_output_is_a_finding_about_the_option() -> None:
-    loaded, findings = examined("record: [{file: a.csv}, {file: b.csv}]")
-    loaded = with_options(loaded, Options(output=Path("/out.xlsx")), findings)
+    loaded, findings = examined("record: [{file: a.csv}, {file: b.csv}]", PlanOptions(output=Path("/out.xlsx")))
 
-    with pytest.raises(ConfigurationError, match=r"--output /out\.xlsx: '/out.xlsx', a format that is not written"):
+    with pytest.raises(ConfigurationError, match=r"`output='/out\.xlsx'`: '/out.xlsx', a format that is not written"):
         build(loaded, DESCRIPTIONS, findings)
 
 
 def test_of_what_stays_in_memory_there_is_one() -> None:
-    loaded, findings = examined("record: [{file: a.csv, variables: [delay.y]}, {file: b.csv}]")
-    loaded = with_options(loaded, Options(output=Path("/run/rows.arrays")), findings)
+    loaded, findings = examined(
+        "record: [{file: a.csv, variables: [delay.y]}, {file: b.csv}]", PlanOptions(output="/run/rows.arrays")
+    )
 
     assert [own.variables for own in build(loaded, DESCRIPTIONS, findings).records] == [(("delay", "y"),)]
 
@@ -289,8 +289,9 @@ def test_a_chosen_list_is_recorded_as_it_is() -> None:
 
 @pytest.mark.parametrize("output", [None, Path("/out.csv")])
 def test_a_named_file_without_columns_is_a_finding(output: Path | None) -> None:
-    loaded, findings = examined("record: {file: a.csv}" if output is None else "record: {variables: []}")
-    loaded = with_options(loaded, Options(output=output), findings)
+    loaded, findings = examined(
+        "record: {file: a.csv}" if output is None else "record: {variables: []}", PlanOptions(output=output)
+    )
     nothing = without_outputs(0)
 
     with pytest.raises(ConfigurationError, match="into which nothing is recorded; expected variables in"):
@@ -310,11 +311,10 @@ def test_a_file_that_nobody_named_and_that_gets_nothing_is_a_warning(record: str
 
 
 def test_what_stays_in_memory_may_be_nothing() -> None:
-    loaded, findings = examined("record: {variables: []}")
-    loaded = with_options(loaded, Options(output=Path("/run/rows.arrays")), findings)
+    loaded, findings = examined("record: {variables: []}", PlanOptions(output="/run/rows.arrays"))
 
     assert build(loaded, DESCRIPTIONS, findings).records == ()
 
 
-def examined(rest: str) -> tuple[LoadedConfig, Findings]:
-    return examine_data(read_text(text(rest=rest), FILE))
+def examined(rest: str, options: PlanOptions | None = None) -> tuple[LoadedConfig, Findings]:
+    return examine_data(with_options(read_text(text(rest=rest), FILE), options or PlanOptions()))

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
 from fmu_mesh.instances.fmi import Terms, open_instance, read_description, sha256_of
-from fmu_mesh.run.options import Options
+from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import plan_run
 from fmu_mesh.run.run_plan import RunPlan, read_node, read_run
 from tests.helpers import FMUS
@@ -20,7 +20,7 @@ CONFIGS = FMUS.parent / "configs"
 
 @pytest.fixture
 def run() -> RunPlan:
-    return plan_run(CONFIGS / "pendulum_delay.yaml", Options(window=64, output=Path("/tmp/other.csv")))  # noqa: S108 nothing is written there
+    return plan_run(CONFIGS / "pendulum_delay.yaml", PlanOptions(window=64, output=Path("/tmp/other.csv")))  # noqa: S108 nothing is written there
 
 
 def test_what_is_read_is_what_was_written(run: RunPlan, tmp_path: Path) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fmu_mesh.config.loading import read_file
+from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.instances.configuration import examine, parse
+from fmu_mesh.instances.configuration import examine_data, parse
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.system import ResolvedSystem, build
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
@@ -86,13 +89,13 @@ connections: [{connections}]
 """
 
 
-def built(config: str, *overrides: str) -> ResolvedSystem:
-    return build(parse(config, FILE, overrides), DESCRIPTIONS)
+def built(config: str, **start_values: Any) -> ResolvedSystem:  # noqa: ANN401 as a file has them
+    return build(parse(config, FILE, start_values), DESCRIPTIONS)
 
 
-def findings_of(config: str, *overrides: str) -> list[str]:
+def findings_of(config: str, **start_values: Any) -> list[str]:  # noqa: ANN401 as a file has them
     with pytest.raises(ConfigurationError) as caught:
-        built(config, *overrides)
+        built(config, **start_values)
     return [str(finding).removeprefix(f"{FILE}:") for finding in caught.value.findings]
 
 
@@ -205,7 +208,7 @@ def test_an_own_step_size_is_a_multiple_of_the_base_step_size(step: str, expecte
     ],
 )
 def test_a_start_value_takes_the_type_of_its_variable(name: str, value: str, converted: Value) -> None:
-    start_values = built(text(), f"pendulum.{name}={value}").instances["pendulum"].start_values
+    start_values = built(text(), **{f"pendulum.{name}": resolve(value)}).instances["pendulum"].start_values
     assert start_values == {name: converted}
     assert type(start_values[name]) is type(converted)
 
@@ -242,10 +245,13 @@ def test_a_wrong_start_value_is_told_with_its_place(values: str, expected: str) 
 
 
 def test_a_wrong_start_value_of_an_option_is_told_by_the_option() -> None:
-    found = findings_of(text(pendulum="fmu: p.fmu, start_values: {l: 1}"), "pendulum.l=long", "delay.z=1")
+    found = findings_of(text(pendulum="fmu: p.fmu, start_values: {l: 1}"), **{"pendulum.l": "long", "delay.z": 1})
     assert found == [
-        " --set pendulum.l=long: 'long' for the Real 'l'; expected a number",
-        " --set delay.z=1: the unknown variable 'z' of instance 'delay'; expected one of x, body[1].u, i, b, e, s",
+        " `start_values={'pendulum.l': 'long'}`: 'long' for the Real 'l'; expected a number",
+        (
+            " `start_values={'delay.z': 1}`: the unknown variable 'z' of instance 'delay'; "
+            "expected one of x, body[1].u, i, b, e, s"
+        ),
     ]
 
 
@@ -577,7 +583,7 @@ connections:
 record: {variables: [3, pendulum.a]}
 """
     )
-    loaded, findings = examine(file, ["pendulum.n=1.5", "delay.q={}"])
+    loaded, findings = examine_data(read_file(file), {"pendulum.n": 1.5, "delay.q": {}})
     with pytest.raises(ConfigurationError) as caught:
         build(loaded, {"pendulum": SOURCE}, findings)
     assert [(finding.line, finding.path) for finding in caught.value.findings] == [
@@ -597,8 +603,8 @@ record: {variables: [3, pendulum.a]}
         (10, "connections[3].from"),
         (10, "connections[3].to"),
         (11, "record.variables[0]"),
-        (None, "--set delay.q={}"),
-        (None, "--set pendulum.n=1.5"),
+        (None, "`start_values={'delay.q': {}}`"),
+        (None, "`start_values={'pendulum.n': 1.5}`"),
     ]
 
 

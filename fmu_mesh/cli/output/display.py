@@ -23,6 +23,7 @@ from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
+from .flag_words import in_flags
 from .progress import RunProgressLine
 from .terminal import error_console
 
@@ -187,7 +188,7 @@ class Display:
 
 def say(text: str) -> None:
     """Print one line on standard error before a run."""
-    print(f"fmu-mesh: {paragraph(text)}", file=sys.stderr, flush=True)
+    print(f"fmu-mesh: {paragraph(in_flags(text))}", file=sys.stderr, flush=True)
 
 
 def teller(*, quiet: bool) -> Callable[[str], None]:

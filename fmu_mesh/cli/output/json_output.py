@@ -6,6 +6,7 @@ import msgspec
 
 from ...errors import ConfigurationError, ErrorReport, Finding, FmuMeshError, Interrupted
 from ...printing import write_data
+from .flag_words import in_flags
 
 __all__ = ["Failure", "failure_of", "print_failure", "print_json"]
 
@@ -22,6 +23,7 @@ def failure_of(error: BaseException) -> Failure:
         error = Interrupted("interrupted")
     if not isinstance(error, FmuMeshError):
         return Failure(type(error).__name__, str(error), FmuMeshError.exit_code)
+    error = error.in_words(in_flags)
     findings = error.findings if isinstance(error, ConfigurationError) else ()
     return Failure(**msgspec.structs.asdict(error.report()), findings=findings)
 

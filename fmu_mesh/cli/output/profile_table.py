@@ -26,14 +26,14 @@ _LITTLE = 0.1
 """Shares of the time below this one are ignored."""
 
 
-def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path) -> None:
-    """Print the table of a run that took ``seconds``, and write the trace file unless it is `Path()`.
+def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path | None) -> None:
+    """Print the table of a run that took ``seconds``, and write the trace file if there is one.
 
     Raises:
         ConfigurationError: the file cannot be written.
     """
     print(page(profile_page(plan, profile)))
-    if file == Path():
+    if file is None:
         return
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
