@@ -23,7 +23,7 @@ from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, ta
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
-from ..text import listed, shown
+from ..text import listed, option_text, shown
 from .mesh_check import Check
 from .plan_options import memory_file, with_record
 from .rebasing import rebased
@@ -107,6 +107,9 @@ class Mesh:
     @classmethod
     def from_file(cls, path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> Self:
         """As `load`."""
+        if not isinstance(path, str | Path):
+            hint = "A mesh from values is `Mesh.from_configuration`, and from text `Mesh.from_yaml`."
+            raise CallRefused(f"{option_text('path', path)}: expected str | Path", hint=hint)
         return cls.from_configuration(read_configuration(Path(path), ssd, ssv))
 
     @classmethod

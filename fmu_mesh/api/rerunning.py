@@ -8,7 +8,7 @@ every float is the same as before, however long each process takes.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -117,32 +117,25 @@ def rerun(result: str | Path, options: RerunOptions) -> Result:
         ConfigurationError: the file does not say how it was made, or a model has changed; names each.
         FmuMeshError: the run ended early, and not where the first one has.
     """
-    given = options.given()
-    how = {name: given.pop(name) for name in StartOptions.__struct_fields__ if name in given}
-    return planned_rerun(result, **given).run(**how)
+    how = {name: value for name, value in options.given().items() if name in StartOptions.__struct_fields__}
+    return planned_rerun(result, **options.given()).run(**how)
 
 
-def planned_rerun(
-    result: str | Path,
-    *,
-    output: str | Path | None = None,
-    allow_code: bool = False,
-    on_notice: Callable[[str], None] = log.info,
-) -> PlannedRerun:
+@takes(RerunOptions)
+def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     """Plan a rerun; the arguments and errors are those of `rerun`.
 
     Args:
         result: the result file.
-        output: the new result file.
-        allow_code: run the Python code that the file names; also, run it although another user owns the file.
-        on_notice: called with a sentence about what may make a difference, such as another version of fmu_mesh.
+        options: see `RerunOptions`.
     """
+    allow_code, on_notice = options.allow_code, options.on_notice or log.info
     path = Path(result)
     first = Result.read(path)
     metadata, values = _metadata_of(path, first)
     if not allow_code:
         check_owner(path, f"'{path}'")
-    output = Path(output) if output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
+    output = Path(options.output) if options.output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
     if output.absolute() == path.absolute():
         raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with `output=...`.")
     data = {**metadata.configuration, **_ALONE}

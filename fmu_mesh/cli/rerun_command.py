@@ -12,10 +12,11 @@ from ..api.rerunning import planned_rerun
 from ..api.result import Result
 from ..api.run_handle import Run
 from ..errors import FmuMeshError
+from ..run.options import RerunOptions
 from .arguments import CommandParser, Parsers, add_json
-from .output.display import Display, summary, teller, warn
+from .output.display import Display, summary, warn
 from .output.reports import RunReporter
-from .run_options import add_options
+from .run_options import add_options, given_options
 from .running import add_output, interrupted_by_signals, show_event
 
 __all__ = ["PARSERS"]
@@ -31,12 +32,7 @@ def _add_rerun(parser: CommandParser) -> None:
 
 def _rerun(arguments: argparse.Namespace) -> int:
     with RunReporter(wanted=arguments.json) as reporter:
-        again = planned_rerun(
-            arguments.result,
-            output=arguments.output,
-            allow_code=bool(arguments.allow_code),
-            on_notice=teller(quiet=arguments.quiet),
-        )
+        again = planned_rerun(arguments.result, **given_options(arguments, RerunOptions))
         reporter.planned(again.plan)
         plan = again.plan.plan
         if not arguments.quiet:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,22 +65,24 @@ def add_options(
         field = option_fields(options)[name]
         default = (defaults or {}).get(name)
         text = (
-            field.text.removeprefix("False: ")
+            field.line.removeprefix("False: ")
             + ("; repeatable" if field.repeatable else "")
             + (f"; default: {default}" if default else "")
         )
-        flag = field.option.flag or ""
+        flag = field.flag or ""
         details: dict[str, Any] = {"dest": name, "help": text.replace("%", "%%"), "default": None}
         if field.kinds == (bool,):
-            action = "store_false" if field.default else "store_true"
+            action = "store_false" if field.parameter.default else "store_true"
             parser.add_argument(flag, action=action, **details)
             continue
-        reader = _READERS.get(name) or next((_OF_TYPE[kind] for kind in field.kinds if kind in _OF_TYPE), str)
-        details |= {"metavar": (metavars or {}).get(name, field.option.metavar), "type": reader}
+        metavar = (metavars or {}).get(name, field.metavar)
+        of_type = (_OF_TYPE[kind] for kind in field.kinds if kind in _OF_TYPE)
+        reader = partial(_value, expected=metavar) if field.named else _READERS.get(name) or next(of_type, str)
+        details |= {"metavar": metavar, "type": reader}
         if field.repeatable:
             details |= {"action": "append"}
-        if field.option.bare is not None:
-            details |= {"nargs": "?", "const": field.option.bare}
+        if field.bare is not None:
+            details |= {"nargs": "?", "const": field.bare}
         parser.add_argument(flag, **details)
 
 
@@ -110,19 +113,16 @@ def _window(text: str) -> int | Literal["auto"]:
     return value
 
 
-def _value(text: str) -> tuple[str, Plain]:
+def _value(text: str, *, expected: str | None) -> tuple[str, Plain]:
     try:
         return read_value(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{error}; expected NAME=VALUE") from error
+        raise argparse.ArgumentTypeError(f"{error}; expected {expected}") from error
 
 
 _READERS: Mapping[str, Callable[[str], object]] = {
     "window": _window,
     "profile": _trace_file,
-    "start_values": _value,
-    "config_values": _value,
-    "max_instances": _value,
     "listen": endpoint,
     "connect": endpoint,
     "restarts": count,

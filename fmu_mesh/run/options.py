@@ -19,10 +19,8 @@ from typing import (
     Concatenate,
     Generic,
     Literal,
-    NamedTuple,
     ParamSpec,
     TypeVar,
-    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -30,15 +28,13 @@ from typing import (
 )
 
 import msgspec
-from msgspec.structs import force_setattr
+from msgspec.structs import force_setattr, replace
 
-from ..config.plain_values import NOTHING, in_words, kinds_of, taken
+from ..config.plain_values import kinds_of, taken
 from ..errors import CallRefused
 from ..text import listed, nearest, option_text
 
 if TYPE_CHECKING:
-    from ..config.yaml_text import Plain
-    from ..instances.contract import Showing
     from ..wire.views import MeshStatus
     from .events import Event
 
@@ -46,7 +42,6 @@ __all__ = [
     "CallOptions",
     "OpenOptions",
     "Option",
-    "OptionField",
     "PlanOptions",
     "RerunOptions",
     "RunOptions",
@@ -63,8 +58,8 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 
-class Option(NamedTuple):
-    """What an option is besides its name, its type and its default.
+class Option(msgspec.Struct, frozen=True):
+    """An option: what its field says beside its type, and what follows from the field.
 
     Attributes:
         text: one line about it; None: the description of its key.
@@ -73,47 +68,69 @@ class Option(NamedTuple):
         key: key of the configuration that it replaces.
         bare: its value where the flag is given without one; None if it needs a value.
         least: its smallest value, where no key says it.
+        parameter: it as a parameter of a call.
+        kinds: the types that it takes.
     """
 
     text: str | None = None
     flag: str | None = None
     metavar: str | None = None
     key: str | None = None
-    bare: object = None
+    bare: Any = None
     least: int | None = None
+    parameter: Parameter = Parameter("_", Parameter.KEYWORD_ONLY)
+    kinds: tuple[Any, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """One line about it."""
+        return self.text or _description(self.key or "")
+
+    @property
+    def named(self) -> bool:
+        """Whether it has values by name: its flag takes one of them."""
+        return any(get_origin(kind) is Iterable for kind in self.kinds)
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether its flag may be given more than once."""
+        return self.named or any(get_origin(kind) is Sequence for kind in self.kinds)
+
+    def taken(self, value: object) -> Any:  # noqa: ANN401  of one of its types
+        """A value that was given for it.
+
+        Raises:
+            CallRefused: it is of another type.
+        """
+        words = [word for kind in self.kinds for word in get_args(kind) if get_origin(kind) is Literal]
+        try:
+            own = taken(value, self.kinds)
+            if self.least is None or own is None or own >= self.least:
+                return own
+        except (TypeError, ValueError, LookupError):
+            pass
+        near = nearest(value, words) if isinstance(value, str) else None
+        expected = re.sub(r"Literal\[(.*?)\]", r"\1", self.parameter.annotation)
+        expected += f" from {self.least} on" if self.least is not None else ""
+        hint = f"Did you mean {option_text(self.parameter.name, near)}?" if near else None
+        raise CallRefused(f"{option_text(self.parameter.name, value)}: expected {expected}", hint=hint)
 
 
-AllowCode = Annotated[
-    bool, Option("run Python code that a file of others names, or that others can write", "--allow-code")
-]
-OnNotice = Annotated[
-    Callable[[str], None] | None,
-    Option("called with a sentence before something that takes long, such as compiling an FMU; None: the log gets it"),
-]
-Output = Annotated[
-    str | Path | None, Option("result file; its ending chooses the format", "--output", "FILE", "record.file")
-]
-StartValues = Annotated[
-    Mapping[str, Any] | Iterable[Any] | None,
-    Option("start values by `instance.variable`", "--set", "INSTANCE.VARIABLE=VALUE"),
-]
+Values = Mapping[str, Any] | Iterable[Any] | None
+File = str | Path | None
+Number = float | None
+
+AllowCode = Annotated[bool, Option("run Python code that a file of others names, or others can write", "--allow-code")]
+OnNotice = Annotated[Callable[[str], None] | None, Option("called with a sentence before something that takes long")]
+Output = Annotated[File, Option("result file; its ending chooses the format", "--output", "FILE", "record.file")]
+StartValues = Annotated[Values, Option("start values by `instance.variable`", "--set", "INSTANCE.VARIABLE=VALUE")]
 Processes = Annotated[bool, Option("False: run everything in this one process", "--local")]
-MemoryLimit = Annotated[
-    int, Option("the most bytes of results in memory; a run that needs more is refused, or ends there", least=0)
-]
+MemoryLimit = Annotated[int, Option("the most bytes of results in memory; a run ends there, or is refused", least=0)]
 Restarts = Annotated[
-    int,
-    Option(
-        "restart from the first point when a node or the master is lost, at most so often", "--restarts", "N", least=0
-    ),
+    int, Option("restart from the first point when a process is lost, at most N times", "--restarts", "N", least=0)
 ]
-OnProgress = Annotated[
-    Callable[["MeshStatus"], object] | None, Option("called with a `MeshStatus` about ten times per second")
-]
-OnEvent = Annotated[
-    Callable[["Event"], object] | None,
-    Option("called with every event of `fmu_mesh.run.events`; without it, the log gets messages of FMUs"),
-]
+OnProgress = Annotated[Callable[["MeshStatus"], object] | None, Option("called about ten times per second")]
+OnEvent = Annotated[Callable[["Event"], object] | None, Option("called with every event of `fmu_mesh.run.events`")]
 MEMORY_LIMIT = 2**30
 
 
@@ -126,39 +143,26 @@ class CallOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         for name, field in option_fields(type(self)).items():
-            if (value := getattr(self, name)) is not field.default:
+            if (value := getattr(self, name)) is not field.parameter.default:
                 force_setattr(self, name, field.taken(value))
 
     def given(self) -> dict[str, Any]:
         """The options that have another value than their default."""
         fields = option_fields(type(self))
-        return {name: value for name in fields if (value := getattr(self, name)) != fields[name].default}
+        return {name: value for name in fields if (value := getattr(self, name)) != fields[name].parameter.default}
 
 
 class VariantOptions(CallOptions, frozen=True, kw_only=True):
     """What any run takes, also each run of a sweep; None leaves what the configuration says."""
 
     algorithm: Annotated[str | None, Option(None, "--algorithm", "NAME", "simulation.algorithm")] = None
-    step_size: Annotated[float | None, Option(None, "--step-size", "S", "simulation.step_size")] = None
-    stop_time: Annotated[float | None, Option(None, "--stop-time", "S", "simulation.stop_time")] = None
+    step_size: Annotated[Number, Option(None, "--step-size", "S", "simulation.step_size")] = None
+    stop_time: Annotated[Number, Option(None, "--stop-time", "S", "simulation.stop_time")] = None
     window: Annotated[int | Literal["auto"] | None, Option(None, "--window", "N", "simulation.window")] = None
     start_values: StartValues = None
-    config_values: Annotated[
-        Mapping[str, Any] | Iterable[Any] | None,
-        Option("values of any keys by their path, such as simulation.window", "--set-config", "KEY=VALUE"),
-    ] = None
+    config_values: Annotated[Values, Option("values of any keys by their path", "--set-config", "KEY=VALUE")] = None
     allow_code: AllowCode = False
     on_notice: OnNotice = None
-
-    @property
-    def starts(self) -> "dict[str, Plain]":
-        """The start values by `instance.variable`, as a file has them."""
-        return dict(cast("Mapping[str, Plain]", self.start_values or {}))
-
-    @property
-    def keys(self) -> "dict[str, Plain]":
-        """The values of keys by their path, as a file has them."""
-        return dict(cast("Mapping[str, Plain]", self.config_values or {}))
 
 
 class OpenOptions(VariantOptions, frozen=True):
@@ -175,56 +179,33 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
         {'window': 1, 'start_values': {'gain.k': 2.5}}
     """
 
-    real_time_factor: Annotated[
-        float | None, Option(None, "--real-time-factor", "F", "simulation.real_time_factor")
-    ] = None
-    update_period: Annotated[float | None, Option(None, "--update-period", "S", "simulation.update_period")] = None
-    catch_up: Annotated[float | None, Option(None, "--catch-up", "S", "simulation.catch_up")] = None
+    real_time_factor: Annotated[Number, Option(None, "--real-time-factor", "F", "simulation.real_time_factor")] = None
+    update_period: Annotated[Number, Option(None, "--update-period", "S", "simulation.update_period")] = None
+    catch_up: Annotated[Number, Option(None, "--catch-up", "S", "simulation.catch_up")] = None
     record: Annotated[
         Literal["memory"] | Sequence[str] | None,
         Option(
-            'variables to record, in the place of those of the configuration, or "memory": those of the configuration; '
-            "the result has them as arrays, and there is no file unless `output` names one"
+            'variables that are recorded, or "memory" for those of the configuration: as arrays, unless `output` is'
         ),
     ] = None
     output: Output = None
     scenario: Annotated[
-        str | Path | Mapping[str, Any] | None,
-        Option(
-            "values of inputs and parameters over time: a file, or a mapping as in such a file", "--scenario", "FILE"
-        ),
+        File | Mapping[str, Any], Option("values over time: a file, or what such a file has", "--scenario", "FILE")
     ] = None
     listen: Annotated[Sequence[str] | None, Option(None, "--listen", "ENDPOINT", "zenoh.listen")] = None
     connect: Annotated[Sequence[str] | None, Option(None, "--connect", "ENDPOINT", "zenoh.connect")] = None
-    paused: Annotated[bool, Option("stay paused at the first point until `resume`, `step` or `play`", "--paused")] = (
-        False
-    )
+    paused: Annotated[bool, Option("stay paused at the first point", "--paused")] = False
     view: Annotated[bool, Option("show the world of the physics engine in a window", "--view")] = False
-    video: Annotated[
-        str | Path | None,
-        Option("film that world into a file, .mp4 or .gif; needs no screen", "--video", "FILE.mp4"),
-    ] = None
+    video: Annotated[File, Option("film that world into a file, .mp4 or .gif", "--video", "FILE.mp4")] = None
     profile: Annotated[
         bool | str | Path,
-        Option(
-            "show where the time went; with a file, also write a trace for Perfetto",
-            "--profile",
-            "FILE.json",
-            bare=True,
-        ),
+        Option("show where the time went; also a trace for Perfetto in a file", "--profile", "FILE.json", bare=True),
     ] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.record == "memory" and self.output is not None:
             raise CallRefused('`output` and `record="memory"` exclude each other', hint="Leave one of them out.")
-
-    @property
-    def showing(self) -> "Showing":
-        """Whether and how a physics engine shows its world."""
-        from ..instances.contract import Showing  # noqa: PLC0415  slow to import, and only for a plan
-
-        return Showing(view=self.view, video=Path(self.video).absolute() if self.video is not None else None)
 
 
 class StartOptions(CallOptions, frozen=True, kw_only=True):
@@ -307,57 +288,13 @@ class takes(Generic[P, O]):  # noqa: N801  a decorator
         parameters = [*own, *(field.parameter for field in fields.values())]
         shown = signature(call).replace(parameters=parameters)
         checked.__signature__ = shown  # type: ignore[attr-defined]  # which the type of a function does not have
-        lines = [f"\\1{field.name}: {field.text}\n" for field in fields.values()]
+        lines = [f"\\1{name}: {field.line}\n" for name, field in fields.items()]
         checked.__doc__ = re.sub(r"(?m)^( +)options: .*\n", "".join(lines), call.__doc__ or "")
         return checked
 
 
-class OptionField(NamedTuple):
-    """One option.
-
-    Attributes:
-        name: that of its field.
-        kinds: the types that it takes.
-        default: its value where it is not given.
-        parameter: it as a parameter of a call.
-        option: what else there is to say about it.
-    """
-
-    name: str
-    kinds: tuple[Any, ...]
-    default: Any
-    parameter: Parameter
-    option: Option
-
-    @property
-    def text(self) -> str:
-        """One line about it."""
-        return self.option.text or _description(self.option.key or "")
-
-    @property
-    def repeatable(self) -> bool:
-        """Whether its flag may be given more than once."""
-        return not {Mapping, Sequence}.isdisjoint(map(get_origin, self.kinds)) and Path not in self.kinds
-
-    def taken(self, value: object) -> Any:  # noqa: ANN401  of one of its types
-        """A value that was given for it.
-
-        Raises:
-            CallRefused: it is of another type.
-        """
-        own, least = taken(value, self.kinds), self.option.least
-        if own is NOTHING or (least is not None and own is not None and own < least):
-            words = [word for kind in self.kinds for word in get_args(kind) if get_origin(kind) is Literal]
-            near = nearest(value, words) if isinstance(value, str) else None
-            expected = " or ".join(dict.fromkeys(map(in_words, self.kinds)))
-            expected += f" from {least} on" if least is not None else ""
-            hint = f"Did you mean {option_text(self.name, near)}?" if near else None
-            raise CallRefused(f"{option_text(self.name, value)}: expected {expected}", hint=hint)
-        return own
-
-
 @cache
-def option_fields(options: type[CallOptions]) -> dict[str, OptionField]:
+def option_fields(options: type[CallOptions]) -> dict[str, Option]:
     """The options of a Struct, by name."""
     annotations = {
         name: one
@@ -367,11 +304,11 @@ def option_fields(options: type[CallOptions]) -> dict[str, OptionField]:
     fields = {}
     for name, default in zip(options.__struct_fields__, options.__struct_defaults__, strict=True):
         kind, option = annotations[name].__origin__, annotations[name].__metadata__[0]
-        kinds = kinds_of(kind)
-        text = " | ".join("None" if one is NoneType else inspect.formatannotation(one) for one in kinds)
+        text = " | ".join("None" if one is NoneType else inspect.formatannotation(one) for one in kinds_of(kind))
         text = re.sub(r"\b(?:[a-z_]+\.)+(?=[A-Z])|'(?=MeshStatus|Event|\], object)", "", text)
         by = Parameter.POSITIONAL_OR_KEYWORD if name in options.__match_args__ else Parameter.KEYWORD_ONLY
-        fields[name] = OptionField(name, kinds, default, Parameter(name, by, default=default, annotation=text), option)
+        parameter = Parameter(name, by, default=default, annotation=text)
+        fields[name] = replace(option, parameter=parameter, kinds=kinds_of(kind))
     return fields
 
 

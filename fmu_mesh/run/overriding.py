@@ -5,7 +5,7 @@ Owns the place in the configuration of each option, and how a finding names the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,77 +27,64 @@ def with_options(plain: PlainConfig, options: PlanOptions) -> PlainConfig:
     Example:
         >>> from pathlib import Path
         >>> plain = PlainConfig({"mesh": "m"}, Path("m.ssp"), needed={"simulation.step_size": "`step_size`"})
-        >>> with_options(plain, PlanOptions(step_size=0.1)).data
-        {'mesh': 'm', 'simulation': {'step_size': 0.1}}
+        >>> with_options(plain, PlanOptions(step_size=0.1, config_values={"zenoh.mode": "peer"})).data
+        {'mesh': 'm', 'zenoh': {'mode': 'peer'}, 'simulation': {'step_size': 0.1}}
         >>> print(*with_options(plain, PlanOptions()).findings)
         m.ssp: simulation.step_size: the package gives none; expected `step_size`
     """
-    plain = _with_config_values(plain, options.keys)
+    if not isinstance(data := plain.data, dict):
+        return plain
     findings = Findings(str(plain.file), plain.lines, overrides := {**plain.overrides}, plain.findings, plain.origins)
     findings.explain(plain.explained)
-    data, lines = plain.data, plain.lines
+    lines = plain.lines
     for name, path, value in _replacements(options):
-        option, keys, place = option_text(name, getattr(options, name)), path.split("."), path
-        if isinstance(data, dict) and keys[0] == "record" and isinstance(records := data.get("record"), list):
+        named, keys, records = name == "config_values", path.split("."), data.get("record")
+        option, place = option_text(name, {path: value} if named else getattr(options, name)), path
+        if keys[0] == "record" and isinstance(records, list) and not named:
             place, data = f"record[0].{keys[1]}", {**data, "record": _with_record(records, keys[1], value)}
-        elif isinstance(data, dict) and _obstacle(data, keys) is None:
-            data = _replaced(data, keys, value)
+        elif (problem := _problem(data, path, value)) is not None:
+            if named:  # what is wrong with a whole section, the check of the file says
+                findings.add(option, *problem)
+            continue
         else:
-            continue  # the section is wrong, as the check of the whole says
-        if isinstance(value, dict):  # its findings say where in it
-            lines = {line: number for line, number in lines.items() if line.partition(".")[0] != keys[0]}
+            data = _replaced(data, keys, value)
+        if isinstance(value, dict) and not named:  # a scenario, whose findings say where in it
+            lines = {line: number for line, number in lines.items() if line.partition(".")[0] != path}
             continue
         if place in overrides:
             findings.add(place, f"replaced by `{name}=...` as well", "one of the two options")
         overrides[place] = option
-    for key, option in plain.needed.items():
-        if _is_absent(data, key):
-            findings.add(key, "the package gives none", option)
+    for path, option in plain.needed.items():
+        section, key = path.split(".")
+        if isinstance(inner := data.get(section, {}), dict) and key not in inner:
+            findings.add(path, "the package gives none", option)
     return plain._replace(data=data, lines=lines, findings=tuple(findings), overrides=overrides)
 
 
-def _with_config_values(plain: PlainConfig, config_values: Mapping[str, Any]) -> PlainConfig:
-    """The values of a configuration with keys replaced by the option `config_values`; they are checked with the others.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from fmu_mesh.config.loading import read_text
-        >>> plain = read_text("simulation: {step_size: 0.1}", Path("mesh.yaml"))
-        >>> _with_config_values(plain, {"simulation.window": 16, "zenoh": {"mode": "client"}}).data
-        {'simulation': {'step_size': 0.1, 'window': 16}, 'zenoh': {'mode': 'client'}}
-
-    Args:
-        plain: the values of the file.
-        config_values: values by the path of a key in the file.
-    """
-    findings = Findings(str(plain.file))
-    data, overrides = plain.data, dict(plain.overrides)
-    for path, value in config_values.items():
-        option, keys = option_text("config_values", {path: value}), path.split(".")
-        if not all(keys):
-            findings.add(option, "no path of a key", "one such as simulation.window")
-        elif "[" in path:
-            findings.add(option, "a key inside a list", f"a value for the whole list {path.partition('[')[0]}")
-        elif keys[2:3] == ["start_values"]:
-            expected = option_text("start_values", {".".join((keys[1], *keys[3:])): value})
-            findings.add(option, "a start value", expected)
-        elif (problem := _obstacle(data, keys)) is not None:
-            findings.add(option, *problem)
-        else:
-            data = _replaced(data, keys, value)
-            overrides[path] = option
-    return plain._replace(data=data, findings=(*plain.findings, *findings), overrides=overrides)
+def _replacements(options: PlanOptions) -> Iterator[tuple[str, str, Any]]:
+    """Name, key and value of each option that replaces a key."""
+    for path, value in dict(options.config_values or {}).items():
+        yield "config_values", path, value
+    keys = {name: field.key for name, field in option_fields(PlanOptions).items() if field.key is not None}
+    for name, key in {"scenario": "scenario", "record": "record.variables", **keys}.items():
+        value = getattr(options, name)
+        if value is not None and (name, value) != ("record", "memory"):
+            yield name, key, str(value.absolute()) if isinstance(value, Path) else _as_list(value)
 
 
-def _is_absent(data: Plain, key: str) -> bool:
-    """Whether a key of a section is not there; false if the section is no mapping, which is another error."""
-    section, _, name = key.partition(".")
-    inner = data.get(section, {}) if isinstance(data, dict) else None
-    return isinstance(inner, dict) and name not in inner
+def _as_list(value: Any) -> Any:  # noqa: ANN401  any value of an option
+    return list(value) if isinstance(value, tuple) else value
 
 
-def _obstacle(data: Plain, keys: Sequence[str]) -> tuple[str, str, str | None] | None:
+def _problem(data: Plain, path: str, value: Plain) -> tuple[str, str, str | None] | None:
     """Why a key cannot be replaced: what was found, what was expected, and the nearest name."""
+    keys = path.split(".")
+    if not all(keys):
+        return "no path of a key", "one such as simulation.window", None
+    if "[" in path:
+        return "a key inside a list", f"a value for the whole list {path.partition('[')[0]}", None
+    if keys[2:3] == ["start_values"]:
+        return "a start value", option_text("start_values", {".".join((keys[1], *keys[3:])): value}), None
     for depth, key in enumerate(keys):
         if not isinstance(data, dict | None):
             where = ".".join(keys[:depth])
@@ -109,27 +96,12 @@ def _obstacle(data: Plain, keys: Sequence[str]) -> tuple[str, str, str | None] |
     return None
 
 
-def _replaced(data: Plain, keys: Sequence[str], value: Plain) -> Plain:
+def _replaced(data: Plain, keys: Sequence[str], value: Plain) -> Any:  # noqa: ANN401  a mapping, if there are keys
     """Nested mappings with another value of one key; mappings on the way are made where there are none."""
     if not keys:
         return value
     section = data if isinstance(data, dict) else {}
     return {**section, keys[0]: _replaced(section.get(keys[0]), keys[1:], value)}
-
-
-def _replacements(options: PlanOptions) -> Iterator[tuple[str, str, Any]]:
-    """Name, key and value of each option that replaces a key."""
-    if options.scenario is not None:
-        yield "scenario", "scenario", _written(options.scenario)
-    if options.record not in (None, "memory"):
-        yield "record", "record.variables", _written(options.record)
-    for name, field in option_fields(PlanOptions).items():
-        if field.option.key is not None and (value := getattr(options, name)) is not None:
-            yield name, field.option.key, _written(value)
-
-
-def _written(value: Any) -> Any:  # noqa: ANN401  any value of an option
-    return str(value.absolute()) if isinstance(value, Path) else [*value] if isinstance(value, tuple) else value
 
 
 def _with_record(records: list[Plain], key: str, value: Plain) -> list[Plain]:

@@ -19,6 +19,7 @@ from ..config.loading import LoadedConfig, PlainConfig, read_scenario
 from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
+from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, claims, content, describe, expected_model
 from ..ros.bags.scenario_bags import bag_values
@@ -149,11 +150,12 @@ def planned(
     Raises:
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
-    loaded, findings = examine_data(with_options(values, options), options.starts)
+    loaded, findings = examine_data(with_options(values, options), dict(options.start_values or {}))
     loaded = _located(loaded)
+    showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
     check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
     if not len(findings):  # otherwise the world may be what is wrong
-        check_showing(loaded.config.instances, options.showing)
+        check_showing(loaded.config.instances, showing)
     known = known or KnownModels()
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
@@ -177,7 +179,7 @@ def planned(
         loaded,
         plan,
         contents,
-        showing=options.showing,
+        showing=showing,
         paused=options.paused,
         profile=options.profile is not False,
         connect=tuple(options.connect or ()),

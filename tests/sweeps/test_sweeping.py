@@ -251,7 +251,7 @@ def test_an_executor_that_is_broken_ends_the_sweep_and_keeps_the_rows(config: Pa
 
     assert isinstance(raised.value.result, fmu_mesh.SweepResult)
     assert 2 < len(raised.value.result) < 200
-    assert "`--resume`" in str(raised.value)
+    assert "`resume=True`" in str(raised.value)
 
 
 def test_resume_runs_what_is_missing_and_the_table_is_the_same(config: Path, tmp_path: Path) -> None:
@@ -299,7 +299,7 @@ def test_a_sweep_is_not_mixed_up_with_another_one(config: Path, tmp_path: Path) 
 
     with pytest.raises(fmu_mesh.ConfigurationError, match=r"there is a sweep in .* already") as raised:
         fmu_mesh.sweep(config, {"pendulum.d": [0.1]}, folder=tmp_path / "sweep")
-    assert "`--resume`" in str(raised.value)
+    assert "`resume=True`" in str(raised.value)
     with fmu_mesh.sweep(config, {"pendulum.d": [0.2]}, folder=tmp_path / "sweep", resume=True) as running:
         result = running.wait(DEADLINE_S)
     assert [row.parameters["pendulum.d"] for row in result] == [0.2]

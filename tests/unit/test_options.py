@@ -60,10 +60,10 @@ def read(*arguments: str) -> PlanOptions:
     return PlanOptions(**{name: value for name, value in given.items() if name != "on_notice"})
 
 
-@pytest.mark.parametrize("name", [name for name, field in option_fields(PlanOptions).items() if field.option.flag])
+@pytest.mark.parametrize("name", [name for name, field in option_fields(PlanOptions).items() if field.flag])
 def test_what_a_flag_is_given_is_the_value_of_its_option(name: str) -> None:
     text, value = GIVEN[name]
-    flag = option_fields(PlanOptions)[name].option.flag or ""
+    flag = option_fields(PlanOptions)[name].flag or ""
 
     assert read(*([flag] if text is None else [flag, text])).given() == {name: value}
 
@@ -82,12 +82,12 @@ def test_the_help_of_a_flag_is_the_description_of_its_key() -> None:
     assert isinstance(definitions, dict)
     sections = {"simulation": "SimulationConfig", "zenoh": "ZenohConfig", "record": "RecordConfig"}
     for field in option_fields(PlanOptions).values():
-        if field.option.key is None or field.option.text is not None:
+        if field.key is None or field.text is not None:
             continue
-        section, _, key = field.option.key.partition(".")
+        section, _, key = field.key.partition(".")
         description = definitions[sections[section]]["properties"][key]["description"]
-        assert description[1:].startswith(field.text[1:])
-        assert description[len(field.text) :].strip(".").partition(":")[0] in ("", "; null")
+        assert description[1:].startswith(field.line[1:])
+        assert description[len(field.line) :].strip(".").partition(":")[0] in ("", "; null")
 
 
 class MoreOptions(RunOptions, frozen=True, kw_only=True):
@@ -161,7 +161,7 @@ def test_every_option_with_a_key_replaces_it() -> None:
     }
     assert changed.overrides["simulation.catch_up"] == "`catch_up=4.0`"
     assert changed.overrides["zenoh.listen"] == "`listen=['tcp/127.0.0.1:1']`"
-    keys = {field.option.key for field in option_fields(PlanOptions).values()} - {None}
+    keys = {field.key for field in option_fields(PlanOptions).values()} - {None}
     assert changed.overrides.keys() == keys | {"scenario"}
 
 

@@ -8,7 +8,7 @@ from ...run.options import RunOptions, option_fields
 
 __all__ = ["in_flags"]
 
-_FLAGS = {name: field.option.flag for name, field in option_fields(RunOptions).items() if field.option.flag} | {
+_FLAGS = {name: field.flag for name, field in option_fields(RunOptions).items() if field.flag} | {
     name: f"--{name.replace('_', '-')}"
     for name in ("folder", "max_instances", "port", "resume", "ssd", "ssv", "timeout", "vary", "version", "workers")
 }
