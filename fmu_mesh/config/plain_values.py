@@ -47,7 +47,13 @@ def _key(key: Any) -> Any:  # noqa: ANN401  whatever a program gives
     return str(key).lower() if isinstance(key, bool) else str(key) if isinstance(key, int) else key
 
 
-_CLASSES: Mapping[object, Any] = {float: int | float, Path: str | PathLike, Sequence: list | tuple, Literal: str}
+_CLASSES: Mapping[object, Any] = {
+    float: int | float,
+    Path: str | PathLike,
+    Sequence: list | tuple,
+    Literal: str,
+    Iterable: (),
+}
 """The classes of what is taken for some types; of any other type, the class itself."""
 
 

@@ -1,0 +1,123 @@
+"""Each option of each call, given in six ways: the call works, or one of our exceptions names the option."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import fmu_mesh
+from fmu_mesh.run.options import CallOptions, OpenOptions, PlanOptions, RunOptions, option_fields
+from fmu_mesh.sweeps.planned_sweep import SweepOptions
+from tests.helpers import write_config
+
+RIGHT: Mapping[str, Any] = {
+    "algorithm": "jacobi",
+    "step_size": 0.002,
+    "stop_time": 0.004,
+    "window": 1,
+    "start_values": {"pendulum.a": 1.0},
+    "config_values": {"simulation.window": 2},
+    "allow_code": True,
+    "on_notice": str,
+    "real_time_factor": 100.0,
+    "update_period": 0.001,
+    "catch_up": 1.0,
+    "record": ["pendulum.a"],
+    "output": "out.csv",
+    "scenario": {"events": []},
+    "listen": ["tcp/127.0.0.1:0"],
+    "connect": ["tcp/127.0.0.1:7447"],
+    "paused": False,
+    "view": False,
+    "video": None,
+    "profile": False,
+    "processes": False,
+    "memory_limit": 10**6,
+    "restarts": 1,
+    "on_progress": str,
+    "on_event": str,
+    "workers": 1,
+    "sampler": "lhs:2",
+    "seed": 3,
+    "reduce": ["max(pendulum.a)"],
+    "folder": "swept",
+    "curves": False,
+    "resume": True,
+    "reset": True,
+    "max_instances": {"DampedPendulum.fmu": 2},
+}
+"""A value of each option with which a call works."""
+
+
+class Nowhere(Executor):
+    """An executor that runs nothing."""
+
+    def submit(self, *_: Any, **__: Any) -> Future[Any]:  # type: ignore[override] # noqa: ANN401 as the base class
+        """Refuse it, as one that was shut down."""
+        raise RuntimeError
+
+
+class Call(NamedTuple):
+    """A call of the library, with the options without which it would take long."""
+
+    options: type[CallOptions]
+    call: Callable[..., object]
+    base: Mapping[str, Any]
+
+
+def started(mesh: fmu_mesh.Mesh, **options: Any) -> None:  # noqa: ANN401 what is tested
+    mesh.start(**options).close()
+
+
+def opened(mesh: fmu_mesh.Mesh, **options: Any) -> None:  # noqa: ANN401 what is tested
+    mesh.open(**options).close()
+
+
+def swept(mesh: fmu_mesh.Mesh, **options: Any) -> None:  # noqa: ANN401 what is tested
+    vary = {"pendulum.d": fmu_mesh.Range(0.1, 0.2) if "sampler" in options else [0.1]}
+    fmu_mesh.sweep(mesh, vary, **{"executor": Nowhere(), **options}).close()
+
+
+SHORT = {"stop_time": 0.004, "processes": False}
+CALLS = {
+    "check": Call(PlanOptions, lambda mesh, **options: mesh.check(**options).require(), {}),
+    "run": Call(RunOptions, fmu_mesh.Mesh.run, SHORT),
+    "start": Call(RunOptions, started, SHORT),
+    "open": Call(OpenOptions, opened, {}),
+    "sweep": Call(SweepOptions, swept, {"stop_time": 0.004}),
+}
+WAYS: Mapping[str, Callable[[str], Any]] = {
+    "right": lambda name: RIGHT[name],
+    "numpy": lambda _: np.float64(0.5),
+    "text": lambda _: "x",
+    "None": lambda _: None,
+    "list": lambda _: [1],
+}
+CASES = [(call, option) for call, (options, _, _) in CALLS.items() for option in option_fields(options)]
+NOT_TRIED = {("executor", "right"), ("executor", "None")}
+"""The executor is always given, and None starts processes."""
+
+
+@pytest.mark.parametrize(("call", "option"), CASES)
+def test_an_option_works_or_is_named(call: str, option: str, folder: Path) -> None:
+    mesh, (_, make, base) = fmu_mesh.load(write_config(folder, stop_time=0.01)), CALLS[call]
+
+    for way, value_of in WAYS.items():
+        if (option, way) in NOT_TRIED:
+            continue
+        refused = None
+        try:
+            make(mesh, **{**base, option: value_of(option)})
+        except fmu_mesh.FmuMeshError as error:
+            refused = error
+        assert refused is None or (option in str(refused) and way != "right"), (way, refused)
+        shutil.rmtree("swept", ignore_errors=True)
+        shutil.rmtree("pair_sweep", ignore_errors=True)
+    with pytest.raises(fmu_mesh.CallRefused, match=f"Did you mean `{option}`"):
+        make(mesh, **base, **{f"{option}_": RIGHT.get(option)})
