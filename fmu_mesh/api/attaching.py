@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 
+from ..run.options import checked
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.waiting import appearance
@@ -14,6 +15,7 @@ from .run_handle import TIMEOUT_S, Run
 __all__ = ["attach", "meshes"]
 
 
+@checked
 def attach(
     name: str | None = None,
     *,
@@ -50,6 +52,7 @@ def attach(
         return Run(client.keys.mesh, attached=(client, stack.pop_all()))
 
 
+@checked
 def meshes(*, connect: str | Sequence[str] = (), timeout: float = TIMEOUT_S) -> list[MeshStatus]:
     """The status of every mesh that runs; none where no mesh runs or answers.
 

@@ -16,6 +16,7 @@ from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
 from ..printing import page, printable
+from ..run.options import checked
 from ..ssp.configuration_files import names_package
 from ..text import listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
@@ -101,6 +102,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
         return self.page()
 
 
+@checked
 def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
     """Read what a model declares: its variables, capabilities and default experiment. Nothing of it is run.
 

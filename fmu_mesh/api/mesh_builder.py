@@ -19,11 +19,11 @@ from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
 from ..instances.python.importing import being_imported, component_section
 from ..instances.registry import KINDS, check_engines
-from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, takes
+from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, checked, takes
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
-from ..text import listed, option_text, shown
+from ..text import listed, shown
 from .mesh_check import Check
 from .plan_options import memory_file, with_record
 from .rebasing import rebased
@@ -77,6 +77,7 @@ class Mesh:
         self._take(PlainConfig(data, Path.cwd() / f"<mesh {name}>"))
 
     @classmethod
+    @checked
     def from_yaml(cls, text: str, *, folder: str | Path = ".") -> Self:
         """A mesh from the text of a configuration file.
 
@@ -105,14 +106,13 @@ class Mesh:
         return mesh
 
     @classmethod
+    @checked
     def from_file(cls, path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> Self:
         """As `load`."""
-        if not isinstance(path, str | Path):
-            hint = "A mesh from values is `Mesh.from_configuration`, and from text `Mesh.from_yaml`."
-            raise CallRefused(f"{option_text('path', path)}: expected str | Path", hint=hint)
         return cls.from_configuration(read_configuration(Path(path), ssd, ssv))
 
     @classmethod
+    @checked
     def from_fmu(
         cls,
         path: str | Path,
@@ -310,6 +310,7 @@ class Mesh:
             else:
                 self._data[key] = plain(value)
 
+    @checked
     def to_yaml(self, folder: str | Path | None = None) -> str:
         """The configuration as the text of a file.
 
@@ -322,6 +323,7 @@ class Mesh:
         """
         return written(self._data if folder is None else rebased(self._plain, Path(folder)))
 
+    @checked
     def save(self, path: str | Path) -> None:
         """Write the configuration into a file, which `fmu-mesh launch` runs; its paths lead to the same files.
 
@@ -334,6 +336,7 @@ class Mesh:
         except OSError as error:
             raise ConfigurationError(f"'{path}' cannot be written: {error.strerror}") from error
 
+    @checked
     def to_ssp(self, path: str | Path, *, version: Literal["1.0", "2.0"] | None = None) -> tuple[Finding, ...]:
         """Write the mesh as a package of SSP (docs/ssp.md): its FMUs, start values and connections in one file.
 
@@ -539,6 +542,7 @@ class Mesh:
         return section
 
 
+@checked
 def load(path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> Mesh:
     """Read a configuration: a YAML file, or a package of SSP.
 

@@ -32,7 +32,7 @@ from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..system.settable import check_settable
-from ..text import listed, nearest, shown
+from ..text import listed, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
 from ..variables.value_types import DTYPES, Value
@@ -146,6 +146,8 @@ class System:
             FmuError: an FMU failed; has the instance, the point and the time. Only `close` is allowed now.
         """
         self._demand("step")
+        if not hasattr(points, "__index__"):
+            raise CallRefused(f"{option_text('points', points)}: expected a whole number")
         count, local = operator.index(points), self._local
         if count < 1 or local.point + count > self._grid.last_point:
             raise self._too_many(count)

@@ -13,6 +13,7 @@ from .. import files
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError
 from ..printing import page
+from ..run.options import checked
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
 from ..ssp.problems import Problems
@@ -152,6 +153,7 @@ class PackageInspection(msgspec.Struct, frozen=True, omit_defaults=False):
         return self.page
 
 
+@checked
 def inspect_package(path: str | Path, *, ssd: str | None = None) -> PackageInspection:
     """Read what a package of SSP says. Nothing of it is run.
 

@@ -6,12 +6,14 @@ from pathlib import Path
 
 from ..errors import ConfigurationError
 from ..files import Kept, is_file, open_alone
+from ..run.options import checked
 from ..system.recording import reading, result_format
 from ..text import nearest_file
 
 __all__ = ["recover"]
 
 
+@checked
 def recover(path: str | Path) -> int:
     """Finish the result file of a run that was killed, and return the number of its rows, which are all whole.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..instances.python.unit_names import base_unit_of
+from ..run.options import checked
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..system.recording import joined
@@ -83,6 +84,7 @@ class Result(Mapping[str, NDArray[Any]]):
         self._variables = _recorded(self._system, record)
 
     @classmethod
+    @checked
     def read(cls, path: str | Path) -> Self:
         """Read the result file of an earlier run, such as `launch` writes: CSV, Parquet or MCAP.
 
@@ -173,6 +175,7 @@ class Result(Mapping[str, NDArray[Any]]):
         pd = imported_pandas()
         return pd.DataFrame(dict(self), index=pd.Index(self.times, name="time"))
 
+    @checked
     def plot(
         self,
         *names: str,
@@ -225,6 +228,7 @@ class Result(Mapping[str, NDArray[Any]]):
         title = title if title is not None else " and ".join(meshes)
         return figure_of(drawn, PictureOptions(title, curves, x, difference, annotate))
 
+    @checked
     def compare(
         self, other: Result, *, rtol: float = 0.0, atol: float = 0.0, variables: Sequence[str] = ()
     ) -> Comparison:
@@ -266,6 +270,7 @@ class Result(Mapping[str, NDArray[Any]]):
         note = machine_difference(self.metadata.get("versions", {}), other.metadata.get("versions", {}))
         return replace(comparison, note=note, drawn=lambda chosen: self.plot(*chosen, others=(other,), difference=True))
 
+    @checked
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.
 

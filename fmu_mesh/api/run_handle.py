@@ -19,7 +19,7 @@ from ..errors import (
     FmuMeshError,
     MeshLost,
 )
-from ..run.options import StartOptions, takes
+from ..run.options import StartOptions, checked, takes
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
 from ..wire.client.waiting import rest, wait_for, wait_for_start
@@ -132,10 +132,12 @@ class Run:
         """What the mesh is: its times, nodes, instances, result file and endpoints."""
         return self._client().info()
 
+    @checked
     def instance_info(self, instance: str) -> InstanceInfo:
         """What an instance is: model, variables, connections, process."""
         return self._client().instance_info(instance)
 
+    @checked
     def instance_status(self, instance: str) -> InstanceStatus:
         """How far an instance is, and what it is doing."""
         return self._client().instance_status(instance)
@@ -186,6 +188,7 @@ class Run:
 
     # --- values
 
+    @checked
     def get(self, name: str) -> Any:  # noqa: ANN401  the type follows from the variable
         """The current value of `instance.variable`.
 
@@ -199,6 +202,7 @@ class Run:
             self._targets[name] = [target_of(self._running(), name)]
         return self.samples(name)[0].value
 
+    @checked
     def samples(self, *names: str) -> list[Sample]:
         """The current values of several variables, each with its point; patterns mean all that they match."""
         client = self._running()
@@ -207,6 +211,7 @@ class Run:
         targets = {target.key: target for name in names for target in self._targets[name]}
         return [sample_of(reading, targets[reading.key].variable) for reading in client.get(list(targets.values()))]
 
+    @checked
     def set(self, name: str, value: object, *, at: float | None = None) -> SetAnswer:
         """Give an unconnected input or a tunable parameter a value.
 
@@ -227,6 +232,7 @@ class Run:
         except ConfigurationError as error:
             raise CallRefused(error.message, hint=error.hint) from error
 
+    @checked
     def watch(self, *names: str) -> Watch:
         """Every value of variables from now on, until the mesh ends; patterns mean all that they match.
 
@@ -308,6 +314,7 @@ class Run:
         """Pause the mesh; returns when all instances have reached the point of the answer."""
         return rest(self._steered(), Command("pause"))
 
+    @checked
     def step(self, points: int = 1) -> CommandAnswer:
         """Run some points and pause again; returns when the mesh has paused."""
         return rest(self._steered(), Command("step", points))
@@ -345,6 +352,7 @@ class Run:
             self._own.stop()  # it has not begun, or runs in this process
             return None
 
+    @checked
     def wait_for(self, state: MeshState, timeout: float = _WAIT_S) -> MeshStatus:
         """Wait until the mesh is in a state, such as "paused".
 
@@ -383,6 +391,7 @@ class Run:
         with self._client().until_end(tell) as ended:
             yield ended
 
+    @checked
     def wait(self, timeout: float | None = None) -> Result:
         """Wait for the end of the run.
 

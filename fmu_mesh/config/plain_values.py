@@ -79,7 +79,8 @@ def taken(value: Any, kinds: Sequence[Any]) -> Any:  # noqa: ANN401  whatever a 
         value = dict(value.items())
     elif hasattr(value, "tolist"):
         value = value.tolist()
-    if isinstance(value, list | tuple) and any(get_origin(kind) is Iterable for kind in kinds):
+    with_pairs = any(get_origin(kind) is Iterable for kind in kinds)
+    if with_pairs and isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         from .yaml_text import read_value  # noqa: PLC0415  slow to import, and only for texts
 
         value = dict(read_value(one) if isinstance(one, str) else (one[0], one[1]) for one in value)

@@ -47,6 +47,7 @@ __all__ = [
     "RunOptions",
     "StartOptions",
     "VariantOptions",
+    "checked",
     "option_fields",
     "takes",
 ]
@@ -268,9 +269,10 @@ class takes(Generic[P, O]):  # noqa: N801  a decorator
         assert issubclass(options, CallOptions)
         fields = option_fields(options)
         *own, _ = signature(call).parameters.values()
+        with_arguments = checked(call)
 
         @wraps(call)
-        def checked(*values: Any, **named: Any) -> R:  # noqa: ANN401  checked below
+        def refusing(*values: Any, **named: Any) -> R:  # noqa: ANN401  whatever is given
             first = list(values[: len(own)])
             first += [named.pop(one.name) for one in own[len(first) :] if one.name in named]
             if len(first) < len(own):
@@ -283,14 +285,57 @@ class takes(Generic[P, O]):  # noqa: N801  a decorator
                 chosen = options(*values[len(own) :], **named)
             except TypeError as error:
                 raise CallRefused(f"`{name}` takes its options by name: {error}") from error
-            return call(*first, chosen)
+            return with_arguments(*first, chosen)
 
         parameters = [*own, *(field.parameter for field in fields.values())]
         shown = signature(call).replace(parameters=parameters)
-        checked.__signature__ = shown  # type: ignore[attr-defined]  # which the type of a function does not have
+        refusing.__signature__ = shown  # type: ignore[attr-defined]  # which the type of a function does not have
         lines = [f"\\1{name}: {field.line}\n" for name, field in fields.items()]
-        checked.__doc__ = re.sub(r"(?m)^( +)options: .*\n", "".join(lines), call.__doc__ or "")
-        return checked
+        refusing.__doc__ = re.sub(r"(?m)^( +)options: .*\n", "".join(lines), call.__doc__ or "")
+        return refusing
+
+
+_ARGUMENTS = {
+    **{one.__name__: one for one in (bool, float, int, str)},
+    "None": NoneType,
+    "Sequence[str]": Sequence[str],
+    "Mapping[str, Any]": Mapping[str, Any],
+}
+"""Types of arguments that `checked` knows, beside the names of the module; others are for the call itself to check."""
+
+
+def checked(call: Callable[P, R]) -> Callable[P, R]:
+    """Lets a public call refuse an argument of a wrong type, and a misspelt one, before it begins.
+
+    Raises:
+        CallRefused: names the argument.
+    """
+
+    @cache
+    def kinds() -> dict[str, tuple[Any, ...]]:  # found at the first call: an import does not wait for it
+        known = {name: one for name, one in (call.__globals__ | _ARGUMENTS).items() if one is not Any}
+        words = {one.name: str(one.annotation).split(" | ") for one in signature(call).parameters.values()}
+        return {name: tuple(known[word] for word in own) for name, own in words.items() if known.keys() >= {*own}}
+
+    @wraps(call)
+    def refusing(*values: P.args, **named: P.kwargs) -> R:
+        try:
+            given = (own := signature(call)).bind(*values, **named).arguments
+        except TypeError as error:
+            near = next((one for name in named if (one := nearest(name, own.parameters)) not in (None, *named)), None)
+            hint = f"Did you mean `{near}`?" if near else None
+            raise CallRefused(f"`{call.__qualname__}`: {error}", hint=hint) from error
+        for name in kinds().keys() & given.keys():
+            is_several = own.parameters[name].kind is Parameter.VAR_POSITIONAL
+            for value in given[name] if is_several else (given[name],):
+                try:
+                    taken(value, kinds()[name])
+                except (TypeError, ValueError):
+                    expected = own.parameters[name].annotation
+                    raise CallRefused(f"{option_text(name, value)}: expected {expected}") from None
+        return call(*values, **named)
+
+    return refusing
 
 
 @cache

@@ -121,3 +121,55 @@ def test_an_option_works_or_is_named(call: str, option: str, folder: Path) -> No
         shutil.rmtree("pair_sweep", ignore_errors=True)
     with pytest.raises(fmu_mesh.CallRefused, match=f"Did you mean `{option}`"):
         make(mesh, **base, **{f"{option}_": RIGHT.get(option)})
+
+
+WRONG: Mapping[str, Callable[[Any], object]] = {
+    "load": fmu_mesh.load,
+    "from_yaml": fmu_mesh.Mesh.from_yaml,
+    "from_fmu": fmu_mesh.Mesh.from_fmu,
+    "save": lambda value: fmu_mesh.load("pair.yaml").save(value),
+    "attach": lambda value: fmu_mesh.attach("pair", timeout=value),
+    "meshes": lambda value: fmu_mesh.meshes(connect=value),
+    "inspect": fmu_mesh.inspect,
+    "inspect_package": fmu_mesh.inspect_package,
+    "recover": fmu_mesh.recover,
+    "rerun": fmu_mesh.rerun,
+    "read": fmu_mesh.Result.read,
+    "sweep": lambda value: fmu_mesh.sweep(value, {"pendulum.d": [0.1]}),
+}
+
+
+@pytest.mark.parametrize("call", WRONG)
+def test_an_argument_of_a_wrong_type_is_refused(call: str, folder: Path) -> None:
+    write_config(folder)
+
+    for value in ({}, 3 if call != "attach" else "3", object()):
+        with pytest.raises(fmu_mesh.CallRefused, match="expected "):
+            WRONG[call](value)
+
+
+def test_a_misspelt_argument_is_refused() -> None:
+    with pytest.raises(fmu_mesh.CallRefused, match="Did you mean `path`"):
+        fmu_mesh.load(pth="pair.yaml")  # type: ignore[call-arg]  # what is to be refused
+
+
+def test_what_pandas_has_is_taken_as_a_mapping(folder: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    mesh = fmu_mesh.load(write_config(folder, stop_time=0.01))
+    starts = pandas.Series({"pendulum.a": 0.5, "delay.d": 0.2})
+
+    plan = mesh.plan(start_values=starts, stop_time=np.array(0.005))
+
+    assert plan.plan.grid.last_point == 5
+    assert plan.plan.system.instances["pendulum"].start_values["a"] == 0.5
+    assert mesh.plan(start_values=starts.items()).contents == plan.contents
+
+
+def test_record_names_what_is_recorded_into_arrays_or_the_output(folder: Path) -> None:
+    mesh = fmu_mesh.load(write_config(folder, stop_time=0.01))
+
+    kept = mesh.run(record=["delay.*"], processes=False)
+    written = mesh.run(record=["in:delay.x", "pendulum.a"], output="few.csv", processes=False)
+
+    assert (kept.names, kept.file, sorted(folder.glob("*.csv"))) == (["delay.y"], None, [folder / "few.csv"])
+    assert written.names == ["delay.x", "pendulum.a"]
