@@ -151,10 +151,10 @@ def open_alone(path: Path, result: Path | None = None) -> OwnFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         return OwnFile(path)
     except BlockingIOError as error:
-        hint = "Wait for its end, or choose another file with --output."
+        hint = "Wait for its end, or choose another file with `output=...`."
         raise ConfigurationError(f"another run is writing the result file '{result or path}'", hint=hint) from error
     except OSError as error:
-        hint, archive = "Choose another file with --output.", archive_on_the_way(result or path)
+        hint, archive = "Choose another file with `output=...`.", archive_on_the_way(result or path)
         if archive is not None:
             hint = f"'{archive}' is a file, and no folder. {hint}"
         text = f"the result file '{result or path}' cannot be written: {error.strerror}"
@@ -165,7 +165,7 @@ def unwritable(path: Path, error: OSError) -> ConfigurationError:
     """The error for a result file that could be opened, but not be written to its end."""
     return ConfigurationError(
         f"the result file '{path}' cannot be written: {error.strerror}",
-        hint="The run has ended there. Free some disk space, or choose another file with --output.",
+        hint="The run has ended there. Free some disk space, or choose another file with `output=...`.",
     )
 
 

@@ -314,7 +314,7 @@ def _variants(found: PackageInspection) -> str:
     if len(found.variants) <= 1:
         return ""
     names = [f"{one.file} ({_line(one.name)})" for one in found.variants]
-    return f"{', '.join(names)}: `--ssd` chooses one"
+    return f"{', '.join(names)}: `ssd=...` chooses one"
 
 
 def _experiment(found: PackageInspection) -> str:

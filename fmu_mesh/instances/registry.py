@@ -229,7 +229,7 @@ def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> 
         return
     worlds = [name for name, section in sections.items() if can_be_shown(section)]
     if len(worlds) != 1:
-        option = "--view" if showing.view else "--video"
+        option = "`view=True`" if showing.view else "`video=...`"
         found = f"this one has {listed(worlds)}" if worlds else "this one has none"
         raise ConfigurationError(f"{option} shows the one physics engine of a mesh, and {found}.")
     _kind_of(sections[worlds[0]]).check_showing(showing)

@@ -32,7 +32,7 @@ class OneProcess:
         Raises:
             NotInOneProcess: a component needs another Python, or two instances cannot share a process.
         """
-        hint = "Run the mesh in processes: `fmu-mesh launch` without --local, `Mesh.run` with processes=True."
+        hint = "Run the mesh in processes: leave out what keeps it in one, such as `processes=False`."
         for node in plan.nodes.values():
             if node.interpreter is not None and is_other_python(node.interpreter):
                 text = f"'{node.node}' needs the Python '{node.interpreter}', and this process is another one"

@@ -42,7 +42,7 @@ def read_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str | P
 
         return read_system(*package, ssv)
     if ssd is not None or ssv:
-        option = "--ssd" if ssd is not None else "--ssv"
+        option = "`ssd=...`" if ssd is not None else "`ssv=...`"
         raise ConfigurationError(f"{option} chooses a variant of a package of SSP, and '{path}' is no package")
     archive = files.archive_on_the_way(path)
     if path.suffix.lower() in _PARTS or (archive is not None and names_package(archive)):
@@ -63,8 +63,8 @@ def named_package(path: Path, ssd: str | None = None) -> tuple[Path, str | None]
     """
     is_description = path.suffix.lower() == ".ssd" and not files.is_folder(path)
     if is_description and ssd is not None:
-        hint = f"Name the package, '{path.parent}', or leave --ssd out."
-        raise ConfigurationError(f"'{path}' is one description, and --ssd chooses one", hint=hint)
+        hint = f"Name the package, '{path.parent}', or leave `ssd=...` out."
+        raise ConfigurationError(f"'{path}' is one description, and `ssd=...` chooses one", hint=hint)
     if is_description and (archive := files.archive_on_the_way(path)) is not None:
         return archive, path.relative_to(archive).as_posix()
     return (path, ssd) if names_package(path) else None

@@ -114,7 +114,7 @@ def _write_copy(plain: PlainConfig, original: PlainConfig, kept: KeptPackage, pa
         raise ConfigurationError(error.message, hint=error.hint) from error
     if kept.name in names_of_files and kept.name != DEFAULT:
         found = f"'{kept.name}' is not the default description of the package"
-        return (Finding(str(path), "", found, f"`--ssd {kept.name}` to run it"),)
+        return (Finding(str(path), "", found, f"`ssd={kept.name!r}` to run it"),)
     return ()
 
 

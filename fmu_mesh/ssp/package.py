@@ -136,7 +136,7 @@ class Package:
             size, limit = path.stat().st_size, LimitsConfig().description_bytes
             if size > limit:
                 text = f"'{path}' has {size} bytes; the limit is {limit}"
-                raise ConfigurationError(text, hint="Divide it into several files: `--ssv` is repeatable.")
+                raise ConfigurationError(text, hint="Divide it into several files: `ssv=...` takes several.")
             return path.read_bytes()
         except OSError as error:
             raise ConfigurationError(f"'{path}' cannot be read: {error.strerror}") from error

@@ -291,7 +291,7 @@ class _Writer:
                 self._needs_2(connection.path, f"{connection}, where '{variable.name}' is of {what}")
 
     def _needs_2(self, path: str, found: str) -> None:
-        self._findings.add(path, found, 'SSP 2.0, as with `version="2.0"` or `--version 2.0`')
+        self._findings.add(path, found, 'SSP 2.0, as with `version="2.0"`')
 
     # --- definitions
 

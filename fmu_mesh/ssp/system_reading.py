@@ -37,9 +37,9 @@ from .system_structure import FilePlace, Structure, StructureComponent, Structur
 __all__ = ["NEEDED", "chosen_description", "read_system"]
 
 NEEDED: Final = {
-    "simulation.step_size": "`--step-size S`, the communication step size in s",
-    "simulation.stop_time": "`--stop-time S`, the end of the simulation in s",
-    "simulation.algorithm": "`--algorithm jacobi`, as OMSimulator and libcosim step, or `--algorithm gauss_seidel`",
+    "simulation.step_size": "`step_size`, the communication step size in s",
+    "simulation.stop_time": "`stop_time`, the end of the simulation in s",
+    "simulation.algorithm": "`algorithm='jacobi'`, as OMSimulator and libcosim step, or `algorithm='gauss_seidel'`",
 }
 """What a run needs and a package may not say, with the option that does."""
 
@@ -91,7 +91,7 @@ def chosen_description(package: Package, ssd: str | None) -> str:
         inside = next((name for name in package.names() if name.endswith(f"/{DEFAULT}")), None)
         hint = f"It has '{inside}': zip what is inside that folder." if inside else "Is it a package of SSP?"
         if names:
-            hint = f"It has {listed(names)}: choose one with `--ssd`."
+            hint = f"It has {listed(names)}: choose one with `ssd=...`."
         raise ConfigurationError(f"'{package.root}' has no {DEFAULT} at its root", hint=hint)
     for wanted in (ssd, f"{ssd}.ssd"):
         if wanted in names:
@@ -194,7 +194,7 @@ class _Configuration:
             self._place(path, self._annotation.place)
         if "zenoh" in result.paths:
             found = f"the package says how the mesh connects: {str(result.data['zenoh'])[:200]}"
-            self._problems.warn(self._annotation.place, found, "--connect and --listen, if you do not trust it")
+            self._problems.warn(self._annotation.place, found, "`connect=...` and `listen=...`, if you do not trust it")
         for gone in result.gone:
             self._problems.warn(self._annotation.place, f"{gone} is not there any more")
         return result.data

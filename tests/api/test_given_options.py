@@ -58,7 +58,7 @@ RIGHT: Mapping[str, Any] = {
 class Nowhere(Executor):
     """An executor that runs nothing."""
 
-    def submit(self, *_: Any, **__: Any) -> Future[Any]:  # type: ignore[override] # noqa: ANN401 as the base class
+    def submit(self, *_: Any, **__: Any) -> Future[Any]:  # noqa: ANN401  as the base class
         """Refuse it, as one that was shut down."""
         raise RuntimeError
 
@@ -158,7 +158,7 @@ def test_what_pandas_has_is_taken_as_a_mapping(folder: Path) -> None:
     mesh = fmu_mesh.load(write_config(folder, stop_time=0.01))
     starts = pandas.Series({"pendulum.a": 0.5, "delay.d": 0.2})
 
-    plan = mesh.plan(start_values=starts, stop_time=np.array(0.005))
+    plan = mesh.plan(start_values=starts, stop_time=np.array(0.005))  # type: ignore[arg-type]  # taken as a number
 
     assert plan.plan.grid.last_point == 5
     assert plan.plan.system.instances["pendulum"].start_values["a"] == 0.5

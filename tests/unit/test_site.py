@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -20,14 +21,26 @@ REFERENCE = "docs/reference"
 DIRECTIVE = re.compile(r"^::: (\S+)\n((?: {4}.*\n)*)", re.MULTILINE)
 
 
-@pytest.fixture(scope="module")
-def site() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("site_pages", ROOT / "docs" / "site_pages.py")
+OF_OTHERS = {
+    *("Any", "Callable", "ClassVar", "Iterator", "Literal", "Mapping", "None", "Self", "Sequence"),
+    *("DataFrame", "Event", "Figure", "ForwardRef", "NDArray", "Path", "Rows"),
+}
+"""Names in annotations that are no types of ours."""
+
+
+def loaded(name: str) -> ModuleType:
+    """A module of the folder `docs`."""
+    specification = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     assert specification is not None
     assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def site() -> ModuleType:
+    return loaded("site_pages")
 
 
 def navigation(entry: object) -> Iterator[str]:
@@ -68,6 +81,39 @@ def test_the_reference_describes_every_public_name_once() -> None:
     missing = [name for name in fmu_mesh.__all__ if name not in names and not name.startswith("__")]
     assert missing == [], f"add `::: fmu_mesh.NAME` to a page of {REFERENCE}"
     assert [name for name, times in names.items() if times > 1] == []
+
+
+def returned_types() -> dict[str, str]:
+    """The classes of ours that public calls return and public objects have, by name, and one place of each."""
+    found: dict[str, str] = {}
+    for offered in (getattr(fmu_mesh, name) for name in fmu_mesh.__all__):
+        members = {"": offered, **(vars(offered) if inspect.isclass(offered) else {})}
+        for name, member in members.items():
+            own = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+            if not name.startswith("_") and inspect.isfunction(own):
+                words = str(inspect.unwrap(own).__annotations__.get("return", ""))
+                found |= dict.fromkeys(re.findall(r"\b[A-Z]\w+", words), own.__qualname__)
+        if inspect.isclass(offered):
+            of_fields = (
+                str(one) for name, one in offered.__dict__.get("__annotations__", {}).items() if name[0] != "_"
+            )
+            found |= dict.fromkeys(re.findall(r"\b[A-Z]\w+", " ".join(of_fields)), offered.__name__)
+    return {name: place for name, place in found.items() if name not in OF_OTHERS}
+
+
+def test_the_reference_describes_every_type_that_a_public_call_returns() -> None:
+    names = described()
+
+    assert {name: place for name, place in returned_types().items() if name not in names} == {}
+
+
+def test_the_table_of_options_has_all_of_each() -> None:
+    rows = {row.name: row for row in loaded("option_table").option_rows()}
+
+    assert rows["stop_time"][1:6] == ("--stop-time S", "float | None", "s", "None", "simulation.stop_time")
+    assert rows["memory_limit"].unit == "bytes"
+    assert {"Mesh.run", "sweep"} < {call for row in rows.values() for call in row.calls}
+    assert all(row.text for row in rows.values())
 
 
 def test_a_link_to_a_file_or_a_folder_leads_to_a_page_that_shows_it(site: ModuleType) -> None:

@@ -10,7 +10,19 @@ __all__ = ["in_flags"]
 
 _FLAGS = {name: field.flag for name, field in option_fields(RunOptions).items() if field.flag} | {
     name: f"--{name.replace('_', '-')}"
-    for name in ("folder", "max_instances", "port", "resume", "ssd", "ssv", "timeout", "vary", "version", "workers")
+    for name in (
+        "folder",
+        "max_instances",
+        "port",
+        "resume",
+        "ssd",
+        "ssv",
+        "start",
+        "timeout",
+        "vary",
+        "version",
+        "workers",
+    )
 }
 _OPTION = re.compile(r"`(\w+)(?:=([^`]*))?`")
 _PLACE = re.compile(r"(?:(?<=: )|(?<=  )|(?<=\")|^)`(\w+=[^`]*)`(?=: |\"|$)", re.MULTILINE)

@@ -62,9 +62,9 @@ def check_film(path: Path) -> None:
         ConfigurationError: it cannot be a film, or something is not installed; says what.
     """
     if path.suffix not in FILM_RATES:
-        raise ConfigurationError(f"--video {path}: a film is one of {', '.join(FILM_RATES)}")
+        raise ConfigurationError(f"`video={str(path)!r}`: a film is one of {', '.join(FILM_RATES)}")
     if files.is_folder(path):
-        raise ConfigurationError(f"--video {path}: a folder, not a file")
+        raise ConfigurationError(f"`video={str(path)!r}`: a folder, not a file")
     if importlib.util.find_spec("imageio") is None:
         raise ConfigurationError("films need imageio.", hint="Install it with `pip install 'fmu-mesh[physics]'`.")
     _choose_backend()
@@ -77,7 +77,7 @@ def check_window() -> None:
         ConfigurationError: there is no screen.
     """
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigurationError("--view needs a screen, and there is none.", hint="`--video FILE.mp4` needs none.")
+        raise ConfigurationError("`view=True` needs a screen, and there is none.", hint="`video=...` needs none.")
 
 
 class Film:

@@ -115,7 +115,7 @@ def _nothing(file: Path, names: str, beyond: int) -> ConfigurationError:
     if beyond:
         return ConfigurationError(
             f"all {beyond} values of {names} in '{file}' are at or after the end of the simulation.",
-            hint="Say when the first one is: --start 0, or start=0.0 in a program.",
+            hint="Say when the first one is, as with `start=0.0`.",
         )
     return ConfigurationError(f"there is no message of {names} in '{file}'.")
 

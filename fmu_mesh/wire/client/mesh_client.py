@@ -341,7 +341,7 @@ class MeshClient:
             return answers(self._session, Question(key, who, self._timeout_s, payload, attachment))
         except DeadlineExceeded:
             text = f"no answer from {who} within {self._timeout_s:g} s."
-            raise DeadlineExceeded(text, hint="--timeout waits longer.") from None
+            raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
         except MeshLost as error:
             raise ConfigurationError(error.message) from error
 

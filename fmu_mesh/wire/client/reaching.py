@@ -217,7 +217,8 @@ class Meshes:
         if self._endpoints:
             return ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
         return ConfigurationError(
-            "no mesh is running here.", hint="Start one with `fmu-mesh launch CONFIG`, or reach another with --connect."
+            "no mesh is running here.",
+            hint="Start one with `fmu-mesh launch CONFIG`, or reach another with `connect=...`.",
         )
 
     def _noted(self) -> Iterator[_Found]:
@@ -331,7 +332,7 @@ def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
     """Meshes with the same name and key, such as one that was launched twice."""
     where = ", ".join(endpoint for one in found for endpoint in one.endpoints[:1])
     return ConfigurationError(
-        f"{len(found)} meshes are running: {names}.", hint=f"Say which one by --connect and its endpoint: {where}."
+        f"{len(found)} meshes are running: {names}.", hint=f"Say which one by `connect=...` and its endpoint: {where}."
     )
 
 

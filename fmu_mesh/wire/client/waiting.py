@@ -50,7 +50,7 @@ def rest(client: MeshClient, command: Command) -> CommandAnswer:
         except DeadlineExceeded:
             at = (last or answer).point
             text = f"mesh '{mesh}' is at point {at}, on its way to point {answer.hold}, where it is going to rest."
-            raise DeadlineExceeded(text, hint="--timeout waits longer.") from None
+            raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
     raise _gone(mesh, what)
 
 
@@ -74,7 +74,7 @@ def appearance(meshes: Meshes, mesh: str | None, timeout_s: float) -> MeshClient
                 return client
             wait(left_s)
     who = f"mesh '{mesh}'" if mesh is not None else "mesh"
-    raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="--timeout waits longer.")
+    raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="A larger `timeout=...` waits longer.")
 
 
 def wait_for_start(client: MeshClient) -> None:
@@ -108,7 +108,7 @@ def wait_for(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStat
         except DeadlineExceeded:
             now = last.state if last is not None else "silent"
             text = f"mesh '{mesh}' is {now}, and was not {state} in time."
-            raise DeadlineExceeded(text, hint="--timeout waits longer.") from None
+            raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
     raise _gone(mesh, f"become {state}")
 
 
