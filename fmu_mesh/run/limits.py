@@ -84,7 +84,7 @@ def ring_problem(rings: Mapping[str, tuple[int, int]]) -> ConfigurationError | N
         f"the rings of this run need {_gigabytes(needed)}, and this host has {_gigabytes(available)} for them: "
         f"the ring of '{name}' needs {_gigabytes(sizes[name])} ({rows} rows of {_gigabytes(size)})"
     )
-    hint = "Set `simulation.window` to 1, connect or record smaller arrays, or use `processes=False`, which needs a few rows."
+    hint = "Set `simulation.window` to 1, use smaller arrays, or use `processes=False`, which needs a few rows."
     return ConfigurationError(text, hint=hint)
 
 

@@ -94,10 +94,9 @@ def returned_types() -> dict[str, str]:
                 words = str(inspect.unwrap(own).__annotations__.get("return", ""))
                 found |= dict.fromkeys(re.findall(r"\b[A-Z]\w+", words), own.__qualname__)
         if inspect.isclass(offered):
-            of_fields = (
-                str(one) for name, one in offered.__dict__.get("__annotations__", {}).items() if name[0] != "_"
-            )
-            found |= dict.fromkeys(re.findall(r"\b[A-Z]\w+", " ".join(of_fields)), offered.__name__)
+            own_fields = inspect.get_annotations(offered).items()
+            words = " ".join(str(annotation) for name, annotation in own_fields if not name.startswith("_"))
+            found |= dict.fromkeys(re.findall(r"\b[A-Z]\w+", words), offered.__name__)
     return {name: place for name, place in found.items() if name not in OF_OTHERS}
 
 

@@ -161,21 +161,21 @@ def topics_for(
     plan = Resolver(config, section, descriptions, types, findings).plan()
     if choices and len(findings):
         problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
-        raise ConfigurationError(f"--topic: {problems}.")
+        raise ConfigurationError(f"`topics=...`: {problems}.")
     topics = [topic for topic in plan.topics if topic.direction == "in" and topic.name in there]
     for topic in topics:
         if there[topic.name] != topic.message:
             raise ConfigurationError(
                 f"the topic '{topic.name}' has messages of '{there[topic.name]}' in '{bag.path}', and of "
                 f"'{topic.message}' in the mesh.",
-                hint=f"Say which field goes where: --topic {topic.name}:FIELD=INSTANCE.VARIABLE.",
+                hint=f"Say which field goes where: `topics=['{topic.name}:FIELD=INSTANCE.VARIABLE']`.",
             )
     if not topics:
         wanted = [topic.name for topic in plan.topics if topic.direction == "in"]
         raise ConfigurationError(
             f"no topic of '{bag.path}' is one that the mesh subscribes to: it has {listed(sorted(there))}, and the "
             f"mesh wants {listed(wanted)}.",
-            hint="Say what goes where: --topic TOPIC=INSTANCE.VARIABLE.",
+            hint="Say what goes where: `topics=['TOPIC=INSTANCE.VARIABLE']`.",
         )
     return topics
 
@@ -198,12 +198,12 @@ def _entries(choices: Sequence[str], there: Mapping[str, str]) -> Iterator[RosTo
     for choice in choices:
         found = _CHOICE.fullmatch(choice)
         if found is None:
-            raise ConfigurationError(f"--topic {choice}: expected TOPIC=INSTANCE.VARIABLE or TOPIC:FIELD=….")
+            raise ConfigurationError(f"`topics=[{choice!r}]`: expected TOPIC=INSTANCE.VARIABLE or TOPIC:FIELD=….")
         topic = "/" + found["topic"].lstrip("/")
         if topic not in there:
             near = nearest(topic, there)
             hint = f"Did you mean '{near}'?" if near else f"It has {listed(sorted(there))}."
-            raise ConfigurationError(f"--topic {choice}: the bag has no topic '{topic}'.", hint=hint)
+            raise ConfigurationError(f"`topics=[{choice!r}]`: the bag has no topic '{topic}'.", hint=hint)
         fields.setdefault(topic, {})[found["field"] or "data"] = found["variable"]
     for topic, own in fields.items():
         yield RosTopicConfig(topic=topic, type=there[topic], fields=own)

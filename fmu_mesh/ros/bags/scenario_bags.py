@@ -48,10 +48,10 @@ def bag_values(
                 topics = topics_for(loaded, descriptions, bag, choices)
                 samples = timed(bag.samples(topics, "log" if stamps == "log" else "header"), start)
         except ConfigurationError as error:
-            of_topic = error.message.startswith("--topic: ")
+            of_topic = error.message.startswith("`topics=...`: ")
             place = f"{places[0]}.{'topic' if of_topic else 'file'}"
             expected = error.hint or ("another field" if of_topic else "a bag that can be read")
-            findings.add(place, error.message.removeprefix("--topic: ").rstrip("."), expected.rstrip("."))
+            findings.add(place, error.message.removeprefix("`topics=...`: ").rstrip("."), expected.rstrip("."))
             continue
         pairs: dict[str, list[tuple[float, Value]]] = {}
         for time, sample in samples:
