@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import inspect
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -247,3 +249,43 @@ def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
     options = PlanOptions(algorithm="jacobi", step_size=0.25, config_values={"simulation.stop_time": None})
     plan = prepare(file, options)
     assert (plan.system.config.simulation.algorithm, plan.grid.step_size, plan.grid.stop_time) == ("jacobi", 0.25, None)
+
+
+SPELLS_FLAGS = {
+    "run/options.py": "it says how the command line spells them",
+    "sweeps/slurm.py": "options of sbatch",
+    "sweeps/slurm_sweep.py": "a command that the tasks of a job run",
+    "__main__.py": "it reads the command line",
+    "foxglove/foxglove_server.py": "only the command line serves it",
+}
+"""Modules outside of `cli` with the flags of options, with the reason."""
+
+
+def test_messages_of_the_library_name_options_without_dashes() -> None:
+    flags = {field.flag for field in option_fields(RunOptions).values() if field.flag} | {"--ssd", "--ssv", "--timeout"}
+    written = re.compile(rf"(?:{'|'.join(sorted(flags))})\b(?!-)")
+    found = set()
+    for path in (FMUS.parent / "fmu_mesh").rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        docstrings = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        texts = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and node not in docstrings)
+        if any(isinstance(text.value, str) and written.search(text.value) for text in texts):
+            found.add(path.relative_to(FMUS.parent / "fmu_mesh").as_posix())
+
+    assert {name for name in found if not name.startswith("cli/")} == SPELLS_FLAGS.keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "flags"),
+    [
+        ("`output='a b.csv'`: a file", "--output a b.csv: a file"),
+        ("Choose another file with `output=...`.", "Choose another file with `--output ...`."),
+        ("m.yaml: `listen=['tcp/a:1', 'tcp/b:1']`: x", "m.yaml: --listen tcp/a:1, tcp/b:1: x"),
+        ("expected `step_size`, in s", "expected `--step-size`, in s"),
+        ("a `window` of `record`, or `resume`", "a `window` of `record`, or `resume`"),
+        ("`allow_code=True` runs it", "`--allow-code` runs it"),
+        ("`processes=4`: expected bool", "--local 4: expected bool"),
+    ],
+)
+def test_the_command_line_shows_options_as_flags(text: str, flags: str) -> None:
+    assert in_flags(text) == flags
