@@ -138,7 +138,7 @@ class _Courses:
             try:
                 samples = self._run.samples(*self._names)
             except FmuMeshError:  # the mesh ends, or an instance does not answer now
-                continue
+                samples = []
             with self._lock:
                 self._histories.add(samples)
 

@@ -6,6 +6,7 @@ Knows neither meshes nor pages.
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 from typing import Final
 
@@ -13,13 +14,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BUCKETS", "SPANS", "BoundedCurve", "CurveChange"]
+__all__ = ["BUCKETS", "SPANS", "BoundedCurve", "CurveChange", "Looks"]
 
 BUCKETS: Final = 1024
 """Intervals of a curve from the start on. A plot on a page has about as many columns of pixels."""
 SPANS: Final = (1, 10, 60, 600)
 """The last so many seconds of a curve are also kept in finer intervals."""
 _RECENT: Final = 512
+_LATE: Final = 1.5
+"""A value that comes later than so many usual steps after another one is not the next one."""
+_SLOW: Final = 10.0
+"""A look that comes later than so many usual times after another one is not the next one."""
 
 _first_versions = itertools.count(1 << 32, 1 << 32)
 """A page that has drawn another curve of this name has no version of this one. A script has 53 bits for a number."""
@@ -27,7 +32,9 @@ _first_versions = itertools.count(1 << 32, 1 << 32)
 Numbers = NDArray[np.float64]
 
 
-class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": "th", "low": "l", "high": "h"}):
+class CurveChange(
+    msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": "th", "low": "l", "high": "h", "gaps": "g"}
+):
     """What a page needs to draw a curve that it has drawn before.
 
     Attributes:
@@ -36,6 +43,7 @@ class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": 
         at: the intervals that changed, by number.
         t_low: the time of the smallest value of each of them, in s; ``t_high`` is that of the largest.
         low: the smallest values; ``high`` has the largest.
+        gaps: those of them after which nothing is known, so no line may lead to the next one.
     """
 
     version: int
@@ -45,6 +53,7 @@ class CurveChange(msgspec.Struct, frozen=True, rename={"t_low": "tl", "t_high": 
     low: list[float]
     t_high: list[float]
     high: list[float]
+    gaps: list[int]
 
 
 class BoundedCurve:
@@ -63,21 +72,32 @@ class BoundedCurve:
         self._whole = _FromStart(start, width)
         self._recent = {span: _Recent(start, max(span / _RECENT, width)) for span in SPANS}
 
-    def add(self, times: Numbers, values: Numbers) -> None:
-        """Add values; those that are not finite are left out.
+    def add(self, times: Numbers, values: Numbers, after: float | None = None) -> None:
+        """Add values of one source; those that are not finite are left out.
+
+        A line leads from a value to the next one where none is missing between them: where both are finite, and as near
+        to each other as others are.
 
         Args:
-            times: in s, shape `(n,)`; in any order.
+            times: in s, shape `(n,)`.
             values: of the same shape.
+            after: the time of the value of the source before them; None: there was none, or some may be missing.
         """
         finite = np.isfinite(values) & np.isfinite(times)
+        ends, known = (times, finite) if after is None else (np.append(after, times), np.append(True, finite))
+        steps = np.diff(ends)
+        joined = known[:-1] & known[1:] & (steps >= 0.0)
+        if joined.sum() > 1:
+            joined &= steps <= _LATE * np.median(steps[joined])
+        lines = ends[:-1][joined], ends[1:][joined]
         times, values = times[finite], values[finite]
         if not len(times):
             return
+        parts: tuple[_FromStart | _Recent, ...] = (self._whole, *self._recent.values())
         with self._lock:
-            self._whole.add(times, values)
-            for recent in self._recent.values():
-                recent.add(times, values)
+            for part in parts:
+                part.add(times, values)
+                part.join(*lines)
 
     def since(self, version: int, span: int = 0) -> CurveChange:
         """What has changed since a version; 0 stands for a page that has nothing yet.
@@ -95,19 +115,58 @@ class BoundedCurve:
         return self._whole.size + sum(recent.size for recent in self._recent.values())
 
 
+class Looks:
+    """Which values were looked at in the look before, so that none that could be had is missing between them.
+
+    Args:
+        usual: the time between two looks in s; it follows that of a slow source.
+    """
+
+    def __init__(self, usual: float) -> None:
+        self._least = self._usual = usual
+        self._number = 0
+        self._began = math.inf
+        self._last: dict[str, tuple[int, float]] = {}
+
+    def begin(self, now: float) -> None:
+        """Begin a look at a wall-clock time. A late one follows none: the process slept, or waited for an answer."""
+        took, latest = now - self._began, _SLOW * self._usual
+        self._number += 1 if took < latest else 2
+        self._usual += 0.1 * (min(max(took, self._least), latest) - self._usual)
+        self._began = now
+
+    def after(self, name: str, time: float, step: float) -> float | None:
+        """Take the time of a value, and give that of the value before; None if values may be missing between them.
+
+        Args:
+            name: of the variable.
+            time: in s.
+            step: the time from one value to the next one in s: within it, none is missing.
+        """
+        number, before = self._last.get(name, (-1, -math.inf))
+        self._last[name] = self._number, time
+        return before if number == self._number - 1 or time - before < _LATE * step else None
+
+
 class _Intervals:
     """The smallest and the largest value of each of some intervals.
 
     Args:
-        count: how many there are.
+        numbers: of the interval at each place.
+        start: the start time in s.
+        width: length of an interval in s at first.
     """
 
-    def __init__(self, count: int) -> None:
-        self._count = count
+    def __init__(self, numbers: NDArray[np.int32 | np.int64], start: float, width: float) -> None:
+        count = len(numbers)
+        self._number = numbers
+        self._start = start
+        self._width = width
         self._low = np.full(count, np.nan)
         self._high = np.full(count, np.nan)
         self._t_low = np.zeros(count)
         self._t_high = np.zeros(count)
+        self._joined = np.zeros(count, bool)  # whether a line leads from its last value to the next interval
         self._changed = np.zeros(count, np.int64)
         self._version = self._whole_since = next(_first_versions)
 
@@ -120,12 +179,25 @@ class _Intervals:
         """As `BoundedCurve.since`."""
         whole = not self._whole_since <= version <= self._version
         at = np.flatnonzero(self._changed > (0 if whole else version))
-        columns = (self._t_low, self._low, self._t_high, self._high)
-        return CurveChange(self._version, whole, self._names(at), *(column[at].tolist() for column in columns))
+        columns = (self._number, self._t_low, self._low, self._t_high, self._high)
+        gaps = self._number[at[~self._joined[at]]].tolist()
+        return CurveChange(self._version, whole, *(column[at].tolist() for column in columns), gaps=gaps)
 
-    def _names(self, at: NDArray[np.int64]) -> list[int]:
-        """The numbers of intervals for a page."""
-        return [int(number) for number in at]
+    def join(self, starts: Numbers, ends: Numbers) -> None:
+        """Let lines lead from values at these times to those at others."""
+        numbers = self._numbers(starts)
+        numbers = numbers[numbers < self._numbers(ends)]
+        at = numbers % len(self._number)
+        new = at[(self._number[at] == numbers) & ~self._joined[at] & ~np.isnan(self._low[at])]
+        if len(new):
+            self._version += 1
+            self._joined[new] = True
+            self._changed[new] = self._version
+
+    def _numbers(self, times: Numbers) -> NDArray[np.int64]:
+        """The interval of each time. Rounding may put the very start just before it."""
+        numbers: NDArray[np.int64] = ((times - self._start) / self._width).astype(np.int64)
+        return np.maximum(numbers, 0)
 
     def _put(self, at: NDArray[np.int64], times: Numbers, values: Numbers) -> None:
         """Put each value into its interval."""
@@ -146,25 +218,17 @@ class _Intervals:
 
 
 class _FromStart(_Intervals):
-    """All values; when the intervals do not reach far enough, each two of them become one.
-
-    Args:
-        start: the start time in s.
-        width: length of an interval in s at first.
-    """
+    """All values; when the intervals do not reach far enough, each two of them become one."""
 
     def __init__(self, start: float, width: float) -> None:
-        super().__init__(BUCKETS)
-        self._start = start
-        self._width = width
+        super().__init__(np.arange(BUCKETS, dtype=np.int32), start, width)
 
     def add(self, times: Numbers, values: Numbers) -> None:
         """Add values that are finite; at least one."""
         while (float(times.max()) - self._start) / self._width >= BUCKETS:
             self._width *= 2.0
             self._merge()
-        # Rounding may put a value at the very start just before it.
-        self._put(np.maximum(((times - self._start) / self._width).astype(np.int64), 0), times, values)
+        self._put(self._numbers(times), times, values)
 
     def _merge(self) -> None:
         """Each two intervals become one."""
@@ -173,7 +237,9 @@ class _FromStart(_Intervals):
         rows = np.arange(half)
         lower = np.where(np.isnan(low), np.inf, low).argmin(axis=1)
         higher = np.where(np.isnan(high), -np.inf, high).argmax(axis=1)
+        joined = self._joined.reshape(half, 2)
         merged = (
+            (self._joined, np.where(np.isnan(low[:, 1]), joined[:, 0], joined[:, 1]), False),
             (self._low, low[rows, lower], np.nan),
             (self._high, high[rows, higher], np.nan),
             (self._t_low, self._t_low.reshape(half, 2)[rows, lower], 0.0),
@@ -188,23 +254,15 @@ class _FromStart(_Intervals):
 
 
 class _Recent(_Intervals):
-    """The newest values, in a ring of intervals.
-
-    Args:
-        start: the start time in s.
-        width: length of an interval in s.
-    """
+    """The newest values, in a ring of intervals."""
 
     def __init__(self, start: float, width: float) -> None:
-        super().__init__(_RECENT)
-        self._start = start
-        self._width = width
-        self._number = np.full(_RECENT, -1, np.int64)
+        super().__init__(np.full(_RECENT, -1, np.int64), start, width)
         self._newest = 0
 
     def add(self, times: Numbers, values: Numbers) -> None:
         """Add values that are finite; older ones than those in the ring are left out."""
-        numbers = np.maximum(((times - self._start) / self._width).astype(np.int64), 0)
+        numbers = self._numbers(times)
         self._newest = max(self._newest, int(numbers.max()))
         recent = numbers > self._newest - _RECENT
         if not recent.any():
@@ -213,8 +271,6 @@ class _Recent(_Intervals):
         at = numbers % _RECENT
         old = at[self._number[at] != numbers]
         self._low[old] = self._high[old] = np.nan
+        self._joined[old] = False
         self._number[at] = numbers
         self._put(at, times[recent], values[recent])
-
-    def _names(self, at: NDArray[np.int64]) -> list[int]:
-        return [int(number) for number in self._number[at]]

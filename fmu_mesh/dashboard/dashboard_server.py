@@ -106,7 +106,8 @@ def _serve(
         application,
         title="fmu_mesh",
         favicon=_ICON,
-        dark=None,
+        dark=None,  # as the browser or the system says
+        language="en-US",
         tailwind=False,
         message_history_length=_HISTORY,
         reconnect_timeout=_PATIENCE_S,

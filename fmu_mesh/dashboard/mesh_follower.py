@@ -22,7 +22,7 @@ from ..api.system_graph import SystemGraph, graph_of_infos
 from ..errors import FmuMeshError, MeshLost
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
-from .curve import BoundedCurve, CurveChange
+from .curve import BoundedCurve, CurveChange, Looks
 from .result_source import ResultSource
 
 __all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshView"]
@@ -35,6 +35,7 @@ _AGAIN_S: Final = 1.0
 _ASKED_S: Final = 10.0
 """A value that is in no result file is asked for this long after the last page has shown it."""
 _LOG_LINES: Final = 500
+_CONSTANT: Final = ("constant", "fixed")
 
 
 class Catalogue(NamedTuple):
@@ -205,6 +206,7 @@ class MeshFollower:
         with run.until_end(self._wake.set) as ended:
             infos = {name: run.instance_info(name) for name in info.instances}
             before, catalogue = self._view, _catalogue_of(info.mesh, infos)
+            self._stop_sampling()  # or that of the run before would add values to the curves of this one
             with self._lock:
                 if before.info is None or before.info.run != info.run:
                     self._curves.clear()
@@ -214,7 +216,6 @@ class MeshFollower:
                     before, info=info, infos=infos, catalogue=catalogue, ended=False, trouble=None
                 )
             self._run = run
-            self._stop_sampling()
             sampler = self._sampler = threading.Thread(
                 target=self._sample, args=(run, info, ended), name="sample", daemon=True
             )
@@ -268,7 +269,7 @@ class MeshFollower:
 
     def _sample(self, run: Run, info: MeshInfo, ended: threading.Event) -> None:
         path = Path(info.result_file) if info.result_file is not None and info.is_here else None
-        source = ResultSource(path)
+        source, looks = ResultSource(path), Looks(_SAMPLE_S)
         try:
             while not (self._closing.is_set() or self._next_run.is_set()):
                 over = ended.is_set()
@@ -278,7 +279,7 @@ class MeshFollower:
                     source.read_all(self._held)
                 else:
                     source.read(self._held, self._forget)
-                    self._ask_for_values(run, source.names)
+                    self._ask_for_values(run, source.names, looks)
                 self._wake.wait(_LOOK_S if over else _SAMPLE_S)
                 self._wake.clear()
         finally:
@@ -296,9 +297,10 @@ class MeshFollower:
                 assert info is not None  # it was there before there were samples
                 self._curves[name] = BoundedCurve(info.start_time, info.step_size)
 
-    def _ask_for_values(self, run: Run, in_file: Sequence[str]) -> None:
+    def _ask_for_values(self, run: Run, in_file: Sequence[str], looks: Looks) -> None:
         """Ask for the values that are in no file and on a page."""
         now = time.monotonic()
+        looks.begin(now)
         with self._lock:
             names = [n for n in self._curves if n not in in_file and now - self._asked.get(n, 0.0) < _ASKED_S]
         for name in names:
@@ -308,9 +310,13 @@ class MeshFollower:
                 value = float(np.asarray(sample.value, float).reshape(-1)[number])
             except (FmuMeshError, ValueError, TypeError, LookupError):
                 continue  # it has ended, or the value is no number
+            own = self._view.catalogue.variables[variable]
+            # Of two points of the instance none lies between them, and what cannot change was known all the time.
+            step = self._view.infos[name.partition(".")[0]].step_size if own.variability not in _CONSTANT else np.inf
+            after = looks.after(name, sample.time, step)
             with self._lock:
                 if (curve := self._curves.get(name)) is not None:
-                    curve.add(np.array([sample.time]), np.array([value]))
+                    curve.add(np.array([sample.time]), np.array([value]), after)
             if self._closing.is_set():
                 return
 

@@ -15,7 +15,6 @@ __all__ = ["PlotCard", "first_plots"]
 
 _PLOTS: Final = 4
 _CURVES: Final = 5
-_COLORS: Final = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999"]
 
 
 class PlotCard:
@@ -78,9 +77,8 @@ def _options(catalogue: Catalogue, names: Sequence[str]) -> dict[str, Any]:
     unit = next(iter(units)) if len(units) == 1 else None
     return {
         "animation": False,
-        "color": _COLORS,
         "grid": {"left": 70, "right": 20, "top": 34, "bottom": 44},
-        "legend": {"type": "scroll", "top": 0, "textStyle": {"color": "#888"}},
+        "legend": {"type": "scroll", "top": 0},
         "tooltip": {"trigger": "axis", "transitionDuration": 0},
         "toolbox": {
             "feature": {"dataZoom": {"yAxisIndex": "none"}, "restore": {}},

@@ -84,15 +84,15 @@ class ResultSource:
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
-        self._new: Tail | None = None
-        self._old: Tail | None = None
+        self._new: _Reader | None = None
+        self._old: _Reader | None = None
         self._filling: dict[str, BoundedCurve] = {}
         self._filled: dict[str, BoundedCurve] = {}
 
     @property
     def names(self) -> Sequence[str]:
         """The variables in the file."""
-        return self._new.names if self._new is not None else ()
+        return self._new.tail.names if self._new is not None else ()
 
     def read(self, held: Callable[[], Mapping[str, BoundedCurve]], forget: Callable[[], None]) -> None:
         """Read some megabytes, so that this returns soon.
@@ -101,56 +101,79 @@ class ResultSource:
             held: gives the curves.
             forget: called when the file is another one than before.
         """
-        if self._new is not None and self._new.replaced:
+        if self._new is not None and self._new.tail.replaced:
             self.close()
             forget()
         if self._new is None:
             if self._path is None or (new := open_tail(self._path)) is None:
                 return
-            self._new = new
-            new.skip()
-        curves = {name: curve for name, curve in held().items() if name in self._new.names}
-        if self._new.behind > _FAR_BEHIND or not curves:
+            self._new = _Reader(new)
             self._new.skip()
-        _feed(self._new, curves)
+        curves = {name: curve for name, curve in held().items() if name in self.names}
+        if self._new.tail.behind > _FAR_BEHIND or not curves:
+            self._new.skip()
+        if not curves:
+            return
+        self._new.feed(curves)
         added = {name: curve for name, curve in curves.items() if self._filled.get(name) is not curve}
-        if added and self._old is None and (old := open_tail(self._new.path)) is not None:
-            self._old, self._filling = old, added
+        if added and self._old is None and (old := open_tail(self._new.tail.path)) is not None:
+            self._old, self._filling = _Reader(old), added
             self._filled = {name: curve for name, curve in self._filled.items() if name in curves} | added
-        if self._old is not None and _feed(self._old, self._filling, _OLD_PIECES):
-            self._old.close()
+        if self._old is not None and self._old.feed(self._filling, _OLD_PIECES):
+            if self._new.after is None:  # it has skipped a part of a row, which this one goes on with
+                self._old, self._new = self._new, self._old
+            self._old.tail.close()
             self._old = None
 
     @property
     def replaced(self) -> bool:
         """Whether another file has its name by now."""
-        return self._new is None or self._new.replaced
+        return self._new is None or self._new.tail.replaced
 
     def read_all(self, held: Callable[[], Mapping[str, BoundedCurve]]) -> None:
         """Read to the end of a file that nobody writes any more."""
         self.read(held, lambda: None)
         if self._new is not None:
-            while not _feed(self._new, {n: c for n, c in held().items() if n in self._new.names}):
+            while not self._new.feed({n: c for n, c in held().items() if n in self.names}):
                 pass
-        while self._old is not None and not _feed(self._old, self._filling):
+        while self._old is not None and not self._old.feed(self._filling):
             pass
 
     def close(self) -> None:
         """Close the files."""
-        for tail in (self._new, self._old):
-            if tail is not None:
-                tail.close()
+        for reader in (self._new, self._old):
+            if reader is not None:
+                reader.tail.close()
         self._new = self._old = None
         self._filled = {}
 
 
-def _feed(tail: Tail, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
-    """Add some rows to curves; True at the end of the file."""
-    for _ in range(pieces):
-        rows = tail.read(list(curves))
-        if rows is None:
-            return True
-        times, values = rows
-        for curve, column in zip(curves.values(), values, strict=True):
-            curve.add(times, column)
-    return False
+class _Reader:
+    """Feeds curves with the rows of one tail.
+
+    Attributes:
+        tail: the rows.
+        after: the time of the row that was read last in s; None at the start, and after rows that were left out.
+    """
+
+    def __init__(self, tail: Tail) -> None:
+        self.tail = tail
+        self.after: float | None = None
+
+    def skip(self) -> None:
+        """Leave out the rows that are there."""
+        self.tail.skip()
+        self.after = None
+
+    def feed(self, curves: Mapping[str, BoundedCurve], pieces: int = _PIECES) -> bool:
+        """Add some rows to curves; True at the end of the file."""
+        for _ in range(pieces):
+            rows = self.tail.read(list(curves))
+            if rows is None:
+                return True
+            times, values = rows
+            for curve, column in zip(curves.values(), values, strict=True):
+                curve.add(times, column, self.after)
+            if len(times):
+                self.after = float(times[-1])
+        return False

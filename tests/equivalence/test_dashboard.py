@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
 import socket
 from pathlib import Path
 
+import psutil
 import pytest
 
 import fmu_mesh
@@ -223,6 +225,36 @@ def test_values_that_are_not_recorded_are_asked_for(place: Place) -> None:
     )
 
     assert found
+    place.run("stop", "pair")
+
+
+def test_the_time_in_which_nobody_looked_is_a_gap_of_a_value_that_is_not_recorded(place: Place) -> None:
+    config = write_config(
+        place.folder,
+        stop_time=3600.0,
+        simulation=PACED,
+        record={"file": "pair.csv", "variables": ["pendulum.a"]},
+    )
+    place.start("launch", config, "--no-progress")
+    dashboard = Dashboard(place)
+
+    def values_after(time: float) -> dict[str, list[float]] | None:
+        found = dashboard.curves(KEY, delay__y=0).get("delay.y")
+        return found if found and max(found["th"], default=0.0) > time else None
+
+    before = wait_until(lambda: values_after(0.5), "some values")
+    process = psutil.Process(dashboard.process.pid)
+    process.suspend()
+    try:
+        asleep = max(before["th"]) + 2.0
+        wait_until(lambda: json.loads(place.run("status", "pair", "--json").output)["time"] > asleep, "2 s")
+    finally:
+        process.resume()
+    after = wait_until(lambda: values_after(asleep + 0.5), "values after it woke")
+
+    seen = [at for at, time in zip(after["at"], after["th"], strict=True) if time < asleep]
+    assert seen[-1] in after["g"]
+    assert len(after["g"]) < len(after["at"])
     place.run("stop", "pair")
 
 

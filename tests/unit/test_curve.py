@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from fmu_mesh.dashboard.curve import BUCKETS, SPANS, BoundedCurve, CurveChange
+from fmu_mesh.dashboard.curve import BUCKETS, SPANS, BoundedCurve, CurveChange, Looks
 
 
 def _points(change: CurveChange) -> set[tuple[float, float]]:
@@ -122,3 +125,123 @@ def test_the_last_seconds_are_kept_in_finer_intervals(span: int) -> None:
     fresh = dict[int, tuple[float, float, float, float]]()
     _apply(fresh, curve.since(0, span))
     assert {at: cells[at] for at in fresh} == fresh
+
+
+def _segments(change: CurveChange) -> list[tuple[float, float]]:
+    """The first and the last time of each line that the page draws."""
+    order = sorted(range(len(change.at)), key=change.at.__getitem__)
+    found: list[tuple[float, float]] = []
+    is_cut = True
+    for n in order:
+        first, last = sorted((change.t_low[n], change.t_high[n]))
+        found = [*found, (first, last)] if is_cut else [*found[:-1], (found[-1][0], last)]
+        is_cut = change.at[n] in change.gaps
+    return found
+
+
+def _times(first: int, last: int) -> NDArray[np.float64]:
+    return np.arange(first, last + 1, dtype=np.float64)
+
+
+@pytest.mark.parametrize("span", [0, 600])
+def test_no_line_leads_over_values_that_nobody_looked_at(span: int) -> None:
+    curve = BoundedCurve(0.0, 1.0)
+
+    for first, last in ((0, 9), (40, 40), (60, 69)):
+        after = None
+        for time in _times(first, last):
+            curve.add(np.array([time]), np.array([time]), after)
+            after = time
+
+    assert _segments(curve.since(0, span)) == [(0.0, 9.0), (40.0, 40.0), (60.0, 69.0)]
+
+
+def test_a_gap_stays_where_intervals_become_wider() -> None:
+    curve = BoundedCurve(0.0, 1e-3)
+
+    curve.add(times := _times(0, 3000) * 1e-3, times)
+    curve.add(times := _times(9000, 30_000) * 1e-3, times)
+
+    assert _segments(curve.since(0)) == [(0.0, 3.0), (9.0, 30.0)]
+
+
+def test_rows_that_are_not_finite_or_not_there_are_gaps() -> None:
+    curve = BoundedCurve(0.0, 1.0)
+    times = np.concatenate([_times(0, 30), _times(35, 60)])
+    values = np.where((times > 10) & (times < 14), np.nan, times)
+    values[times == 50.0] = np.inf
+
+    curve.add(times, values)
+
+    assert _segments(curve.since(0)) == [(0.0, 10.0), (14.0, 30.0), (35.0, 49.0), (51.0, 60.0)]
+
+
+@pytest.mark.parametrize("stride", [1, 7, 50])
+def test_values_that_come_seldom_or_are_held_are_one_line(stride: int) -> None:
+    curve = BoundedCurve(0.0, 1.0)
+    times = _times(0, 100) * stride
+
+    after = None
+    for part in np.array_split(times, 9):
+        curve.add(part, np.where(part < 40.0, 1.0, 2.0), after)
+        after = float(part[-1])
+
+    assert _segments(curve.since(0)) == [(0.0, times[-1])]
+
+
+def test_the_values_of_a_gap_that_come_later_close_it() -> None:
+    curve = BoundedCurve(0.0, 1.0)
+    curve.add(new := _times(50, 60), new)
+    page = curve.since(0)
+
+    curve.add(old := _times(0, 55), old)
+
+    assert _segments(page) == [(50.0, 60.0)]
+    assert 49 in curve.since(page.version).at
+    assert _segments(curve.since(0)) == [(0.0, 60.0)]
+
+
+def test_a_page_that_takes_changes_knows_which_gaps_are_closed() -> None:
+    curve = BoundedCurve(0.0, 1.0)
+    curve.add(np.array([1.0]), np.array([1.0]))
+    before = curve.since(0)
+
+    curve.add(np.array([5.0]), np.array([1.0]), 1.0)
+
+    assert before.gaps == [1]
+    assert (change := curve.since(before.version)).at == [1, 5]
+    assert change.gaps == [5]
+
+
+def _continued(looks: Looks, times: Mapping[float, float], step: float) -> list[bool]:
+    """Whether the value of each look, by wall-clock and simulation time, follows the one before."""
+    found = []
+    for now, time in times.items():
+        looks.begin(now)
+        found.append(looks.after("a.x", time, step) is not None)
+    return found
+
+
+def test_a_value_that_was_not_looked_at_once_begins_a_line() -> None:
+    looks = Looks(0.05)
+
+    before = _continued(looks, {0.0: 1.0, 0.05: 1.5, 0.1: 2.0}, 0.01)
+    looks.begin(0.15)  # nobody wants it
+
+    assert before == [False, True, True]
+    assert _continued(looks, {0.2: 3.0, 0.25: 3.5}, 0.01) == [False, True]
+
+
+def test_a_late_look_begins_a_line_and_slow_looks_do_not() -> None:
+    late = _continued(Looks(0.05), {0.0: 1.0, 0.05: 1.5, 3.0: 4.0, 3.05: 4.5}, 0.01)
+    slow = _continued(Looks(0.05), {float(look): 2.0 * look for look in range(100)}, 0.01)
+
+    assert late == [False, True, False, True]
+    assert slow[-50:] == [True] * 50
+
+
+def test_nothing_is_missing_between_two_points_of_a_slow_instance() -> None:
+    times = {0.0: 1.0, 20.0: 1.0, 60.0: 2.0, 100.0: 4.0}
+
+    assert _continued(Looks(0.05), times, 1.0) == [False, True, True, False]
+    assert _continued(Looks(0.05), times, np.inf) == [False, True, True, True]

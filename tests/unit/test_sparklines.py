@@ -72,3 +72,12 @@ def test_blocks_are_drawn_where_they_can_be_written() -> None:
         BLOCKS,
         *[PLAIN] * 4,
     ]
+
+
+def test_a_look_without_an_answer_is_blank_and_not_a_shorter_line() -> None:
+    found = histories("gain.y", 0.0, 1.0)
+
+    found.add([])
+    found.add([Sample("gain.y", 1.0, 3, 0.3, None)])
+
+    assert found.lines()[0].startswith("gain.y  ▁█ █  ")

@@ -37,12 +37,16 @@ class Histories:
         self._newest: dict[str, Sample] = {}
 
     def add(self, samples: Iterable[Sample]) -> None:
-        """Add the current values of variables."""
+        """Add the current values of variables; one of which there is none now has a blank."""
+        missing = dict.fromkeys(self._values)
         for sample in samples:
+            missing.pop(sample.name, None)
             value = sample.value
             is_number = isinstance(value, bool | int | float)
             self._newest[sample.name] = sample
             self._values.setdefault(sample.name, deque(maxlen=KEPT)).append(float(value) if is_number else math.nan)
+        for name in missing:
+            self._values[name].append(math.nan)
 
     @property
     def newest(self) -> list[Sample]:

@@ -6,7 +6,12 @@ window.fmuMeshPlots = (() => {
   const LEAST_MS = 50; // 20 pictures per second
   const SHARE = 2; // of the time between two pictures, at most a third is drawing
   const AGAIN_MS = 1000;
-  const plots = new Map(); // by the id of a chart: {names, drawn}
+  const COLORS = {
+    // On white and on the dark card, each is at least 3 : 1; neighbours are told apart by the colour-blind as well.
+    default: ["#0072b2", "#d55e00", "#00805d", "#b5508a", "#a87400", "#3a8fc7", "#000000", "#777777"],
+    dark: ["#56b4e9", "#ff8c42", "#2ccc9a", "#e59ac6", "#f0c445", "#a9b4ff", "#ffffff", "#a0a0a0"],
+  };
+  const plots = new Map(); // by the id of a chart: {names, drawn, theme}
   const curves = new Map(); // by name: {version, cells}, and cells by the number of an interval
   let shown = 0; // the last so many seconds; 0: from the start on
   let mesh = null;
@@ -75,16 +80,29 @@ window.fmuMeshPlots = (() => {
       curves.set(name, curve);
     }
     curve.version = change.version;
+    const gaps = new Set(change.g);
     change.at.forEach((at, i) => {
       const low = [change.tl[i], change.l[i]];
       const high = [change.th[i], change.h[i]];
-      curve.cells.set(at, low[0] === high[0] ? [low] : low[0] < high[0] ? [low, high] : [high, low]);
+      const points = low[0] === high[0] ? [low] : low[0] < high[0] ? [low, high] : [high, low];
+      curve.cells.set(at, { points, isCut: gaps.has(at) });
     });
-    curve.points = [...curve.cells.keys()].sort((a, b) => a - b).flatMap((at) => curve.cells.get(at));
-    if (shown > 0 && curve.points.length > 0) {
-      const from = curve.points[curve.points.length - 1][0] - shown;
-      for (const [at, cell] of curve.cells) if (cell[cell.length - 1][0] < from) curve.cells.delete(at);
-      curve.points = curve.points.filter((point) => point[0] >= from);
+    const cells = [...curve.cells.entries()].sort((a, b) => a[0] - b[0]);
+    const from = shown > 0 && cells.length > 0 ? cells.at(-1)[1].points.at(-1)[0] - shown : -Infinity;
+    curve.points = []; // values only
+    curve.line = []; // what is drawn: nothing leads over a time of which nothing is known
+    let length = 0;
+    for (const [at, cell] of cells) {
+      const points = cell.points.filter((point) => point[0] >= from);
+      if (points.length === 0) curve.cells.delete(at);
+      curve.points.push(...points);
+      curve.line.push(...points);
+      length += points.length;
+      if (!cell.isCut || length === 0) continue;
+      const last = curve.points.at(-1);
+      if (length === 1) curve.line.splice(-1, 1, { value: last, symbol: "circle" }); // a line of one point is invisible
+      curve.line.push([last[0], null]);
+      length = 0;
     }
   }
 
@@ -92,14 +110,22 @@ window.fmuMeshPlots = (() => {
     for (const [id, one] of plots) {
       const chart = getElement(id)?.chart;
       if (!chart) continue;
-      if (one.names.some((name) => changed.has(name))) one.drawn = false;
+      const theme = document.body.classList.contains("body--dark") ? "dark" : "default";
+      if (one.theme !== theme || one.names.some((name) => changed.has(name))) one.drawn = false;
       if (one.drawn || !isOnScreen(chart.getDom())) continue;
-      const series = one.names.map((name) => ({ data: curves.get(name)?.points ?? [] }));
-      const ends = series.filter((own) => own.data.length).map((own) => own.data[own.data.length - 1][0]);
+      if (one.theme !== theme) chart.setTheme(theme);
+      one.theme = theme;
+      const found = one.names.map((name) => curves.get(name) ?? { points: [], line: [] });
+      const series = found.map((own) => {
+        const hasDots = own.line.some((point) => point.symbol);
+        return { data: own.line, showSymbol: hasDots, symbol: hasDots ? "none" : "circle" };
+      });
+      const ends = found.filter((own) => own.points.length).map((own) => own.points.at(-1)[0]);
       const last = Math.max(...ends);
       const from = shown > 0 && ends.length ? last - shown : "dataMin";
       const to = ends.length ? last : "dataMax";
-      chart.setOption({ xAxis: { min: from, max: to }, series }, { lazyUpdate: true });
+      const colors = { color: COLORS[theme], backgroundColor: "transparent" };
+      chart.setOption({ ...colors, xAxis: { min: from, max: to }, series }, { lazyUpdate: true });
       one.drawn = true;
       window.fmuMeshPlots.pictures += 1;
     }
