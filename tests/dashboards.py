@@ -8,12 +8,14 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import psutil
 import pytest
+from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
@@ -127,6 +129,31 @@ class Browser:
         """The points of a curve that the page has."""
         script = "return fmuMeshPlots.curves.get(arguments[0])?.points ?? []"
         return [[float(x) for x in point] for point in self.run(script, name)]
+
+    def line(self, number: int) -> list[list[float | None]]:
+        """What the first curve of a plot is drawn of; a value of None ends a line."""
+        script = """const plot = document.querySelectorAll('.fm-plot')[arguments[0]];
+            const chart = plot && getElement(Number(plot.id.slice(1)))?.chart;
+            return chart?.getOption().series[0]?.data.map((point) => point.value ?? point) ?? []"""
+        return [list(point) for point in self.run(script, number)]
+
+    def show_as(self, theme: str, width: int, height: int) -> None:
+        """Show the page as to a person who wants a dark or a light theme, in a window of this size."""
+        wanted = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", wanted)  # type: ignore[attr-defined]  # of Chromium
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)  # type: ignore[attr-defined]  # as above
+
+    def picture(self, selector: str) -> Image.Image:
+        """A picture of the first such element."""
+        return Image.open(BytesIO(self.driver.find_element(By.CSS_SELECTOR, selector).screenshot_as_png))
+
+    def spoken(self) -> list[tuple[str, str]]:
+        """The role and the name of all that a screen reader tells of."""
+        nodes = self.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]  # type: ignore[attr-defined]  # of Chromium
+        return [
+            (node["role"]["value"], node.get("name", {}).get("value", "")) for node in nodes if not node.get("ignored")
+        ]
 
     def click(self, label: str) -> None:
         """Click the button with this text, as soon as it is there."""

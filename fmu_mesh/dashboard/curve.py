@@ -179,9 +179,9 @@ class _Intervals:
         """As `BoundedCurve.since`."""
         whole = not self._whole_since <= version <= self._version
         at = np.flatnonzero(self._changed > (0 if whole else version))
-        columns = (self._number, self._t_low, self._low, self._t_high, self._high)
-        gaps = self._number[at[~self._joined[at]]].tolist()
-        return CurveChange(self._version, whole, *(column[at].tolist() for column in columns), gaps=gaps)
+        columns = [column[at] for column in (self._number, self._t_low, self._low, self._t_high, self._high)]
+        columns.append(self._number[at[~self._joined[at]]])
+        return CurveChange(self._version, whole, *(column.tolist() for column in columns))
 
     def join(self, starts: Numbers, ends: Numbers) -> None:
         """Let lines lead from values at these times to those at others."""

@@ -22,7 +22,7 @@ _COLUMNS: Final = {
     "activity": "activity",
 }
 _BAR: Final = """
-<q-td :props="props"><div class="fm-bar" :title="props.row.shares">
+<q-td :props="props"><div class="fm-bar" role="img" :title="props.row.shares" :aria-label="props.row.shares">
 <div :style="{width: props.row.share[0] + '%'}"></div><div :style="{width: props.row.share[1] + '%'}"></div>
 </div></q-td>
 """

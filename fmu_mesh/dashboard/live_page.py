@@ -68,13 +68,13 @@ class _Content:
         self._read_only = read_only
         self._page: MeshPage | None = None
         with ui.header().classes("items-center q-py-sm"):
-            ui.label("fmu_mesh").classes("text-h6")
+            ui.label("fmu_mesh").classes("text-h6 fm-brand").props("role=heading aria-level=1")
             self._choice = ui.select({}, value=None, label="mesh", on_change=self._clear).props("dense dark outlined")
-            self._choice.classes("fm-mesh").style("min-width: 180px")
-            self._head = ui.row().classes("fm-line col")
+            self._choice.classes("fm-mesh")
+            self._head = ui.row().classes("fm-line fm-head col")
         self._body = ui.column().classes("fm-content")
         with self._body:
-            self._nothing = ui.label()
+            self._nothing = ui.label().props("role=status")
         self._wanted = wanted
 
     def look(self) -> None:

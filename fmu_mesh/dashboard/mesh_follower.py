@@ -10,6 +10,7 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..api.system_graph import SystemGraph, graph_of_infos
-from ..errors import FmuMeshError, MeshLost
+from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
 from .curve import BoundedCurve, CurveChange, Looks
@@ -66,6 +67,7 @@ class MeshView(msgspec.Struct, frozen=True):
         infos: what the instances are, in the order of the mesh.
         ended: whether it runs no more.
         trouble: why it is not reached.
+        failure: why the run failed; None if it did not, or goes on.
         run: counts the runs of a mesh of this name that were seen.
     """
 
@@ -78,6 +80,7 @@ class MeshView(msgspec.Struct, frozen=True):
     catalogue: Catalogue = Catalogue({}, {}, {}, SystemGraph("", (), ()))
     ended: bool = False
     trouble: str | None = None
+    failure: str | None = None
     run: int = 0
 
 
@@ -222,13 +225,15 @@ class MeshFollower:
             logger = threading.Thread(target=self._read_log, args=(run,), name="log", daemon=True)
             for thread in (sampler, logger):
                 thread.start()
+            with suppress(DeadlineExceeded):
+                run.wait(0.0)  # from now on the handle knows how the run ends
             try:
                 while not (ended.is_set() or self._closing.is_set()):
                     self._look(run)
                     ended.wait(_LOOK_S)
             finally:
                 if not self._closing.is_set():
-                    self._change(ended=True)
+                    self._change(ended=True, failure=_failure(run))
                 self._run = None
         # The thread of the log ends with the mesh, or with the session that `attach` closes.
 
@@ -319,6 +324,17 @@ class MeshFollower:
                     curve.add(np.array([sample.time]), np.array([value]), after)
             if self._closing.is_set():
                 return
+
+
+def _failure(run: Run) -> str | None:
+    """Why a run has failed that is at its end."""
+    try:
+        run.wait(_AGAIN_S)
+    except (DeadlineExceeded, Interrupted):
+        return None
+    except FmuMeshError as error:
+        return str(error)
+    return None
 
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:

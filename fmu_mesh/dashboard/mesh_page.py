@@ -71,16 +71,18 @@ class MeshPage:
     def build(self, head: Any, body: Any) -> None:  # noqa: ANN401  elements of NiceGUI
         """Make the elements, in the head and in the body of the page."""
         ui.run_javascript(f"fmuMeshPlots.show({json.dumps(self.key)}, {self.run})")
-        with head, ui.row().classes("fm-line col") as row:
+        with head, ui.row().classes("fm-line fm-head col") as row:
             self._parts.append(row)
-            self._state = ui.badge("").classes("text-body2 fm-state")
-            self._numbers = ui.label().classes("fm-numbers")
-            ui.space()
+            self._state = ui.badge("").classes("text-body2 fm-state").props("role=status")
+            self._numbers = ui.label().classes("fm-numbers fm-progress")
             if self._read_only:
-                ui.badge("read only", color="grey").classes("text-body2")
+                ui.badge("read only", color="grey-8").classes("text-body2")
             else:
-                with ui.row().classes("fm-line") as self._buttons:
+                with ui.row().classes("fm-line fm-buttons") as self._buttons:
                     self._add_buttons()
+        with body:
+            self._trouble = ui.label().classes("fm-trouble").props("role=alert")
+            self._parts.append(self._trouble)
         with body, ui.element("div").classes("fm-columns") as columns:
             self._parts.append(columns)
             with ui.element("div").classes("fm-column"):
@@ -97,19 +99,18 @@ class MeshPage:
             self._parts.append(ui.timer(_VALUES_S, self._read_values))
 
     def _add_buttons(self) -> None:
-        self._pausing = ui.button("Pause", icon="pause", on_click=self._pause).props("dense unelevated color=secondary")
-        self._resuming = ui.button("Resume", icon="play_arrow", on_click=self._resume)
-        self._resuming.props("dense unelevated color=secondary")
+        self._pausing = _button("Pause", "pause", self._pause)
+        self._resuming = _button("Resume", "play_arrow", self._resume)
         self._points = ui.number(value=1, min=1, precision=0, label="points").props("dense dark outlined")
-        self._points.style("width: 90px")
-        ui.button("Step", icon="skip_next", on_click=self._step).props("dense unelevated color=secondary")
-        with ui.dialog() as dialog, ui.card():
+        self._points.classes("fm-points")
+        _button("Step", "skip_next", self._step)
+        with ui.dialog().props("aria-label='Stop the run?'") as dialog, ui.card():
             ui.label(f"Stop the run of '{self.key}'? Its result file keeps what was recorded.")
             with ui.row():
                 ui.button("Stop the run", color="negative", on_click=lambda: dialog.submit(True))  # noqa: FBT003  its value
                 ui.button("Cancel", on_click=lambda: dialog.submit(False)).props("flat")  # noqa: FBT003  its value
         self._dialog = dialog
-        ui.button("Stop", icon="stop", color="negative", on_click=self._stop).props("dense unelevated")
+        _button("Stop", "stop", self._stop, "negative")
 
     def _add_plots(self) -> None:
         with ui.row().classes("fm-line"):
@@ -142,22 +143,18 @@ class MeshPage:
         ui.run_javascript(f"history.replaceState(null, '', '/?' + new URLSearchParams({query}))")
 
     def _add_instances(self) -> None:
-        with ui.card().classes("fm-card").props("flat bordered"):
-            ui.label("Instances").classes("fm-title")
+        with _card("Instances"):
             self._table = InstanceTable()
 
     def _add_picture(self) -> None:
-        with ui.card().classes("fm-card").props("flat bordered"):
-            with ui.row().classes("fm-line").style("width: 100%"):
-                ui.label("Connections").classes("fm-title")
-                ui.space()
-                ui.switch("full size", on_change=self._enlarge).props("dense")
+        with _card("Connections"):
+            ui.switch("full size", on_change=self._enlarge).props("dense").classes("fm-corner")
             self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
+            self._picture.props("role=img aria-label='the instances and their connections' tabindex=0")
 
     def _add_settings(self) -> None:
         settable = self._view.catalogue.settable
-        with ui.card().classes("fm-card").props("flat bordered"):
-            ui.label("Values to set").classes("fm-title")
+        with _card("Values to set"):
             if not settable:
                 ui.label("This mesh has no unconnected input and no tunable parameter.")
                 return
@@ -169,9 +166,8 @@ class MeshPage:
             self._show_fields(first)
 
     def _add_log(self) -> None:
-        with ui.card().classes("fm-card").props("flat bordered"):
-            ui.label("Log").classes("fm-title")
-            self._log = ui.log(max_lines=500).classes("fm-log")
+        with _card("Log"):
+            self._log = ui.log(max_lines=500).classes("fm-log").props("role=log aria-label=Log tabindex=0")
 
     # --- what it shows
 
@@ -181,8 +177,9 @@ class MeshPage:
         status = view.status
         assert status is not None  # otherwise there is no page yet
         state = "ended" if view.ended and status.state not in ("done", "failed") else status.state
+        state = "failed" if view.failure is not None else state
         self._state.set_text(state)
-        self._state.props(f"color={_STATES.get(state, 'grey')}")
+        self._state.props(f"color={_STATES.get(state, 'grey-8')}")
         last = f"/{status.last_point}" if view.info is not None and view.info.stop_time is not None else ""
         parts = [
             f"t = {status.time:.6g} s",
@@ -190,10 +187,10 @@ class MeshPage:
             f"{status.points_per_second:.0f} points/s",
             f"real-time factor {status.real_time_factor:.3g}",
             *([f"{status.overruns} overruns"] if status.overruns else []),
-            *([status.error.message] if status.error is not None else []),
-            *([view.trouble] if view.trouble is not None else []),
         ]
         self._numbers.set_text(" · ".join(parts))
+        error = status.error.message if status.error is not None else None
+        self._trouble.set_text(view.failure or error or view.trouble or "")
         if not self._read_only:
             self._pausing.set_visibility(state != "paused")
             self._resuming.set_visibility(state == "paused")
@@ -265,6 +262,18 @@ class MeshPage:
         except FmuMeshError as error:
             ui.notify(str(error), type="negative", close_button=True, timeout=10000)
             return None
+
+
+def _card(title: str) -> Any:  # noqa: ANN401  an element of NiceGUI
+    """A part of the page with a title; a landmark for screen readers."""
+    with ui.card().classes("fm-card").props(f"flat bordered role=region aria-label='{title}'") as card:
+        ui.label(title).classes("fm-title").props("role=heading aria-level=2")
+    return card
+
+
+def _button(text: str, icon: str, act: Callable[[], Any], color: str = "secondary") -> ui.button:
+    """A button of the head, which on a narrow page has only its icon."""
+    return ui.button(text, icon=icon, color=color, on_click=act).props(f"dense unelevated aria-label={text}")
 
 
 def _show_span(seconds: int) -> None:

@@ -49,8 +49,10 @@ class PlotCard:
             with ui.row().classes("items-center no-wrap").style("width: 100%"):
                 choice = ui.select([*elements], value=self.names, multiple=True, label="variables", with_input=True)
                 choice.props("dense outlined use-chips").classes("col").on_value_change(self._choose)
-                ui.button(icon="close", on_click=self._remove).props("dense flat round").tooltip("Remove this plot")
-            self._chart = ui.echart(_options(self._catalogue, self.names)).classes("fm-plot")
+                ui.button(icon="close", on_click=self._remove).props(
+                    "dense flat round aria-label='Remove this plot'"
+                ).tooltip("Remove this plot")
+            self._chart = ui.echart(_options(self._catalogue, self.names)).classes("fm-plot").props("role=img")
         self._tell()
 
     def _choose(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
@@ -62,6 +64,7 @@ class PlotCard:
         self._changed()
 
     def _tell(self) -> None:
+        self._chart.props["aria-label"] = f"curves over time of {', '.join(self.names) or 'no variable'}"
         ui.run_javascript(f"fmuMeshPlots.plot({self._chart.id}, {json.dumps(self.names)})")
 
     def _remove(self) -> None:

@@ -46,6 +46,9 @@ class SettingField:
             if variable.description:
                 label.tooltip(variable.description)
             self._element = self._make()
+            for element in (self._element, self._slider):
+                if element is not None:
+                    element.props["aria-label"] = name
             self._answer = ui.label().classes("text-caption fm-numbers")
 
     def show(self, value: Any) -> None:  # noqa: ANN401  the type follows from the variable

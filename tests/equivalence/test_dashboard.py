@@ -228,7 +228,7 @@ def test_values_that_are_not_recorded_are_asked_for(place: Place) -> None:
     place.run("stop", "pair")
 
 
-def test_the_time_in_which_nobody_looked_is_a_gap_of_a_value_that_is_not_recorded(place: Place) -> None:
+def test_time_in_which_nobody_looked_is_a_gap_of_unrecorded_values(place: Place) -> None:
     config = write_config(
         place.folder,
         stop_time=3600.0,

@@ -7,7 +7,9 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
+from PIL import Image
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -29,6 +31,8 @@ class Drive(fmu_mesh.Component):
     y = fmu_mesh.Output(0.0, unit="m/s")
 
     def step(self, time, step_size):
+        if self.speed > 9.0:
+            raise RuntimeError("the drive is broken")
         self.y = 0.0 if self.brake else self.speed + 100.0 * self.mode
 """
 
@@ -95,6 +99,99 @@ def test_the_page_shows_the_run_from_its_start_and_asks_no_other_host(place: Pla
         page.driver.refresh()
         wait_until(lambda: page.state == "running" and page.curve("pendulum.a"), "the same page again")
     place.run("stop", "pair")
+
+
+def test_no_line_is_drawn_over_the_time_in_which_nobody_looked(place: Place) -> None:
+    recorded = {"file": "pair.csv", "variables": ["pendulum.a"]}
+    config = write_config(place.folder, stop_time=3600.0, simulation=PACED, record=recorded)
+    place.start("launch", config, "--no-progress")
+    dashboard = Dashboard(place)
+
+    with browser(place.folder) as page:
+        page.driver.get(f"{dashboard.url}&mesh=fmu_mesh/pair&curve=0:delay.y&curve=1:pendulum.a")
+        wait_until(lambda: len(page.curve("delay.y")) > 10, "some values")
+        process = psutil.Process(dashboard.process.pid)
+        process.suspend()
+        try:
+            asleep = page.curve("delay.y")[-1][0] + 2.0
+            wait_until(lambda: _status(place, "pair")["time"] > asleep, "2 s of simulation")
+        finally:
+            process.resume()
+        wait_until(lambda: page.curve("delay.y")[-1:] > [[asleep + 0.5]], "values after it woke")
+        seen = [time for time, _ in page.curve("delay.y") if time < asleep]
+
+        drawn = wait_until(lambda: line if (line := page.line(0))[-1:] > [[asleep + 0.5]] else None, "both parts")
+        assert [seen[-1], None] in drawn
+        assert all(value is not None for _, value in page.line(1)[:-1])  # what is recorded has no gap
+    place.run("stop", "pair")
+
+
+_CONTRASTS = """
+const luminance = (rgb) => rgb.map((c) => (c /= 255) <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)
+  .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+const numbers = (color) => color.match(/[0-9.]+/g).map(Number);
+const ground = (e) => { for (; e; e = e.parentElement) {
+  const own = numbers(getComputedStyle(e).backgroundColor); if ((own[3] ?? 1) > 0.5) return own.slice(0, 3); } };
+const texts = [...document.querySelectorAll('header *')].filter((e) =>
+  e.getClientRects().length && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()));
+return texts.map((e) => { const ink = numbers(getComputedStyle(e).color), under = ground(e), a = ink[3] ?? 1;
+  const pair = [luminance(ink.slice(0, 3).map((c, i) => a * c + (1 - a) * under[i])), luminance(under)].sort();
+  return [e.innerText, (Math.max(...pair) + 0.05) / (Math.min(...pair) + 0.05)]; });
+"""
+"""The texts of the head, each with its contrast to what is behind it (WCAG 2.2, 1.4.3)."""
+_NAMED = {
+    "button",
+    "checkbox",
+    "combobox",
+    "dialog",
+    "image",
+    "log",
+    "region",
+    "slider",
+    "spinbutton",
+    "switch",
+    "textbox",
+}
+
+
+def test_the_page_can_be_read_in_both_themes_on_phones_and_aloud(place: Place) -> None:
+    place.start("launch", _drive(place), "--no-progress")
+    dashboard = Dashboard(place)
+
+    with browser(place.folder) as page:
+        _open(page, dashboard.url)
+        wait_until(lambda: page.instances, "the graph of the mesh")
+        for theme, least, most in (("light", 200.0, 255.0), ("dark", 0.0, 60.0)):
+            page.show_as(theme, 1280, 800)
+            wait_until(lambda: least <= _mean(page.picture(".fm-columns")) <= most, f"the {theme} theme")  # noqa: B023  called now
+            assert least <= _mean(page.picture(".fm-graph")) <= most
+            assert least <= _mean(page.picture(".fm-plot")) <= most
+            contrasts = page.run(_CONTRASTS)
+            assert len(contrasts) > 5
+            assert [text for text, contrast in contrasts if contrast < 4.5] == []
+
+        page.show_as("dark", 390, 844)
+        wait_until(lambda: page.run("return document.querySelector('header').offsetHeight") <= 0.12 * 844, "a low head")
+        assert page.run("return document.documentElement.scrollWidth") <= 390
+        spoken = page.spoken()
+        assert [part for part in spoken if part[0] in _NAMED and not part[1]] == []
+        assert {"banner", "main", "status", "log", "table"} <= {role for role, _ in spoken}
+        assert {
+            ("button", "Pause"),
+            ("slider", "drive.speed"),
+            ("switch", "drive.brake"),
+            ("spinbutton", "gain.k"),
+        } <= {*spoken}
+        assert page.run("return document.documentElement.lang").startswith("en")
+
+        place.run("set", "drive.speed", "9.5")
+        wait_until(lambda: page.state == "failed", "the failure")
+        assert "RuntimeError: the drive is broken" in page.text
+
+
+def _mean(picture: Image.Image) -> float:
+    """The mean of all grey values, from 0 to 255."""
+    return float(np.asarray(picture.convert("L")).mean())
 
 
 def test_its_elements_steer_the_mesh_and_set_values(place: Place) -> None:
