@@ -141,8 +141,8 @@ class Browser:
         """Show the page as to a person who wants a dark or a light theme, in a window of this size."""
         wanted = {"features": [{"name": "prefers-color-scheme", "value": theme}]}
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
-        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", wanted)  # type: ignore[attr-defined]  # of Chromium
-        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)  # type: ignore[attr-defined]  # as above
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", wanted)
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
 
     def picture(self, selector: str) -> Image.Image:
         """A picture of the first such element."""
@@ -150,7 +150,7 @@ class Browser:
 
     def spoken(self) -> list[tuple[str, str]]:
         """The role and the name of all that a screen reader tells of."""
-        nodes = self.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]  # type: ignore[attr-defined]  # of Chromium
+        nodes = self.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
         return [
             (node["role"]["value"], node.get("name", {}).get("value", "")) for node in nodes if not node.get("ignored")
         ]

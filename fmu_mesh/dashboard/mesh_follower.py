@@ -225,7 +225,7 @@ class MeshFollower:
             logger = threading.Thread(target=self._read_log, args=(run,), name="log", daemon=True)
             for thread in (sampler, logger):
                 thread.start()
-            with suppress(DeadlineExceeded):
+            with suppress(FmuMeshError):
                 run.wait(0.0)  # from now on the handle knows how the run ends
             try:
                 while not (ended.is_set() or self._closing.is_set()):
@@ -233,7 +233,8 @@ class MeshFollower:
                     ended.wait(_LOOK_S)
             finally:
                 if not self._closing.is_set():
-                    self._change(ended=True, failure=_failure(run))
+                    failure, last = _failure(run), {n: _at_its_end(own) for n, own in self._view.instances.items()}
+                    self._change(ended=True, failure=failure, instances=last, before=last)
                 self._run = None
         # The thread of the log ends with the mesh, or with the session that `attach` closes.
 
@@ -330,11 +331,15 @@ def _failure(run: Run) -> str | None:
     """Why a run has failed that is at its end."""
     try:
         run.wait(_AGAIN_S)
-    except (DeadlineExceeded, Interrupted):
-        return None
     except FmuMeshError as error:
-        return str(error)
+        return None if isinstance(error, DeadlineExceeded | Interrupted) else str(error)
     return None
+
+
+def _at_its_end(own: InstanceStatus) -> InstanceStatus:
+    """What is known of an instance that runs no more."""
+    state = own.state if own.state in ("done", "failed") else "ended"
+    return msgspec.structs.replace(own, state=state, activity="")
 
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:

@@ -187,6 +187,8 @@ def test_the_page_can_be_read_in_both_themes_on_phones_and_aloud(place: Place) -
         place.run("set", "drive.speed", "9.5")
         wait_until(lambda: page.state == "failed", "the failure")
         assert "RuntimeError: the drive is broken" in page.text
+        graph = "return document.querySelector('.fm-graph').textContent"
+        wait_until(lambda: "ended" in page.run(graph) and "points/s" not in page.run(graph), "the end in the graph")
 
 
 def _mean(picture: Image.Image) -> float:
