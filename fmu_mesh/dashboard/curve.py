@@ -126,26 +126,26 @@ class Looks:
         self._least = self._usual = usual
         self._number = 0
         self._began = math.inf
-        self._last: dict[str, tuple[int, float]] = {}
+        self._last: dict[str, tuple[int, float, float]] = {}
 
     def begin(self, now: float) -> None:
-        """Begin a look at a wall-clock time. A late one follows none: the process slept, or waited for an answer."""
-        took, latest = now - self._began, _SLOW * self._usual
-        self._number += 1 if took < latest else 2
-        self._usual += 0.1 * (min(max(took, self._least), latest) - self._usual)
-        self._began = now
+        """Begin a look at a wall-clock time in s."""
+        self._usual += 0.1 * (min(max(now - self._began, self._least), 2.0 * self._usual) - self._usual)
+        self._number, self._began = self._number + 1, now
 
-    def after(self, name: str, time: float, step: float) -> float | None:
+    def after(self, name: str, now: float, time: float, step: float) -> float | None:
         """Take the time of a value, and give that of the value before; None if values may be missing between them.
 
         Args:
             name: of the variable.
+            now: when the value came. A late one follows none: the process slept, or waited for the answer.
             time: in s.
             step: the time from one value to the next one in s: within it, none is missing.
         """
-        number, before = self._last.get(name, (-1, -math.inf))
-        self._last[name] = self._number, time
-        return before if number == self._number - 1 or time - before < _LATE * step else None
+        number, looked, before = self._last.get(name, (-1, -math.inf, -math.inf))
+        self._last[name] = self._number, now, time
+        is_next = number == self._number - 1 and now - looked < _SLOW * self._usual
+        return before if is_next or time - before < _LATE * step else None
 
 
 class _Intervals:

@@ -319,7 +319,7 @@ class MeshFollower:
             own = self._view.catalogue.variables[variable]
             # Of two points of the instance none lies between them, and what cannot change was known all the time.
             step = self._view.infos[name.partition(".")[0]].step_size if own.variability not in _CONSTANT else np.inf
-            after = looks.after(name, sample.time, step)
+            after = looks.after(name, time.monotonic(), sample.time, step)
             with self._lock:
                 if (curve := self._curves.get(name)) is not None:
                     curve.add(np.array([sample.time]), np.array([value]), after)

@@ -218,7 +218,7 @@ def _continued(looks: Looks, times: Mapping[float, float], step: float) -> list[
     found = []
     for now, time in times.items():
         looks.begin(now)
-        found.append(looks.after("a.x", time, step) is not None)
+        found.append(looks.after("a.x", now, time, step) is not None)
     return found
 
 
@@ -238,6 +238,15 @@ def test_a_late_look_begins_a_line_and_slow_looks_do_not() -> None:
 
     assert late == [False, True, False, True]
     assert slow[-50:] == [True] * 50
+
+
+def test_a_value_for_which_an_answer_took_long_begins_a_line() -> None:
+    looks = Looks(0.05)
+    _continued(looks, {0.0: 1.0, 0.05: 1.5}, 0.01)
+
+    looks.begin(0.1)  # and now the process sleeps
+
+    assert looks.after("a.x", 3.0, 4.5, 0.01) is None
 
 
 def test_nothing_is_missing_between_two_points_of_a_slow_instance() -> None:
