@@ -138,13 +138,13 @@ class Looks:
 
         Args:
             name: of the variable.
-            now: when the value came. A late one follows none: the process slept, or waited for the answer.
+            now: when the value came. It may be as old as its question, so the time since the look before began counts.
             time: in s.
             step: the time from one value to the next one in s: within it, none is missing.
         """
-        number, looked, before = self._last.get(name, (-1, -math.inf, -math.inf))
-        self._last[name] = self._number, now, time
-        is_next = number == self._number - 1 and now - looked < _SLOW * self._usual
+        number, began, before = self._last.get(name, (-1, -math.inf, -math.inf))
+        self._last[name] = self._number, self._began, time
+        is_next = number == self._number - 1 and now - began < _SLOW * self._usual
         return before if is_next or time - before < _LATE * step else None
 
 

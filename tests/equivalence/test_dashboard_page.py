@@ -120,7 +120,9 @@ def test_no_line_is_drawn_over_the_time_in_which_nobody_looked(place: Place) -> 
         wait_until(lambda: sum(time > asleep for time, _ in page.curve("delay.y")) > 5, "values after it woke")
         seen = [time for time, _ in page.curve("delay.y") if time < asleep]
 
-        drawn = wait_until(lambda: line if (line := page.line(0)) and line[-1][0] > asleep else None, "both parts")
+        drawn = wait_until(
+            lambda: line if (line := page.line(0)) and (line[-1][0] or 0.0) > asleep else None, "both parts"
+        )
         assert [seen[-1], None] in drawn
         assert all(value is not None for _, value in page.line(1)[:-1])  # what is recorded has no gap
     place.run("stop", "pair")

@@ -244,9 +244,12 @@ def test_a_value_for_which_an_answer_took_long_begins_a_line() -> None:
     looks = Looks(0.05)
     _continued(looks, {0.0: 1.0, 0.05: 1.5}, 0.01)
 
-    looks.begin(0.1)  # and now the process sleeps
+    looks.begin(0.1)  # and now the process sleeps, with the answer on its way
+    old = looks.after("a.x", 3.0, 2.0, 0.01)
+    looks.begin(3.05)
 
-    assert looks.after("a.x", 3.0, 4.5, 0.01) is None
+    assert old is None
+    assert looks.after("a.x", 3.05, 4.5, 0.01) is None
 
 
 def test_nothing_is_missing_between_two_points_of_a_slow_instance() -> None:
