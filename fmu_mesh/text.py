@@ -16,6 +16,7 @@ from .printing import printable
 __all__ = [
     "EXPRESSION",
     "WILDCARDS",
+    "counted",
     "is_pattern",
     "listed",
     "matched",
@@ -77,6 +78,11 @@ def listed(names: Sequence[str], *, nothing: str = "none") -> str:
         return nothing
     rest = len(names) - _LISTED_NAMES
     return ", ".join(names[:_LISTED_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def counted(number: int, what: str) -> str:
+    """`1 row`, `2 rows`, `0 processes`."""
+    return f"{number} {what}{'' if number == 1 else 'es' if what.endswith('s') else 's'}"
 
 
 def shown(value: object) -> str:

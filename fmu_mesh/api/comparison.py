@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 
 from ..printing import page
-from ..text import listed, short_number
-from .tables import shortened, table
+from ..text import counted, listed, short_number
+from .tables import html_table, shortened, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,6 +21,7 @@ Rows = Literal["same", "common", "interpolated"]
 _NAME = 32
 _SHOWN = 40
 _DRAWN = 6
+_HEADING = ("variable", "rows", "largest difference", "at", "relative", "at", "")
 
 
 class FirstDifference(msgspec.Struct, frozen=True):
@@ -125,21 +126,24 @@ class Comparison(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         return self.text
 
+    def __repr__(self) -> str:
+        return f"<Comparison: {self._head()}>"
+
+    def _repr_html_(self) -> str:
+        order, title = self._most_different, " ".join([self._head(), *self._first_text()])
+        rows = (_cells(name, self.differences[name], self.rows) for name in order)
+        return html_table(title, _HEADING, rows, len(order))
+
     @property
     def text(self) -> str:
         """What is different, as a sentence and a table: the message of a test that failed."""
-        lines = [self._head()]
-        if self.first is not None:
-            first = self.first
-            values = f"{_shown(first.here)} in {self.here}, {_shown(first.there)} in {self.there}"
-            lines.append(f"first at t = {short_number(first.time)} s, point {first.point}: {first.variable}: {values}")
+        lines = [self._head(), *self._first_text()]
         lines += [f"calculated on other machines: {self.note}"] if self.note else []
         lines += self._rows_text()
         if self.differences:
-            order = sorted(self.differences, key=lambda name: -self.differences[name].rows)
+            order = self._most_different
             cells = [_cells(name, self.differences[name], self.rows) for name in order[:_SHOWN]]
-            heading = ["variable", "rows", "largest difference", "at", "relative", "at", ""]
-            lines += ["", *table(cells, heading=heading)]
+            lines += ["", *table(cells, heading=_HEADING)]
             lines += [f"and {len(order) - _SHOWN} more"] if len(order) > _SHOWN else []
         for names, where in ((self.only_here, self.here), (self.only_there, self.there)):
             lines += [f"only in {where}: {listed(names)}"] if names else []
@@ -159,19 +163,28 @@ class Comparison(msgspec.Struct, frozen=True):
             ConfigurationError: there is no such variable, or matplotlib is not installed.
         """
         assert self.drawn is not None  # `Result.compare` gives it
-        order = sorted(self.differences, key=lambda name: -self.differences[name].rows)
-        drawable = [name for name in order if self.differences[name].largest is not None]
+        drawable = [name for name in self._most_different if self.differences[name].largest is not None]
         return self.drawn(names or drawable[:_DRAWN] or self.compared[:_DRAWN])
+
+    @property
+    def _most_different(self) -> list[str]:
+        return sorted(self.differences, key=lambda name: -self.differences[name].rows)
+
+    def _first_text(self) -> list[str]:
+        if (first := self.first) is None:
+            return []
+        values = f"{_shown(first.here)} in {self.here}, {_shown(first.there)} in {self.there}"
+        return [f"first at t = {short_number(first.time)} s, point {first.point}: {first.variable}: {values}"]
 
     def _head(self) -> str:
         limits = [f"{name} {value:g}" for name, value in (("rtol", self.rtol), ("atol", self.atol)) if value]
         within = f" within {', '.join(limits)}" if limits else ""
-        what = f"{_count(len(self.compared), 'variable')}, {_count(self.rows, 'row')}"
+        what = f"{counted(len(self.compared), 'variable')}, {counted(self.rows, 'row')}"
         if self.equal:
             return f"{self.here} and {self.there} are equal{within}: {what}"
         differing = sum(difference.rows > 0 for difference in self.differences.values())
-        parts = [f"{differing} of {_count(len(self.compared), 'variable')}"] if differing else []
-        parts += [f"{_count(len(self.only_here) + len(self.only_there), 'variable')} only in one"] * bool(
+        parts = [f"{differing} of {counted(len(self.compared), 'variable')}"] if differing else []
+        parts += [f"{counted(len(self.only_here) + len(self.only_there), 'variable')} only in one"] * bool(
             self.only_here or self.only_there
         )
         parts += ["the span of time"] * bool(self.rows_only_here or self.rows_only_there)
@@ -181,12 +194,14 @@ class Comparison(msgspec.Struct, frozen=True):
     def _rows_text(self) -> list[str]:
         lines = []
         if self.matching == "common":
-            lines.append(f"compared at the {_count(self.rows, 'time')} that both have")
+            lines.append(f"compared at the {counted(self.rows, 'time')} that both have")
         if self.matching == "interpolated":
             how = "floats linearly, others held"
-            lines.append(f"compared at {_count(self.rows, 'time')} of {self.here}; {self.there} is interpolated: {how}")
+            lines.append(
+                f"compared at {counted(self.rows, 'time')} of {self.here}; {self.there} is interpolated: {how}"
+            )
         for count, where in ((self.rows_only_here, self.here), (self.rows_only_there, self.there)):
-            lines += [f"{_count(count, 'row')} of {where} before or after all of the other"] if count else []
+            lines += [f"{counted(count, 'row')} of {where} before or after all of the other"] if count else []
         return lines
 
 
@@ -212,7 +227,3 @@ def _cells(name: str, difference: VariableDifference, rows: int) -> list[str]:
 
 def _shown(value: object) -> str:
     return repr(value) if isinstance(value, float | str | bytes) else str(value)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

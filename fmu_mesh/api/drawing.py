@@ -120,9 +120,10 @@ def empty_figure() -> Figure:
     require_matplotlib()
     # The object interface: no window, no global state of pyplot.
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
-    from matplotlib.figure import Figure  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
-    figure = Figure(dpi=120, layout="constrained")
+    from .shown_figure import ShownFigure  # noqa: PLC0415  as above
+
+    figure = ShownFigure(dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -11,6 +10,7 @@ from ..printing import printable
 from .drawing import empty_figure
 from .graph_drawing import Box, Drawing, DrawnWire, Label
 from .graph_layout import Dot
+from .tables import escaped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +81,7 @@ def svg_of_drawing(drawing: Drawing) -> str:
         by_edge.setdefault(wire.edge, []).append(wire)
     for edge, wires in by_edge.items():
         source, target = drawing.edges[edge]
-        lines.append(f'<g class="edge" data-source="{_escaped(source)}" data-target="{_escaped(target)}">')
+        lines.append(f'<g class="edge" data-source="{escaped(source)}" data-target="{escaped(target)}">')
         for wire in wires:
             dashes = ' stroke-dasharray="6 4"' if wire.dashed else ""
             commands = "".join(
@@ -90,13 +90,13 @@ def svg_of_drawing(drawing: Drawing) -> str:
             lines.append(
                 f'<g><path d="{commands}" fill="none" stroke="{wire.colour}" stroke-width="{wire.width}"{dashes}/>'
                 f'<polygon points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in _arrow(wire.path[-1]))}" '
-                f'fill="{wire.colour}"/><title>{_escaped(wire.tip)}</title></g>'
+                f'fill="{wire.colour}"/><title>{escaped(wire.tip)}</title></g>'
             )
         lines.append("</g>")
     for instance in drawing.instances:
-        lines.append(f'<g class="instance" data-instance="{_escaped(instance.name)}">')
+        lines.append(f'<g class="instance" data-instance="{escaped(instance.name)}">')
         lines.append(_rect(instance.box, "#ffffff", instance.border, 2.4 if instance.is_in_cycle else 1.2, 5.0))
-        lines.append(f"<title>{_escaped(instance.name)}</title>")
+        lines.append(f"<title>{escaped(instance.name)}</title>")
         if instance.dot is not None:
             x, y, colour = instance.dot
             lines.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>')
@@ -116,12 +116,8 @@ def _svg_text(label: Label) -> str:
     anchor = ' text-anchor="end"' if label.anchor == "end" else ""
     return (
         f'<text x="{label.x:.1f}" y="{label.y:.1f}" font-size="{label.size:g}" fill="{label.colour}"{bold}{anchor}>'
-        f"{_escaped(label.text)}</text>"
+        f"{escaped(label.text)}</text>"
     )
-
-
-def _escaped(text: str) -> str:
-    return html.escape(printable(text), quote=True)
 
 
 # --- matplotlib

@@ -18,9 +18,9 @@ from ..instances.registry import KINDS, describe
 from ..printing import page, printable
 from ..run.options import checked
 from ..ssp.configuration_files import names_package
-from ..text import listed, matching, nearest, nearest_file, short_number, shown
+from ..text import counted, listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
-from .tables import pairs
+from .tables import html_table, pairs
 
 __all__ = ["SHOWN_VARIABLES", "Inspection", "inspect", "with_way_out"]
 
@@ -100,6 +100,22 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
 
     def __str__(self) -> str:
         return self.page()
+
+    def __repr__(self) -> str:
+        return f"<Inspection of {self._in_short}>"
+
+    @property
+    def _in_short(self) -> str:
+        runs = "runs here" if self.runs_here else "cannot run here"
+        return f"{self.file}: {_kind(self.description)}, {counted(len(self.description.variables), 'variable')}, {runs}"
+
+    def _repr_html_(self) -> str:
+        order = [causality for causality, _ in _CAUSALITIES]
+        variables = sorted(self.description.variables, key=lambda own: order.index(own.causality))
+        rows = ((v.name, v.causality, v.type_name, v.variability, _start(v), v.description) for v in variables)
+        title = ". ".join([self._in_short, *self.problems[:1]])
+        heading = ["variable", "causality", "type", "variability", "start value", "description"]
+        return html_table(title, heading, rows, len(variables))
 
 
 @checked
@@ -210,7 +226,6 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     if indicators := description.event_indicators:
         states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
-    kinds = " or ".join(_KIND_WORDS[kind] for kind in description.kinds)
     platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
@@ -218,11 +233,11 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("SHA-256", inspection.sha256 or ""),
         ("Model", description.model_name),
         ("Description", description.description or ""),
-        ("Kind", f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")),
+        ("Kind", _kind(description)),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
-        ("Platforms", platforms or ("none" if kinds else "")),
+        ("Platforms", platforms or ("none" if description.kinds else "")),
         ("Runs here", "yes" if inspection.runs_here else "no, see Problems"),
         ("Can", ", ".join(can)),
         ("Needs", ", ".join(needs)),
@@ -234,6 +249,11 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     lines = pairs((name, " ".join(value.split())) for name, value in facts)
     indent = " " * (2 + max(len(name) for name, value in facts if value))
     return [part for line in lines for part in _wrapped(line, width, indent)]
+
+
+def _kind(description: ModelDescription) -> str:
+    kinds = " or ".join(_KIND_WORDS[kind] for kind in description.kinds)
+    return f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")
 
 
 _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}

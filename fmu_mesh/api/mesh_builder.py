@@ -23,11 +23,12 @@ from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, ch
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
-from ..text import listed, shown
+from ..text import counted, listed, shown
 from .mesh_check import Check
 from .plan_options import memory_file, with_record
 from .rebasing import rebased
 from .run_handle import Run
+from .tables import html_table, shortened
 
 if TYPE_CHECKING:
     from ..errors import Finding
@@ -170,6 +171,21 @@ class Mesh:
     def _take(self, values: PlainConfig, known: KnownModels | None = None) -> None:
         self._plain = values
         self._known = known or KnownModels()
+
+    def __repr__(self) -> str:
+        return f"<Mesh {self._in_short}>"
+
+    def _repr_html_(self) -> str:
+        instances = _mapping(_mapping(self._plain.data).get("instances"))
+        rows = ((name, _in_words(own), _in_words(_mapping(own).get("start_values"))) for name, own in instances.items())
+        return html_table(self._in_short, ["instance", "what it is", "start values"], rows, len(instances))
+
+    @property
+    def _in_short(self) -> str:
+        data = _mapping(self._plain.data)  # a file may say anything
+        found = ((what, data.get(f"{what}s")) for what in ("instance", "connection"))
+        counts = (counted(len(own) if isinstance(own, dict | list) else 0, what) for what, own in found)
+        return f"{shortened(str(data.get('mesh')), 40)}: {', '.join(counts)}"
 
     # --- building
 
@@ -540,6 +556,15 @@ class Mesh:
         if not isinstance(section, dict):
             raise ConfigurationError(f"'{key}' of '{self._plain.file}' is {shown(section)}, where a mapping should be")
         return section
+
+
+def _mapping(data: object) -> dict[str, Any]:
+    return data if isinstance(data, dict) else {}
+
+
+def _in_words(data: object) -> str:
+    """The keys of a section that have plain values."""
+    return ", ".join(f"{key}: {one}" for key, one in _mapping(data).items() if not isinstance(one, dict))
 
 
 @checked

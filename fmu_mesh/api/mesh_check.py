@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 
 from ..errors import ConfigurationError, Finding
 from ..printing import page
 from ..run.run_plan import RunPlan
+from ..text import counted
 from .plan_page import plan_page
 from .plan_view import PlanView, plan_view
+from .tables import html_table
 
 __all__ = ["Check"]
 
@@ -71,6 +75,20 @@ class Check(msgspec.Struct, frozen=True):
             raise self.error
         assert self.run is not None
         return self.run
+
+    def __repr__(self) -> str:
+        verdict = "can run" if self else counted(len(self.findings), "finding")
+        return f"<Check of {self.file}: {verdict}, {counted(len(self.warnings), 'warning')}>"
+
+    def _repr_html_(self) -> str:
+        told = [*self.findings, *(self.run.plan.system.warnings if self.run is not None else ())]
+        title = f"OK: {self.file} can run." if self else f"{self.file} cannot run."
+        if told:
+            cells = ((one.path or one.file, one.found, one.expected, one.suggestion) for one in told)
+            return html_table(title, ["place", "found", "expected", "did you mean"], cells, len(told))
+        instances = self.require().plan.system.instances
+        rows = ((own.name, Path(own.fmu).name, own.node) for own in instances.values())
+        return html_table(title, ["instance", "model", "process"], rows, len(instances))
 
     def __bool__(self) -> bool:
         return self.error is None

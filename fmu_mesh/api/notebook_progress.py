@@ -1,64 +1,90 @@
-"""A progress bar below the cell of a notebook, while a program waits for a run. Elsewhere nothing is shown."""
+"""Waits for a run or a sweep; in a notebook, a progress bar is below the cell meanwhile."""
 
 from __future__ import annotations
 
-import html
 import sys
-from types import TracebackType
-from typing import Any, Self
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any, NamedTuple, TypeVar
 
+from ..errors import DeadlineExceeded
 from ..simtime import ENDLESS
 from ..wire.views import MeshStatus
+from .tables import escaped
 
-__all__ = ["NotebookProgress"]
+__all__ = ["Progress", "awaited", "progress_of"]
+
+_LOOK_S = 0.2
+
+Ended = TypeVar("Ended")
 
 
-class NotebookProgress:
-    """Shows the status of a run.
+class Progress(NamedTuple):
+    """How far something is: in words, and as a part of a total, which may be unknown."""
+
+    text: str
+    done: int
+    total: int | None
+
+    @property
+    def html(self) -> str:
+        """A bar with the words."""
+        bar = f"<progress value='{self.done}' max='{self.total}'></progress> " if self.total is not None else ""
+        return bar + escaped(self.text)
+
+
+def progress_of(name: str, status: MeshStatus) -> Progress:
+    """How far the run of the mesh with this name is."""
+    total = status.last_point if status.last_point < ENDLESS else None
+    of = f" of {total}" if total is not None else ""
+    text = f"{name}: {status.state}, point {status.point}{of}, {status.points_per_second:.0f} points/s"
+    return Progress(text, status.point, total)
+
+
+def awaited(future: Future[Ended], timeout: float | None, what: str, progress: Callable[[], Progress | None]) -> Ended:
+    """The result of a run or a sweep, when it has ended.
 
     Args:
-        name: name of the mesh.
-        display: the function `display` of IPython; None shows nothing.
+        future: gets the result.
+        timeout: the longest time to wait in s; None: no limit.
+        what: the run or the sweep, as the error names it.
+        progress: how far it is; None while nothing is known.
+
+    Raises:
+        DeadlineExceeded: it goes on after this time.
+        BaseException: the error with which it has ended.
     """
+    end = time.monotonic() + timeout if timeout is not None else None
+    display, bar = _display(), None
+    try:
+        while True:
+            left = _LOOK_S if end is None else min(_LOOK_S, end - time.monotonic())
+            try:
+                return future.result(max(left, 0.0))
+            except TimeoutError:
+                if future.done():
+                    raise  # an error that happens to be of this class
+                if end is not None and time.monotonic() >= end:
+                    text = f"{what} has not ended within {timeout:g} s"
+                    raise DeadlineExceeded(text, hint="It goes on; wait again, or end it.") from None
+            if display is None or (now := progress()) is None:
+                continue
+            shown = {"text/html": now.html, "text/plain": now.text}
+            if bar is None:
+                bar = display(shown, raw=True, display_id=True)
+            else:
+                bar.update(shown, raw=True)
+    finally:
+        if bar is not None:
+            bar.update({"text/plain": ""}, raw=True)
 
-    def __init__(self, name: str, display: Any | None) -> None:  # noqa: ANN401  IPython has no types for it
-        self._name = name
-        self._display = display
-        self._handle: Any = None
 
-    @classmethod
-    def here(cls, name: str) -> Self:
-        """A progress bar if this program is a notebook, and one that shows nothing otherwise."""
-        shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-        if not hasattr(shell, "kernel"):  # a terminal has none, and a program that imports ipykernel has no shell
-            return cls(name, None)
-        from IPython.display import display  # noqa: PLC0415  only a notebook has it
+def _display() -> Any | None:  # noqa: ANN401  IPython has no types for it
+    """The function `display` of IPython if this program is a notebook."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if not hasattr(shell, "kernel"):  # a terminal has none, and a program that imports ipykernel has no shell
+        return None
+    from IPython.display import display  # noqa: PLC0415  only a notebook has it
 
-        return cls(name, display)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._handle is not None:
-            self._handle.update({"text/plain": ""}, raw=True)
-
-    def update(self, status: MeshStatus) -> None:
-        """Show a status."""
-        if self._display is None:
-            return
-        shown = {"text/html": self._html(status), "text/plain": self._text(status)}
-        if self._handle is None:
-            self._handle = self._display(shown, raw=True, display_id=True)
-        else:
-            self._handle.update(shown, raw=True)
-
-    def _text(self, status: MeshStatus) -> str:
-        of = f" of {status.last_point}" if status.last_point < ENDLESS else ""
-        return f"{self._name}: {status.state}, point {status.point}{of}, {status.points_per_second:.0f} points/s"
-
-    def _html(self, status: MeshStatus) -> str:
-        bar = f"<progress value='{status.point}' max='{status.last_point}'></progress> "
-        return (bar if status.last_point < ENDLESS else "") + html.escape(self._text(status))
+    return display

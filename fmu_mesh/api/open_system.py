@@ -104,6 +104,9 @@ class System:
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return f"<System {self._run.mesh}: {self._mode}, point {self.point}, {self.time:g} s>"
+
     @property
     def time(self) -> float:
         """The simulation time in s that all instances have reached."""
@@ -399,6 +402,9 @@ class SystemState:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def __repr__(self) -> str:
+        return f"<SystemState: point {self.point}{', closed' if self.closed else ''}>"
 
     @property
     def closed(self) -> bool:

@@ -28,7 +28,7 @@ from ..ssp.system_structure import (
     StructureSystem,
     components_of,
 )
-from ..text import printable, short_number
+from ..text import counted, printable, short_number
 from .tables import pairs, table
 
 __all__ = ["PackageInspection", "inspect_package"]
@@ -151,6 +151,9 @@ class PackageInspection(msgspec.Struct, frozen=True, omit_defaults=False):
 
     def __str__(self) -> str:
         return self.page
+
+    def __repr__(self) -> str:
+        return f"<PackageInspection of {self.file}: SSP {self.version}, {_counts(self)}>"
 
 
 @checked
@@ -326,15 +329,17 @@ def _experiment(found: PackageInspection) -> str:
 def _counts(found: PackageInspection) -> str:
     kinds = Counter(element.kind for element in found.elements)
     systems = f" in {kinds['system']} systems" if kinds["system"] > 1 else ""
-    return f"{_many(kinds['component'], 'component')}{systems}, {_many(found.connections, 'connection')} between them"
+    return (
+        f"{counted(kinds['component'], 'component')}{systems}, {counted(found.connections, 'connection')} between them"
+    )
 
 
 def _row(element: PackageElement) -> list[str]:
     """An element of the tree, indented below the system that it is in."""
     name = "  " * len(element.path) + (_line(element.path[-1]) if element.path else "the system")
-    connectors = ", ".join(_many(count, kind) for kind, count in element.connectors.items())
+    connectors = ", ".join(counted(count, kind) for kind, count in element.connectors.items())
     if element.kind == "system":
-        return [name, "", _many(element.connections, "connection"), "", connectors]
+        return [name, "", counted(element.connections, "connection"), "", connectors]
     differs = element.instance is not None and element.path != (element.instance,)
     instance = f"instance {element.instance}" if differs else ""
     implementation = "" if element.implementation == "any" else str(element.implementation)
@@ -345,11 +350,7 @@ def _values(source: PackageParameters) -> list[str]:
     element = " / ".join(map(_line, source.element)) or "the system"
     mapping = f"mapped by {source.mapping}" if source.mapping is not None else ""
     prefix = f"prefix '{_line(source.prefix)}'" if source.prefix else ""
-    return [f"{source.file}:{source.line}", _many(source.parameters, "parameter"), f"of {element}", prefix, mapping]
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    return [f"{source.file}:{source.line}", counted(source.parameters, "parameter"), f"of {element}", prefix, mapping]
 
 
 def _times(what: str, count: int) -> str:

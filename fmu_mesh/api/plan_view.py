@@ -13,6 +13,7 @@ from ..system.schedule import Schedule
 from ..system.series_files import course_of
 from ..system.system import SystemInstance
 from ..system.value_map import map_words
+from ..text import counted
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .plan_page import start_value_origin
@@ -113,6 +114,10 @@ class PlanView(msgspec.Struct, frozen=True):
     scenario: list[PlannedSchedule]
     warnings: tuple[Finding, ...]
     library: str | None
+
+    def __repr__(self) -> str:
+        counts = f"{counted(len(self.instances), 'instance')}, {counted(len(self.connections), 'connection')}"
+        return f"<PlanView of {self.mesh}: {counts}>"
 
 
 def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:

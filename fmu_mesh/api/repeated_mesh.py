@@ -84,6 +84,9 @@ class RepeatedMesh:
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return f"<RepeatedMesh of {self._mesh!r}>"
+
     @takes(PlanOptions)
     def run(self, options: PlanOptions) -> Result:
         """Run the mesh to its end, and return what it has recorded.

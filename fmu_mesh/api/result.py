@@ -29,6 +29,7 @@ from .comparison import Comparison
 from .drawing import thinned
 from .result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
 from .result_reading import Columns, chosen_names, read_result, result_pieces
+from .tables import html_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -295,7 +296,18 @@ class Result(Mapping[str, NDArray[Any]]):
         return len(self._variables or self._head.values)
 
     def __repr__(self) -> str:
-        return f"<Result of '{self.title}': {self.summary}>"
+        known = self.outcome is not None or self._is_here
+        return f"<Result of '{self.title}': {self.summary if known else listed([*self._variables], nothing='unread')}>"
+
+    def _repr_html_(self) -> str:
+        """The variables, with the least and the largest value of those that are in memory already."""
+        columns = self._columns.values if self._is_here else dict.fromkeys(self._variables)
+        rows = ((name, self._unit(name), *_ends_of(values)) for name, values in columns.items())
+        return html_table(repr(self)[1:-1], ["variable", "unit", "least", "largest"], rows, len(columns))
+
+    @property
+    def _is_here(self) -> bool:
+        return self._given is not None or "_columns" in self.__dict__
 
     @cached_property
     def _columns(self) -> Columns:
@@ -397,6 +409,12 @@ def imported_pandas() -> ModuleType:
         raise ConfigurationError("pandas is not installed.", hint="Install it with `pip install pandas`.") from error
     module: ModuleType = pd
     return module
+
+
+def _ends_of(values: NDArray[Any] | None) -> tuple[object, object]:
+    if values is None or not len(values) or values.dtype.kind not in "fiub":
+        return None, None
+    return values.min().item(), values.max().item()
 
 
 def summary_of(outcome: Outcome, step_size: float) -> str:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from concurrent.futures import TimeoutError as NotYet
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Self, Unpack
 from ..errors import (
     CallRefused,
     ConfigurationError,
-    DeadlineExceeded,
     FmuMeshError,
     MeshLost,
 )
@@ -35,7 +32,7 @@ from ..wire.views import (
     SetAnswer,
     VariableView,
 )
-from .notebook_progress import NotebookProgress
+from .notebook_progress import Progress, awaited, progress_of
 from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, target_of, targets_of
 
@@ -50,7 +47,6 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
 
 __all__ = ["TIMEOUT_S", "Run"]
 
-_LOOK_S = 0.2
 _WAIT_S = 60.0
 
 
@@ -115,7 +111,17 @@ class Run:
 
     def __repr__(self) -> str:
         state = "closed" if self._closed else "started here" if self._own is not None else "attached"
-        return f"<Run of mesh '{self.name}' ({state})>"
+        now = self._progress()
+        return f"<Run of mesh {now.text if now is not None else self.name} ({state})>"
+
+    def _repr_html_(self) -> str | None:
+        now = self._progress()
+        return now.html if now is not None else None
+
+    def _progress(self) -> Progress | None:
+        """How far a run is that was started here; nobody is asked."""
+        status = self._own.status if self._own is not None else None
+        return progress_of(self.name, status) if status is not None else None
 
     # --- looking
 
@@ -406,7 +412,7 @@ class Run:
         """
         future = self._end()
         try:
-            return self._wait(future, timeout)
+            return awaited(future, timeout, f"the run of '{self.name}'", self._progress)
         except KeyboardInterrupt:
             if self._own is None:
                 raise
@@ -438,22 +444,6 @@ class Run:
                 self._own.join()
             self._closed = True
             self._way.close()
-
-    def _wait(self, future: Future[Result], timeout: float | None) -> Result:
-        end = time.monotonic() + timeout if timeout is not None else None
-        with NotebookProgress.here(self.name) as progress:
-            while True:
-                left = _LOOK_S if end is None else min(_LOOK_S, end - time.monotonic())
-                try:
-                    return future.result(max(left, 0.0))
-                except NotYet:
-                    if future.done():
-                        raise  # an error of the run that happens to be of this class
-                    if end is not None and time.monotonic() >= end:
-                        text = f"the run of '{self.name}' has not ended within {timeout:g} s"
-                        raise DeadlineExceeded(text, hint="It goes on; wait again, or stop it.") from None
-                if self._own is not None and self._own.status is not None:
-                    progress.update(self._own.status)
 
     def _end(self) -> Future[Result]:
         """The end of the run; that of a mesh that was found is followed on a thread."""

@@ -16,10 +16,11 @@ from msgspec.structs import replace
 from ..printing import page
 from ..system.graph import strongly_connected, topological_order
 from ..system.value_map import map_text
+from ..text import counted
 from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
 from .graph_layout import INITIAL, going_back
 from .graph_pictures import figure_of_drawing, svg_of_drawing
-from .tables import shortened, table
+from .tables import html_table, shortened, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,6 +32,8 @@ __all__ = ["SystemGraph", "graph_of", "graph_of_infos", "graph_of_plan"]
 
 _COLUMNS = 80
 _NAME = 30
+_DRAWN = 60
+"""Most instances that a notebook draws unasked."""
 
 
 class SystemGraph(msgspec.Struct, frozen=True):
@@ -69,9 +72,9 @@ class SystemGraph(msgspec.Struct, frozen=True):
     def title(self) -> str:
         """One line: how many instances, processes, connections and cycles there are."""
         counts = [
-            _count(len(self.nodes), "instance") + f" in {_count(len({n.group for n in self.nodes}), 'process')}",
-            _count(sum(len(edge.variables) for edge in self.edges), "connection"),
-            *([_count(len(self.cycles), "cycle")] if self.cycles else []),
+            counted(len(self.nodes), "instance") + f" in {counted(len({n.group for n in self.nodes}), 'process')}",
+            counted(sum(len(edge.variables) for edge in self.edges), "connection"),
+            *([counted(len(self.cycles), "cycle")] if self.cycles else []),
         ]
         return f"{self.mesh}: {', '.join(counts)}"
 
@@ -136,6 +139,15 @@ class SystemGraph(msgspec.Struct, frozen=True):
         if self.cycles:
             lines += ["", *_wrapped([("cycle", cycle) for cycle in self.cycles])]
         return page(line.rstrip() for line in lines)
+
+    def __repr__(self) -> str:
+        return f"<SystemGraph of {self.title}>"
+
+    def _repr_html_(self) -> str:
+        if len(self.nodes) <= _DRAWN:
+            return f'<div style="overflow-x: auto">{self.svg()}</div>'
+        rows = ((node.instance, node.model, node.group, node.live) for node in self.nodes)
+        return html_table(self.title, ["instance", "model", "process", "state"], rows, len(self.nodes))
 
     @property
     def _first_of_group(self) -> dict[str, int]:
@@ -257,11 +269,6 @@ def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus
 def _remark(edge: GraphEdge, variable: GraphVariable) -> str:
     delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
     return ", ".join(filter(None, [delay, "map" if variable.map else ""]))
-
-
-def _count(number: int, what: str) -> str:
-    many = "" if number == 1 else "es" if what.endswith("s") else "s"
-    return f"{number} {what}{many}"
 
 
 def _fitted(rows: Sequence[tuple[str, str, str, str]], indent: int) -> list[str]:

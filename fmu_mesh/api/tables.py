@@ -1,15 +1,19 @@
-"""Tables as plain text with aligned columns and without colours."""
+"""Tables: as plain text with aligned columns and without colours, and as the HTML that notebooks show."""
 
 from __future__ import annotations
 
+import html
 from collections.abc import Iterable, Sequence
+from itertools import islice
 
-from ..text import printable
+from ..text import counted, printable
 
-__all__ = ["pairs", "shortened", "table", "width_of"]
+__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "width_of"]
 
 _GAP = "  "
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
+_ROWS, _COLUMNS, _CELL = 20, 10, 120
+"""The size of a table in a notebook; what is left out is counted."""
 
 
 def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None, indent: int = 0) -> list[str]:
@@ -39,3 +43,32 @@ def shortened(name: str, width: int) -> str:
 def pairs(items: Iterable[tuple[str, str]], *, indent: int = 0) -> list[str]:
     """The lines of a list of names and values, without the pairs whose value is empty."""
     return table([[name, value] for name, value in items if value], indent=indent)
+
+
+def escaped(text: str) -> str:
+    """A text as a part of a page of HTML, or of an SVG."""
+    return html.escape(printable(text), quote=True)
+
+
+def html_table(title: str, heading: Sequence[str], rows: Iterable[Sequence[object]], count: int) -> str:
+    """A title and the first rows of a table; without colours of its own, so that it is readable in light and in dark.
+
+    Args:
+        title: the title.
+        heading: the titles of the columns.
+        rows: the cells; only those that are shown are asked for.
+        count: how many rows there are.
+    """
+
+    def line(tag: str, cells: Sequence[object]) -> str:
+        texts = [f"{cell:.6g}" if isinstance(cell, float) else "" if cell is None else str(cell) for cell in cells]
+        style = ' style="text-align: left"'
+        return "".join(f"<{tag}{style}>{escaped(shortened(text, _CELL))}</{tag}>" for text in texts[:_COLUMNS])
+
+    parts = [f"<p>{escaped(title)}</p>"]
+    if count:
+        body = "".join(f"<tr>{line('td', row)}</tr>" for row in islice(rows, _ROWS))
+        parts.append(f"<table><thead><tr>{line('th', heading)}</tr></thead><tbody>{body}</tbody></table>")
+    left_out = [(count - _ROWS, "row"), (len(heading) - _COLUMNS, "column")]
+    parts += [f"<p>and {counted(number, f'more {what}')}</p>" for number, what in left_out if number > 0]
+    return f"<div>{''.join(parts)}</div>"

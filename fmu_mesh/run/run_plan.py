@@ -17,9 +17,10 @@ from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError
 from ..instances.contract import Showing
 from ..instances.registry import decode_section
+from ..simtime import ENDLESS
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
-from ..text import listed, nearest
+from ..text import counted, listed, nearest
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
 
@@ -108,6 +109,11 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def mesh(self) -> str:
         """Name of the mesh."""
         return self.loaded.config.mesh
+
+    def __repr__(self) -> str:
+        system, last = self.plan.system, self.plan.grid.last_point
+        counts = f"{counted(len(system.instances), 'instance')}, {counted(len(system.connections), 'connection')}"
+        return f"<RunPlan of {self.mesh}: {counts}, {counted(last, 'point') if last < ENDLESS else 'no end'}>"
 
     def zenoh(self, listen: Sequence[str] = ()) -> ZenohConfig:
         """The `zenoh` section for a process of this run that listens at ``listen``, besides its socket.

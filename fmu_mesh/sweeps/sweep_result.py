@@ -12,6 +12,7 @@ import numpy as np
 from ..api.result import Result, imported_pandas
 from ..api.result_drawing import in_unit
 from ..api.result_reading import chosen_names
+from ..api.tables import html_table
 from ..errors import CallRefused, UnknownName
 from ..system.system import ResolvedSystem
 from ..text import listed, nearest
@@ -125,6 +126,12 @@ class SweepResult(Sequence[SweepRow]):
 
     def __repr__(self) -> str:
         return f"<SweepResult of '{self._wanted.mesh}': {self.summary}>"
+
+    def _repr_html_(self) -> str:
+        cells = (cells_of(self._wanted, number, row, self.columns) for number, row in self._found)
+        shown = ["variant", *self.columns, *self.names, "exit_code", "message"]
+        rows = ([own[name] for name in shown] for own in cells)
+        return html_table(f"{self._wanted.mesh}: {self.summary}", shown, rows, len(self))
 
     @property
     def table(self) -> Path:

@@ -28,8 +28,10 @@ from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
-from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
+from ..api.notebook_progress import Progress, awaited
+from ..errors import FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
 from ..run.options import takes
+from ..text import counted
 from ..wire.runtime import remove_stale_folders
 from .planned_sweep import PlannedSweep, SweepOptions, planned_sweep
 from .sweep_folder import RowFile
@@ -127,6 +129,12 @@ class Sweep(ABC):
     ) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return f"<Sweep of {self._bar().text}>"
+
+    def _repr_html_(self) -> str:
+        return self._bar().html
+
     @property
     def mesh(self) -> str:
         """Name of the mesh."""
@@ -171,12 +179,7 @@ class Sweep(ABC):
             Interrupted: `interrupt` has ended it. Its `result` has the rows up to then, as that of the others.
         """
         try:
-            return self._end.result(timeout)
-        except TimeoutError:
-            if self._end.done():
-                raise
-            text = f"the sweep has not ended within {timeout:g} s"
-            raise DeadlineExceeded(text, hint="It goes on; wait again, or cancel it.") from None
+            return awaited(self._end, timeout, "the sweep", self._bar)
         except KeyboardInterrupt as error:
             if isinstance(error, FmuMeshError):
                 raise
@@ -197,6 +200,12 @@ class Sweep(ABC):
         """Let go of the sweep; if it goes on, it is cancelled. May be called twice."""
         self._cancelled.set()
         self._thread.join(_JOIN_S)
+
+    def _bar(self) -> Progress:
+        now = self.progress
+        left = f", {now.left:.0f} s left" if now.left else ""
+        text = f"{self.mesh}: {now.done} of {counted(now.total, 'run')}, {now.failed} failed{left}"
+        return Progress(text, now.done, now.total)
 
     def _so_far(self) -> list[Row | None]:
         return [self._row_at(number) for number in range(len(self._planned.wanted.identities))]

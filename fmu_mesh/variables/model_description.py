@@ -15,6 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..simtime import steps_between
+from ..text import counted
 from .units import BaseUnit
 from .value_types import MAX_ELEMENTS, PlainValue, Value, VariableType, element_names, flattened, nested, split_element
 
@@ -203,6 +204,10 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     library: str | None = None
     fixed_step_size: float | None = None
     states: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        version = f"FMI {self.fmi_version}" if self.fmi_version else self.kind
+        return f"<ModelDescription of {self.model_name}: {version}, {counted(len(self.variables), 'variable')}>"
 
     @property
     def step_size(self) -> float | None:

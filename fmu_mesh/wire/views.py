@@ -8,6 +8,7 @@ import msgspec
 
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
+from ..text import counted
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
 
@@ -94,6 +95,10 @@ class InstanceInfo(msgspec.Struct, frozen=True):
     host: str
     problems: tuple[str, ...]
     clocks: tuple[Clock, ...] = ()
+
+    def __repr__(self) -> str:
+        counts = f"{counted(len(self.variables), 'variable')}, {counted(len(self.connections), 'connection')}"
+        return f"<InstanceInfo of {self.instance}: {self.model_name}, {counts}>"
 
 
 class InstanceStatus(msgspec.Struct, frozen=True):
