@@ -130,7 +130,7 @@ class Comparison(msgspec.Struct, frozen=True):
         return f"<Comparison: {self._head()}>"
 
     def _repr_html_(self) -> str:
-        order, title = self._most_different, " ".join([self._head(), *self._first_text()])
+        order, title = self._most_different, "; ".join([self._head(), *self._first_text()])
         rows = (_cells(name, self.differences[name], self.rows) for name in order)
         return html_table(title, _HEADING, rows, len(order))
 

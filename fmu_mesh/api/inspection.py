@@ -112,7 +112,8 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
     def _repr_html_(self) -> str:
         order = [causality for causality, _ in _CAUSALITIES]
         variables = sorted(self.description.variables, key=lambda own: order.index(own.causality))
-        rows = ((v.name, v.causality, v.type_name, v.variability, _start(v), v.description) for v in variables)
+        starts = (_start(v).removeprefix("= ") for v in variables)
+        rows = ((v.name, v.causality, v.type_name, v.variability, next(starts), v.description) for v in variables)
         title = ". ".join([self._in_short, *self.problems[:1]])
         heading = ["variable", "causality", "type", "variability", "start value", "description"]
         return html_table(title, heading, rows, len(variables))

@@ -41,6 +41,7 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
     from ..ros.bags.playing import Played, PlayOptions
     from ..run.run_plan import RunPlan
     from ..wire.messages import SetValue
+    from .live_view import LiveView
     from .result import Result
     from .run_thread import RunThread
     from .system_graph import SystemGraph
@@ -255,6 +256,39 @@ class Run:
         """
         client = self._running()
         return Watch(client, targets_of(client, *names))
+
+    def view(self, *names: str) -> LiveView:
+        """A live cell in a notebook, which draws numbers over time until the mesh ends.
+
+        Of a long run, a curve has the least and the largest value of each of 400 sections of time. Where values were
+        lost, because the mesh is faster than this program can follow, there is no line.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
+            ...     view = run.view("delay.y", "pendulum.a")
+            ...     answer, result = run.resume(), run.wait()
+            >>> view
+            <LiveView of pendulum_delay: delay.y, pendulum.a, ended>
+
+        Args:
+            names: at most 10 variables, or patterns; none: the first 10 outputs.
+
+        Raises:
+            UnknownName: there is no such variable.
+            CallRefused: too many of them, or none of them, are numbers.
+            ConfigurationError: anywidget is not installed.
+        """
+        try:
+            from .live_view import LiveView  # noqa: PLC0415  anywidget is an extra
+        except ModuleNotFoundError as error:
+            text, hint = "a live cell needs anywidget.", "Install it with `pip install anywidget`."
+            raise ConfigurationError(text, hint=hint) from error
+        view = LiveView(self._running(), names)
+        with self._opening:
+            self._way.callback(view.stop)
+        return view
 
     def logs(self, *, follow: bool = False) -> Iterator[LogLine]:
         """The log messages of FMUs that the mesh has kept, the oldest first.

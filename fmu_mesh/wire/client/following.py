@@ -58,6 +58,7 @@ class Follower(Generic[Item]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
+        self.arrived.put(None)  # another thread may be waiting for more
 
     def subscribe(
         self, keys: Collection[str], decode: Callable[[zenoh.Sample], Item | None], through: str | None = None
