@@ -1,8 +1,8 @@
-"""A live cell: a widget in a notebook that draws chosen values of a mesh while it runs. Imports anywidget, an extra.
+"""A live cell: a widget in a notebook that draws values of a mesh while it runs. Imports anywidget, an extra.
 
 Threads: one takes the values as fast as they come, and one sends a picture to the page a few times a second, so that a
 slow page never holds back the values, nor the mesh. Both end with the mesh, and when the widget or the `Run` is closed.
-The page gets a picture of bounded size each time, so one that is opened late, or twice, shows the same.
+The page gets all that it draws each time, and its size is bounded: one that is opened late shows the same.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
 from .samples import Sample, Watch, targets_of
 
-__all__ = ["LiveView"]
+__all__ = ["LiveView", "live_view"]
 
 _EVERY_S = 0.25
 _JOIN_S = 5.0
@@ -34,37 +34,35 @@ _ROWS = 8 * _SECTIONS
 """So many values of a curve are kept before they are put into sections."""
 
 
+def live_view(client: MeshClient, names: Sequence[str]) -> LiveView:
+    """As `Run.view`."""
+    found = [
+        target
+        for target in targets_of(client, *(names or ["*"]))
+        if not (target.variable.shape or target.variable.type in ("String", "Binary"))
+        and (names or target.variable.causality == "output")
+    ]
+    if not found or (names and len(found) > _CURVES):
+        many = f"{len(found)} numbers match, and a live cell draws at most {_CURVES}"
+        raise CallRefused(many if found else "no number matches", hint="Name what is to be drawn.")
+    return LiveView(client, found[:_CURVES])
+
+
 class LiveView(anywidget.AnyWidget):
-    """A live cell; `Run.view` makes it.
-
-    Args:
-        client: the way into the mesh.
-        names: variables, or patterns; none: the outputs.
-
-    Raises:
-        UnknownName: there is no such variable.
-        CallRefused: too many of them, or none of them, are numbers.
-    """
+    """A live cell; `Run.view` makes it."""
 
     _esm = Path(__file__).with_name("live_view.js").read_text(encoding="utf-8")
     curves: traitlets.List[dict[str, object]] = traitlets.List().tag(sync=True)
     state = traitlets.Unicode("waiting").tag(sync=True)
 
-    def __init__(self, client: MeshClient, names: Sequence[str]) -> None:
-        found = [target for target in targets_of(client, *(names or ["*"])) if _is_drawn(target, names)]
-        if not found or (names and len(found) > _CURVES):
-            text = (
-                f"{len(found)} numbers match, and a live cell draws at most {_CURVES}" if found else "no number matches"
-            )
-            raise CallRefused(text, hint="Name what is to be drawn.")
+    def __init__(self, client: MeshClient, targets: Sequence[Target]) -> None:
         super().__init__()
         self._mesh = client.keys.mesh
-        self._curves = {target.name: _Curve(target) for target in found[:_CURVES]}
-        self._watch = Watch(client, found[:_CURVES])
+        self._curves = {target.name: _Curve(target) for target in targets}
+        self._watch = Watch(client, targets)
         self._over = threading.Event()
-        self._threads = [
-            threading.Thread(target=work, daemon=True) for work in (self._take_values, self._send_pictures)
-        ]
+        works = self._take_values, self._send_pictures
+        self._threads = [threading.Thread(target=work, daemon=True) for work in works]
         for thread in self._threads:
             thread.start()
 
@@ -83,7 +81,6 @@ class LiveView(anywidget.AnyWidget):
         super().close()
 
     def _take_values(self) -> None:
-        """The first thread."""
         try:
             for sample in self._watch:
                 self._curves[sample.name].add(sample)
@@ -93,7 +90,6 @@ class LiveView(anywidget.AnyWidget):
             self._over.set()
 
     def _send_pictures(self) -> None:
-        """The second thread."""
         ended = False
         while not ended:
             ended = self._over.wait(_EVERY_S)
@@ -115,24 +111,19 @@ class _Curve:
 
     def add(self, sample: Sample) -> None:
         value, passed = float(sample.value), sample.point - self._last
+        lost = 0 < self._step < passed  # no line is drawn over values that were lost
+        if self._now and passed:
+            self._step = min(passed, self._step or passed)
         with self._lock:
-            self._now = f"{value:.5g}"
-            if self._step and passed > self._step:  # values were lost, and no line is drawn over them
-                self._append(sample.time, math.nan)
-            self._append(sample.time, value if math.isfinite(value) else math.nan)
+            self._times += [sample.time] * (1 + lost)
+            self._values += [math.nan] * lost + [value if math.isfinite(value) else math.nan]
             if len(self._times) >= _ROWS:
                 self._times, self._values = _in_sections(np.array(self._times), np.array(self._values))
-        if len(self._times) > 1 and passed > 0:
-            self._step = min(passed, self._step or passed)
-        self._last = sample.point
+            self._last, self._now = sample.point, f"{value:.5g}"
 
     def drawn(self) -> dict[str, object]:
         with self._lock:
             return {**self._head, "now": self._now, "points": np.array([self._times, self._values]).tobytes()}
-
-    def _append(self, time: float, value: float) -> None:
-        self._times.append(time)
-        self._values.append(value)
 
 
 def _in_sections(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[list[float], list[float]]:
@@ -143,9 +134,3 @@ def _in_sections(times: NDArray[np.float64], values: NDArray[np.float64]) -> tup
     np.fmin.at(least, section, values)
     np.fmax.at(largest, section, values)
     return edges.tolist(), np.stack([least, largest], axis=1).ravel().tolist()
-
-
-def _is_drawn(target: Target, names: Sequence[str]) -> bool:
-    """Whether a variable is one number; without names, whether it is an output, too."""
-    view = target.variable
-    return not view.shape and view.type not in ("String", "Binary") and (bool(names) or view.causality == "output")

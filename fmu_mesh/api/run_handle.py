@@ -281,11 +281,11 @@ class Run:
             ConfigurationError: anywidget is not installed.
         """
         try:
-            from .live_view import LiveView  # noqa: PLC0415  anywidget is an extra
+            from .live_view import live_view  # noqa: PLC0415  anywidget is an extra
         except ModuleNotFoundError as error:
             text, hint = "a live cell needs anywidget.", "Install it with `pip install anywidget`."
             raise ConfigurationError(text, hint=hint) from error
-        view = LiveView(self._running(), names)
+        view = live_view(self._running(), names)
         with self._opening:
             self._way.callback(view.stop)
         return view

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.helpers import DEADLINE_S, FMUS, Place, wait_until
+from tests.notebooks import assert_is_a_picture
 
 manager = pytest.importorskip("jupyter_client.manager")
 pytest.importorskip("ipykernel")
@@ -86,3 +87,35 @@ def test_interrupt_kernel_ends_the_run_and_the_kernel_goes_on(kernel: Kernel, pl
     )
     again = "print(len(mesh.run(record='memory', stop_time=0.1).times))"
     assert ("stream", {"name": "stdout", "text": "11\n"}) in list(kernel.messages(again))
+
+
+def test_a_picture_is_shown_exactly_once_however_matplotlib_is_set_up(kernel: Kernel) -> None:
+    list(kernel.messages(MESH.replace("STOP", "1.0") + "result = mesh.run(record='memory', processes=False)"))
+    list(kernel.messages("other = mesh.run(record='memory', processes=False, start_values={'gain.k': 2.0})"))
+
+    for setup in ("", "import matplotlib.pyplot", "%matplotlib inline"):
+        for last in ("result.plot()", "result.compare(other).plot()", "mesh.graph().figure()"):
+            shown = [content["data"] for _, content in kernel.messages(f"{setup}\n{last}") if "data" in content]
+            assert [sorted(data) for data in shown] == [["image/png", "text/plain"]], (setup, last)
+            pixels = assert_is_a_picture(shown[0]["image/png"]) if "graph" not in last else None
+            assert pixels is None or pixels.size
+
+
+def test_a_sweep_shows_a_progress_bar_that_goes_when_it_ends(kernel: Kernel) -> None:
+    cell = (
+        "with fmu_mesh.sweep(mesh, {'gain.k': [1.0, 2.0, 3.0]}, folder='three', workers=1) as running:\n"
+        "    sweep = running.wait()\nsweep"
+    )
+
+    shown = [
+        content["data"]
+        for kind, content in kernel.messages(MESH.replace("STOP", "0.1") + cell)
+        if kind in ("display_data", "update_display_data", "execute_result")
+    ]
+    # A kernel ends without what multiprocessing does at the exit of a process.
+    list(kernel.messages("import multiprocessing.util, shutil; shutil.rmtree(multiprocessing.util.get_temp_dir())"))
+
+    assert "<progress value='0' max='3'></progress> cell: 0 of 3 runs, 0 failed" in shown[0]["text/html"]
+    assert shown[-2] == {"text/plain": ""}
+    assert shown[-1]["text/plain"] == "<SweepResult of 'cell': 3 of 3 runs, 0 failed>"
+    assert shown[-1]["text/html"].count("<tr>") == 4
