@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,7 @@ def test_a_paused_mesh_shows_its_newest_value() -> None:
         point = run.step(7).point
         wait_until(lambda: view.curves and rows(view.curves[0])[0][-1:] == [0.01 * point], "the newest value")
         view.close()
+        assert re.fullmatch(r"<Run of mesh live: paused, point \d, .* points/s \(started here\)>", repr(run))
 
     assert view.curves[0]["now"] == "3"
 

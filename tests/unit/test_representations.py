@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fmu_mesh
 from fmu_mesh.api.result import Result
+from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.api.tables import html_table
 from tests.helpers import FMUS
 
@@ -155,10 +157,6 @@ def test_a_table_is_cut_and_says_so() -> None:
     [([1.0, -2.5], ("-2.5", "1")), (["b", "a"], ("", "")), ([], ("", "")), ([True], ("True", "True"))],
 )
 def test_a_result_shows_the_least_and_the_largest_value(values: list[Any], cells: tuple[str, str]) -> None:
-    import numpy as np  # noqa: PLC0415  only here
-
-    from fmu_mesh.api.result_reading import Columns  # noqa: PLC0415  as above
-
     result = Result("r", columns=Columns(np.arange(float(len(values))), {"a.y": np.array(values)}))
 
     assert all(f">{cell}</td>" in html(result) for cell in cells)
