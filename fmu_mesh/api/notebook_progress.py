@@ -13,14 +13,14 @@ from ..simtime import ENDLESS
 from ..wire.views import MeshStatus
 from .tables import escaped
 
-__all__ = ["Progress", "awaited", "progress_of"]
+__all__ = ["ShownProgress", "awaited", "progress_of"]
 
 _LOOK_S = 0.2
 
 Ended = TypeVar("Ended")
 
 
-class Progress(NamedTuple):
+class ShownProgress(NamedTuple):
     """How far something is: in words, and as a part of a total, which may be unknown."""
 
     text: str
@@ -34,25 +34,21 @@ class Progress(NamedTuple):
         return bar + escaped(self.text)
 
 
-def progress_of(name: str, status: MeshStatus) -> Progress:
+def progress_of(name: str, status: MeshStatus) -> ShownProgress:
     """How far the run of the mesh with this name is."""
     total = status.last_point if status.last_point < ENDLESS else None
     of = f" of {total}" if total is not None else ""
     text = f"{name}: {status.state}, point {status.point}{of}, {status.points_per_second:.0f} points/s"
-    return Progress(text, status.point, total)
+    return ShownProgress(text, status.point, total)
 
 
-def awaited(future: Future[Ended], timeout: float | None, what: str, progress: Callable[[], Progress | None]) -> Ended:
-    """The result of a run or a sweep, when it has ended.
-
-    Args:
-        future: gets the result.
-        timeout: the longest time to wait in s; None: no limit.
-        what: the run or the sweep, as the error names it.
-        progress: how far it is; None while nothing is known.
+def awaited(
+    future: Future[Ended], timeout: float | None, what: str, progress: Callable[[], ShownProgress | None]
+) -> Ended:
+    """The result of a run or a sweep, when it has ended; ``what`` names it in an error.
 
     Raises:
-        DeadlineExceeded: it goes on after this time.
+        DeadlineExceeded: it goes on after this time in s.
         BaseException: the error with which it has ended.
     """
     end = time.monotonic() + timeout if timeout is not None else None

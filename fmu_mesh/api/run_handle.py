@@ -32,7 +32,7 @@ from ..wire.views import (
     SetAnswer,
     VariableView,
 )
-from .notebook_progress import Progress, awaited, progress_of
+from .notebook_progress import ShownProgress, awaited, progress_of
 from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, target_of, targets_of
 
@@ -119,7 +119,7 @@ class Run:
         now = self._progress()
         return now.html if now is not None else None
 
-    def _progress(self) -> Progress | None:
+    def _progress(self) -> ShownProgress | None:
         """How far a run is that was started here; nobody is asked."""
         status = self._own.status if self._own is not None else None
         return progress_of(self.name, status) if status is not None else None

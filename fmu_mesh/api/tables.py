@@ -51,14 +51,7 @@ def escaped(text: str) -> str:
 
 
 def html_table(title: str, heading: Sequence[str], rows: Iterable[Sequence[object]], count: int) -> str:
-    """A title and the first rows of a table; without colours of its own, so that it is readable in light and in dark.
-
-    Args:
-        title: the title.
-        heading: the titles of the columns.
-        rows: the cells; only those that are shown are asked for.
-        count: how many rows there are.
-    """
+    """A title, and the first of ``count`` rows; without colours of its own, so it is readable in light and in dark."""
 
     def line(tag: str, cells: Sequence[object]) -> str:
         texts = [f"{cell:.6g}" if isinstance(cell, float) else "" if cell is None else str(cell) for cell in cells]

@@ -28,7 +28,7 @@ from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
-from ..api.notebook_progress import Progress, awaited
+from ..api.notebook_progress import ShownProgress, awaited
 from ..errors import FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
 from ..run.options import takes
 from ..text import counted
@@ -201,11 +201,11 @@ class Sweep(ABC):
         self._cancelled.set()
         self._thread.join(_JOIN_S)
 
-    def _bar(self) -> Progress:
+    def _bar(self) -> ShownProgress:
         now = self.progress
         left = f", {now.left:.0f} s left" if now.left else ""
         text = f"{self.mesh}: {now.done} of {counted(now.total, 'run')}, {now.failed} failed{left}"
-        return Progress(text, now.done, now.total)
+        return ShownProgress(text, now.done, now.total)
 
     def _so_far(self) -> list[Row | None]:
         return [self._row_at(number) for number in range(len(self._planned.wanted.identities))]
