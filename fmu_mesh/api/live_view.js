@@ -23,7 +23,7 @@ function ends(lists) {
   return low < high ? [low, high] : [low - 0.5, high + 0.5];
 }
 
-const short = (x) => String(Number(x.toPrecision(5)));
+const short = (x) => String(Number(x.toPrecision(4)));
 
 function plot(el, curves, [from, to]) {
   const [low, high] = ends(curves.map((curve) => curve.values));

@@ -127,10 +127,16 @@ class _Curve:
 
 
 def _in_sections(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-    """Two rows for each section: its least and its largest value; NaN where values were lost in all of it."""
+    """Two rows for each section: its least and its largest value; NaN where values were lost in all of it.
+
+    Rows are at regular times, so a later section that has none is one without values.
+    """
     edges = np.linspace(times[0], times[-1], 2 * _SECTIONS + 1)[:-1]
     section = np.searchsorted(edges[::2], times, side="right") - 1
     least, largest = np.full((2, _SECTIONS), np.nan)
     np.fmin.at(least, section, values)
     np.fmax.at(largest, section, values)
-    return edges.tolist(), np.stack([least, largest], axis=1).ravel().tolist()
+    rows = np.stack([least, largest], axis=1)
+    falling = np.diff(least + largest, append=np.nan) < 0.0
+    rows[falling] = rows[falling, ::-1]  # otherwise a curve that falls is a saw
+    return edges.tolist(), rows.ravel().tolist()

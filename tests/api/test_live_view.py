@@ -7,6 +7,7 @@ import json
 import math
 import re
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -134,10 +135,20 @@ def test_a_long_curve_keeps_its_extremes_its_gaps_and_a_bounded_size() -> None:
     times, values = rows(drawn.drawn())
     lost = [time for time, value in zip(times, values, strict=True) if math.isnan(value)]
     assert most < 4_000
-    assert max(values[: len(values) // 2]) == 1e6
+    assert max(values) == 1e6
     assert lost
     assert all(19_900.0 < time < 25_100.0 for time in lost)
     assert times == sorted(times)
+
+
+def test_a_long_curve_that_falls_is_drawn_falling() -> None:
+    drawn = curve()
+    for point in range(10_000):
+        drawn.add(sample(point, -float(point)))
+
+    _, values = rows(drawn.drawn())
+    steps = [after - before for before, after in pairwise(values)]
+    assert sum(step > 0.0 for step in steps) <= 1  # the last section has none after it
 
 
 @needs_chromium
