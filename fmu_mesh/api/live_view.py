@@ -137,6 +137,6 @@ def _in_sections(times: NDArray[np.float64], values: NDArray[np.float64]) -> tup
     np.fmin.at(least, section, values)
     np.fmax.at(largest, section, values)
     rows = np.stack([least, largest], axis=1)
-    falling = np.diff(least + largest, append=np.nan) < 0.0
+    falling = np.gradient(least + largest) < 0.0
     rows[falling] = rows[falling, ::-1]  # otherwise a curve that falls is a saw
     return edges.tolist(), rows.ravel().tolist()
