@@ -23,7 +23,10 @@ function ends(lists) {
   return low < high ? [low, high] : [low - 0.5, high + 0.5];
 }
 
-const short = (x) => String(Number(x.toPrecision(4)));
+function short(x, span) {
+  const decimals = 2 - Math.floor(Math.log10(span)); // so that the ends of a narrow axis differ
+  return String(Number(decimals >= 0 && decimals < 12 ? x.toFixed(decimals) : x.toPrecision(6)));
+}
 
 function plot(el, curves, [from, to]) {
   const [low, high] = ends(curves.map((curve) => curve.values));
@@ -35,10 +38,10 @@ function plot(el, curves, [from, to]) {
   for (const value of [low, (low + high) / 2, high]) {
     const at = y(value);
     add(svg, "path", { d: `M${LEFT} ${at}H${WIDTH - RIGHT}`, stroke: "currentColor", opacity: 0.25 });
-    add(svg, "text", { x: LEFT - 6, y: at + 4, "text-anchor": "end" }, short(value));
+    add(svg, "text", { x: LEFT - 6, y: at + 4, "text-anchor": "end" }, short(value, high - low));
   }
   for (const [time, anchor] of [[from, "start"], [(from + to) / 2, "middle"], [to, "end"]])
-    add(svg, "text", { x: x(time), y: HEIGHT - 6, "text-anchor": anchor }, `${short(time)} s`);
+    add(svg, "text", { x: x(time), y: HEIGHT - 6, "text-anchor": anchor }, `${short(time, to - from)} s`);
   for (const { name, unit, held, now, times, values, colour } of curves) {
     let d = "";
     values.forEach((value, i) => {

@@ -33,7 +33,7 @@ __all__ = ["SystemGraph", "graph_of", "graph_of_infos", "graph_of_plan"]
 _COLUMNS = 80
 _NAME = 30
 _DRAWN = 60
-"""Most instances that a notebook draws unasked."""
+"""Most instances that a notebook draws unasked, with up to three edges each."""
 
 
 class SystemGraph(msgspec.Struct, frozen=True):
@@ -144,7 +144,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
         return f"<SystemGraph of {self.title}>"
 
     def _repr_html_(self) -> str:
-        if len(self.nodes) <= _DRAWN:
+        if len(self.nodes) <= _DRAWN and len(self.edges) <= 3 * _DRAWN:
             return f'<div style="overflow-x: auto">{self.svg()}</div>'
         rows = ((node.instance, node.model, node.group, node.live) for node in self.nodes)
         return html_table(self.title, ["instance", "model", "process", "state"], rows, len(self.nodes))

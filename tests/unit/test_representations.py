@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.graph_drawing import GraphNode, GraphVariable
 from fmu_mesh.api.result import Result
 from fmu_mesh.api.result_reading import Columns
+from fmu_mesh.api.system_graph import graph_of
 from fmu_mesh.api.tables import html_table
 from tests.helpers import FMUS
 
@@ -86,6 +88,16 @@ def test_a_mesh_of_1000_instances_is_shown_in_few_lines() -> None:
         assert len(repr(shown)) < 100
         assert len(html(shown)) < 8_000
         assert "and 980 more rows" in html(shown)
+
+
+def test_a_graph_of_very_many_connections_is_a_table() -> None:
+    nodes = [GraphNode(f"i{number}", "m.fmu", "p") for number in range(20)]
+    pairs = [(a.instance, b.instance, 1) for a in nodes for b in nodes]
+
+    graph = graph_of("dense", nodes, [(pair, GraphVariable("y", "u")) for pair in pairs])
+
+    assert html(graph).count("<tr>") == 21
+    assert "<svg" in html(graph_of("chain", nodes, [(("i0", "i1", 0), GraphVariable("y", "u"))]))
 
 
 @pytest.mark.parametrize(
