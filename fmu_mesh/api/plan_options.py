@@ -45,4 +45,5 @@ def memory_file() -> Path:
 def memory_of(plan: RunPlan) -> Path | None:
     """The file for results that stay in memory; None if they go where the configuration says."""
     file = Path(plan.plan.system.result_file or "")
-    return file if file.suffix == ENDING and file.parent.name.startswith(_MEMORY) else None
+    own = file.suffix == ENDING and file.parent.name.startswith(_MEMORY) and file.parent.parent == runtime_folder()
+    return file if own else None

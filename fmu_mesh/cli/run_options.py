@@ -120,12 +120,19 @@ def _value(text: str, *, expected: str | None) -> tuple[str, Plain]:
         raise argparse.ArgumentTypeError(f"{error}; expected {expected}") from error
 
 
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole number of at least 0")
+    return int(text)
+
+
 _READERS: Mapping[str, Callable[[str], object]] = {
     "window": _window,
     "profile": _trace_file,
     "listen": endpoint,
     "connect": endpoint,
     "restarts": count,
+    "seed": _seed,
     "workers": count,
 }
 """The readers of values by their options; what a key allows is checked with the file."""

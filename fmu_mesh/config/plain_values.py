@@ -65,7 +65,7 @@ def taken(value: Any, kinds: Sequence[Any]) -> Any:  # noqa: ANN401  whatever a 
 
     Example:
         >>> import numpy as np
-        >>> taken(np.float32(0.5), (float, NoneType))
+        >>> taken(np.float32(0.5), (float, type(None)))
         0.5
         >>> taken([("a.b", np.array([1, 2])), "a.c=x"], (Mapping[str, Any], Iterable[Any]))
         {'a.b': [1, 2], 'a.c': 'x'}

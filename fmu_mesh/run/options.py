@@ -9,7 +9,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
-from inspect import Parameter, signature
+from inspect import Parameter, Signature, signature
 from pathlib import Path
 from types import NoneType
 from typing import (
@@ -32,7 +32,7 @@ from msgspec.structs import force_setattr, replace
 
 from ..config.plain_values import kinds_of, taken
 from ..errors import CallRefused
-from ..text import listed, nearest, option_text
+from ..text import nearest, option_text
 
 if TYPE_CHECKING:
     from ..wire.views import MeshStatus
@@ -240,16 +240,6 @@ class RerunOptions(StartOptions, frozen=True, kw_only=True):
 class takes(Generic[P, O]):  # noqa: N801  a decorator
     """Lets a method or a function whose last parameter are options take each of them by name.
 
-    Example:
-        >>> @takes(StartOptions)
-        ... def start(plan: str, options: StartOptions) -> int:
-        ...     return options.restarts
-        >>> start("plan", restarts=3)
-        3
-        >>> start("plan", restart=3)
-        Traceback (most recent call last):
-        fmu_mesh.errors.CallRefused: `start` has no option `restart`. Did you mean `restarts`?
-
     Args:
         options: the Struct of the options, all of which become parameters; in the docstring, they are listed in the
             place of the line `options: ...`.
@@ -264,35 +254,40 @@ class takes(Generic[P, O]):  # noqa: N801  a decorator
     def __call__(self, call: Callable[[S, T, O], R]) -> Callable[Concatenate[S, T, P], R]: ...
     def __call__(self, call: Callable[..., R]) -> Callable[..., R]:
         """The call with the options as parameters."""
-        options, name = self._options, call.__qualname__
+        options, with_arguments = self._options, checked(call)
         assert isinstance(options, type)
         assert issubclass(options, CallOptions)
         fields = option_fields(options)
         *own, _ = signature(call).parameters.values()
-        with_arguments = checked(call)
+        parameters = [*own, *(field.parameter for field in fields.values())]
+        shown = signature(call).replace(parameters=sorted(parameters, key=lambda one: one.kind))
 
         @wraps(call)
         def refusing(*values: Any, **named: Any) -> R:  # noqa: ANN401  whatever is given
-            first = list(values[: len(own)])
-            first += [named.pop(one.name) for one in own[len(first) :] if one.name in named]
-            if len(first) < len(own):
-                raise CallRefused(f"`{name}` needs `{own[len(first)].name}`")
-            for other in named.keys() - fields.keys():
-                near = nearest(other, fields)
-                hint = f"Did you mean `{near}`?" if near else f"There are {listed([*fields])}."
-                raise CallRefused(f"`{name}` has no option `{other}`", hint=hint)
-            try:
-                chosen = options(*values[len(own) :], **named)
-            except TypeError as error:
-                raise CallRefused(f"`{name}` takes its options by name: {error}") from error
-            return with_arguments(*first, chosen)
+            given = _bound(call, shown, values, named)
+            chosen = options(**{name: given.pop(name) for name in fields if name in given})
+            return with_arguments(*given.values(), chosen)
 
-        parameters = [*own, *(field.parameter for field in fields.values())]
-        shown = signature(call).replace(parameters=parameters)
         refusing.__signature__ = shown  # type: ignore[attr-defined]  # which the type of a function does not have
         lines = [f"\\1{name}: {field.line}\n" for name, field in fields.items()]
         refusing.__doc__ = re.sub(r"(?m)^( +)options: .*\n", "".join(lines), call.__doc__ or "")
         return refusing
+
+
+def _bound(
+    call: Callable[..., Any], shown: Signature, values: tuple[Any, ...], named: dict[str, Any]
+) -> dict[str, Any]:
+    """The arguments of a call by name.
+
+    Raises:
+        CallRefused: one is missing or misspelt.
+    """
+    try:
+        return shown.bind(*values, **named).arguments
+    except TypeError as error:
+        near = next((one for name in named if (one := nearest(name, shown.parameters)) not in (None, *named)), None)
+        hint = f"Did you mean `{near}`?" if near else None
+        raise CallRefused(f"`{call.__qualname__}`: {error}", hint=hint) from error
 
 
 _ARGUMENTS = {
@@ -312,27 +307,25 @@ def checked(call: Callable[P, R]) -> Callable[P, R]:
     """
 
     @cache
-    def kinds() -> dict[str, tuple[Any, ...]]:  # found at the first call: an import does not wait for it
-        known = {name: one for name, one in (call.__globals__ | _ARGUMENTS).items() if one is not Any}
-        words = {one.name: str(one.annotation).split(" | ") for one in signature(call).parameters.values()}
-        return {name: tuple(known[word] for word in own) for name, own in words.items() if known.keys() >= {*own}}
+    def known() -> tuple[Signature, dict[str, tuple[Any, ...]]]:  # at the first call: an import does not wait for it
+        own = signature(call)
+        types = {name: one for name, one in (call.__globals__ | _ARGUMENTS).items() if one is not Any}
+        words = {one.name: str(one.annotation).split(" | ") for one in own.parameters.values()}
+        return own, {
+            name: tuple(types[word] for word in all_) for name, all_ in words.items() if types.keys() >= {*all_}
+        }
 
     @wraps(call)
     def refusing(*values: P.args, **named: P.kwargs) -> R:
-        try:
-            given = (own := signature(call)).bind(*values, **named).arguments
-        except TypeError as error:
-            near = next((one for name in named if (one := nearest(name, own.parameters)) not in (None, *named)), None)
-            hint = f"Did you mean `{near}`?" if near else None
-            raise CallRefused(f"`{call.__qualname__}`: {error}", hint=hint) from error
-        for name in kinds().keys() & given.keys():
-            is_several = own.parameters[name].kind is Parameter.VAR_POSITIONAL
-            for value in given[name] if is_several else (given[name],):
+        own, kinds = known()
+        given = _bound(call, own, values, named)
+        for name in kinds.keys() & given.keys():
+            parameter = own.parameters[name]
+            for value in given[name] if parameter.kind is Parameter.VAR_POSITIONAL else (given[name],):
                 try:
-                    taken(value, kinds()[name])
+                    taken(value, kinds[name])
                 except (TypeError, ValueError):
-                    expected = own.parameters[name].annotation
-                    raise CallRefused(f"{option_text(name, value)}: expected {expected}") from None
+                    raise CallRefused(f"{option_text(name, value)}: expected {parameter.annotation}") from None
         return call(*values, **named)
 
     return refusing
@@ -341,11 +334,9 @@ def checked(call: Callable[P, R]) -> Callable[P, R]:
 @cache
 def option_fields(options: type[CallOptions]) -> dict[str, Option]:
     """The options of a Struct, by name."""
-    annotations = {
-        name: one
-        for base in reversed(options.__mro__)
-        for name, one in inspect.get_annotations(base, eval_str=True).items()
-    }
+    annotations: dict[str, Any] = {}
+    for base in reversed(options.__mro__):
+        annotations |= inspect.get_annotations(base, eval_str=True)
     fields = {}
     for name, default in zip(options.__struct_fields__, options.__struct_defaults__, strict=True):
         kind, option = annotations[name].__origin__, annotations[name].__metadata__[0]

@@ -63,7 +63,9 @@ class SweepOptions(VariantOptions, frozen=True, kw_only=True):
             "NAME:COUNT",
         ),
     ] = None
-    seed: Annotated[int, Option("seed of the sampler; the same seed gives the same variants", "--seed", "N")] = 0
+    seed: Annotated[
+        int, Option("seed of the sampler; the same one chooses the same values", "--seed", "N", least=0)
+    ] = 0
     reduce: Annotated[
         Sequence[str | Own],
         Option(

@@ -329,7 +329,7 @@ def test_a_bag_of_ros2_with_headers_is_played_by_their_stamps(delay: tuple[Place
     launched.wait()
 
     assert (early.wait(), played.wait(), launched.wait()) == (2, 0, 0), (early.errors, played.errors, launched.errors)
-    assert "Say when the first one is: --start 0, or" in early.errors
+    assert "Say when the first one is, as with `--start 0`" in early.errors
     rows = rows_of(place.folder / "played.csv")
     # The delay of 100 ms shows each of the values 100 ms after its stamp.
     assert [rows[k][1] for k in (140, 190, 240, 290, 340)] == [0.0, 1.0, 2.0, 3.0, 4.0]

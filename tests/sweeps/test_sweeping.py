@@ -362,8 +362,8 @@ def test_functions_of_a_program_become_columns(config: Path, tmp_path: Path) -> 
 
 WRONG: list[tuple[Mapping[str, Any], Mapping[str, Any], str]] = [
     ({"pendlum.d": [1.0]}, {}, "'pendlum.d' is neither .* Did you mean 'pendulum.d'"),
-    ({"pendulum.dd": [1.0]}, {}, "--vary pendulum.dd=1.0: the unknown variable 'dd' .* Did you mean 'd'"),
-    ({"simulation.stop": [1.0]}, {}, "--vary simulation.stop=1.0: an unknown key; .* 'stop_time'"),
+    ({"pendulum.dd": [1.0]}, {}, "`vary={'pendulum.dd': 1.0}`: the unknown variable 'dd' .* Did you mean 'd'"),
+    ({"simulation.stop": [1.0]}, {}, "`vary={'simulation.stop': 1.0}`: an unknown key; .* 'stop_time'"),
     ({"pendulum.d": [1.0]}, {"reduce": ["max(pendulum.b)"]}, "pendulum.b"),
     ({"pendulum.d": [1.0]}, {"max_instances": {"Gain.fmu": 1}}, "no instance has the model 'Gain.fmu'"),
     ({"pendulum.d": [1.0]}, {"max_instances": {"DampedPendulum.fmu": 0}}, "one run needs 1 instances"),

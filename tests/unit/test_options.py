@@ -119,7 +119,7 @@ def test_an_option_is_one_field(capsys: pytest.CaptureFixture[str]) -> None:
     assert "\n    _mesh: what flies.\n    algorithm: " in (inspect.getdoc(fly) or "")
     assert "\n    wind: speed of the wind in m/s" in (inspect.getdoc(fly) or "")
     assert fly("kite", wind=np.float32(0.5)) == 0.5  # type: ignore[arg-type]  # numpy's own scalars are taken too
-    with pytest.raises(CallRefused, match=r"has no option `wnd`\. Did you mean `wind`"):
+    with pytest.raises(CallRefused, match="Did you mean `wind`"):
         fly("kite", wnd=1)  # type: ignore[call-arg]  # what is to be refused
 
 
@@ -244,7 +244,7 @@ def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
         "--algorithm jacoby: 'jacoby'; expected gauss_seidel or jacobi. Did you mean 'jacobi'?"
     ]
     assert findings(window=3, config_values={"simulation.window": 4}) == [
-        "--set-config simulation.window=4: replaced by `--window ...` as well; expected one of the two options"
+        "--set-config simulation.window=4: replaced by `--window` as well; expected one of the two options"
     ]
     options = PlanOptions(algorithm="jacobi", step_size=0.25, config_values={"simulation.stop_time": None})
     plan = prepare(file, options)
@@ -279,7 +279,7 @@ def test_messages_of_the_library_name_options_without_dashes() -> None:
     ("text", "flags"),
     [
         ("`output='a b.csv'`: a file", "--output a b.csv: a file"),
-        ("Choose another file with `output=...`.", "Choose another file with `--output ...`."),
+        ("Choose another file with `output=...`.", "Choose another file with `--output`."),
         ("m.yaml: `listen=['tcp/a:1', 'tcp/b:1']`: x", "m.yaml: --listen tcp/a:1, tcp/b:1: x"),
         ("expected `step_size`, in s", "expected `--step-size`, in s"),
         ("a `window` of `record`, or `resume`", "a `window` of `record`, or `resume`"),

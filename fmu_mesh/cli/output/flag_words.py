@@ -45,7 +45,7 @@ def _flag(name: str, value: str | None) -> str:
     """An option as a flag with its value; empty if it is none."""
     if name not in _FLAGS or (value is None and "_" not in name):
         return ""
-    if value in (None, "True", "False"):
+    if value in (None, "True", "False", "..."):
         return _FLAGS[name]
     pair = _MAPPING.fullmatch(value)
     return f"{_FLAGS[name]} {f'{pair[1]}={_value(pair[2])}' if pair is not None else _value(value)}"
@@ -53,4 +53,4 @@ def _flag(name: str, value: str | None) -> str:
 
 def _value(text: str) -> str:
     """A value as the command line takes it."""
-    return text.strip("[]'").replace("', '", ", ").removesuffix(".0") if text != "..." else text
+    return text.strip("[]'").replace("', '", ", ").removesuffix(".0")
