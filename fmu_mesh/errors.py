@@ -227,13 +227,20 @@ class ConfigurationError(FmuMeshError):
     """A file, an option or a command is wrong. Carries all findings, not only the first.
 
     If there is one finding, it may be the message itself. Other findings are listed below the message, the first 20.
+
+    Attributes:
+        findings: all of them.
+        plan: the plan of the run, if it is right and only this host lacks something, such as a package.
     """
 
     exit_code = 2
 
-    def __init__(self, message: str, *, findings: tuple[Finding, ...] = (), hint: str | None = None) -> None:
+    def __init__(
+        self, message: str, *, findings: tuple[Finding, ...] = (), hint: str | None = None, plan: object = None
+    ) -> None:
         super().__init__(message, hint=hint)
         self.findings = findings
+        self.plan: Any = plan
 
     def in_words(self, words: Callable[[str], str]) -> Self:
         """As for all errors; also the findings."""

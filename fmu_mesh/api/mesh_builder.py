@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -18,13 +19,13 @@ from ..config.plain_values import plain
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
 from ..instances.python.importing import being_imported, component_section
-from ..instances.registry import KINDS, check_engines
+from ..instances.registry import KINDS
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, checked, takes
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
-from .mesh_check import Check
+from .mesh_check import Check, check_of
 from .plan_options import memory_file, with_record
 from .rebasing import rebased
 from .run_handle import Run
@@ -398,16 +399,7 @@ class Mesh:
         Args:
             options: see `PlanOptions`.
         """
-        run, file = None, self._shown_file
-        try:
-            run = self.plan(**options.given())
-            system = run.plan.system
-            models = {name: (Path(one.fmu), one.description) for name, one in system.instances.items()}
-            check_engines(system.config.instances, models, system.config.limits, str(file))
-            run.check_memory()
-        except ConfigurationError as error:
-            return Check(str(file), error, run)
-        return Check(str(file), run=run)
+        return check_of(str(self._shown_file), partial(self.plan, **options.given()))
 
     @takes(PlanOptions)
     def plan(self, options: PlanOptions) -> RunPlan:

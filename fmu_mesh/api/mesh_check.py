@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from ..errors import ConfigurationError, Finding
+from ..instances.registry import check_engines
 from ..printing import page
 from ..run.run_plan import RunPlan
 from ..text import counted
@@ -14,7 +16,7 @@ from .plan_page import plan_page
 from .plan_view import PlanView, plan_view
 from .tables import html_table
 
-__all__ = ["Check"]
+__all__ = ["Check", "check_of"]
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -36,7 +38,7 @@ class Check(msgspec.Struct, frozen=True):
     Attributes:
         file: the configuration, as messages name it.
         error: why the mesh cannot run; None if it can.
-        run: the plan of the run; None if the configuration is wrong.
+        run: the plan of the run; None if the configuration is wrong. It is there if only this host lacks something.
     """
 
     file: str
@@ -96,3 +98,30 @@ class Check(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         verdict = "\n".join(map(str, self.findings)) or f"OK: {self.file} can run."
         return f"{self.page}\n\n{verdict}" if self.run is not None else verdict
+
+
+def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
+    """Check a plan, and that this host has what its run needs.
+
+    Args:
+        file: the configuration, as messages name it.
+        plan: makes the plan.
+    """
+    run, errors = None, []
+    try:
+        run = plan()
+    except ConfigurationError as error:
+        run, errors = error.plan, [error]
+    if run is not None:
+        system, findings = run.plan.system, run.loaded.findings()
+        models = {name: (Path(one.fmu), one.description) for name, one in system.instances.items()}
+        check_engines(system.config.instances, models, system.config.limits, findings)
+        for look in (findings.raise_any, run.check_memory):
+            try:
+                look()
+            except ConfigurationError as error:
+                errors.append(error)
+    if len(errors) > 1:
+        all_findings = tuple(finding for error in errors for finding in Check(file, error).findings)
+        errors = [ConfigurationError(f"{file}: {len(all_findings)} problems", findings=all_findings)]
+    return Check(file, errors[0] if errors else None, run)

@@ -47,17 +47,19 @@ def _add_schema(parser: CommandParser) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    plan = None
     try:
         check = mesh_of(arguments).check(**given_options(arguments))
-        if not arguments.json and check.run is not None:
+        if arguments.json and check.run is not None:
+            plan = msgspec.Raw(in_flags(msgspec.json.encode(check.plan).decode()).encode())
+        elif check.run is not None:
             print(in_flags(str(check or check.page)))
         check.require()
     except FmuMeshError as error:
         if arguments.json:
-            print_json(CheckReport(str(arguments.config), error.exit_code, error=failure_of(error)))
+            print_json(CheckReport(str(arguments.config), error.exit_code, plan, failure_of(error)))
         raise
     if arguments.json:
-        plan = msgspec.Raw(in_flags(msgspec.json.encode(check.plan).decode()).encode())
         print_json(CheckReport(str(arguments.config), 0, plan))
     return 0
 

@@ -6,13 +6,20 @@ replaced the value. Does not know what is checked.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 from fmu_mesh.errors import ConfigurationError, Finding
 
-__all__ = ["Findings", "ValueOrigin", "located"]
+__all__ = ["CONTAINERS", "Findings", "ValueOrigin", "located"]
+
+CONTAINERS = re.compile(
+    r"|simulation|connections|initialization|record|zenoh|timeouts|limits|(scenario\.)?(values|events)|scenario"
+    r"|ros(\.topics)?|instances(\.[^.]+(\.start_values)?)?"
+)
+"""The paths of mappings and lists whose parts are checked even if something is wrong with the whole, as its key."""
 
 
 class ValueOrigin(NamedTuple):
@@ -94,7 +101,7 @@ class Findings:
             self._places.add(finding.path)
         if isinstance(findings, Findings):
             self._places |= findings.places
-        self._settled = frozenset(self._places - {""})
+        self._settled |= frozenset(place for place in self._places if not CONTAINERS.fullmatch(place))
 
     @property
     def places(self) -> frozenset[str]:
@@ -111,8 +118,11 @@ class Findings:
     def __iter__(self) -> Iterator[Finding]:
         return iter(self._items)
 
-    def raise_any(self) -> None:
+    def raise_any(self, plan: object = None) -> None:
         """Raise one error with all findings in the order of files and lines; do nothing if there are none.
+
+        Args:
+            plan: see `ConfigurationError`.
 
         Raises:
             ConfigurationError: there is at least one finding.
@@ -121,7 +131,7 @@ class Findings:
             files = list(dict.fromkeys([self._file, *(finding.file for finding in self._items)]))
             by_line = sorted(self._items, key=lambda one: (files.index(one.file), one.line is None, one.line or 0))
             text = f"{self._file}: {len(by_line)} problems" if len(by_line) > 1 else str(by_line[0])
-            raise ConfigurationError(text, findings=tuple(by_line))
+            raise ConfigurationError(text, findings=tuple(by_line), plan=plan)
 
 
 def located(

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import msgspec
 from msgspec import inspect, structs
 
-from fmu_mesh.config.findings import Findings, ValueOrigin, located
+from fmu_mesh.config.findings import CONTAINERS, Findings, ValueOrigin, located
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
-from fmu_mesh.config.partial import partial_configuration
-from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, converted, scenario_type
+from fmu_mesh.config.partial import partial_configuration, partial_scenario
+from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, scenario_type
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
@@ -151,11 +151,15 @@ def read_text(text: str, path: Path) -> PlainConfig:
     return PlainConfig(data, path, lines, tuple(findings))
 
 
-def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
+def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | None:
     """The scenario of a configuration: its section, or the file that the section names; None if there is none.
 
+    Args:
+        loaded: the configuration.
+        findings: where everything goes that is wrong with the file; then the result has only its valid parts.
+
     Raises:
-        ConfigurationError: the file cannot be read, or its structure is wrong; has all findings.
+        ConfigurationError: the file cannot be read, or is no YAML.
     """
     section = loaded.config.scenario
     if section is None:
@@ -164,18 +168,19 @@ def read_scenario(loaded: LoadedConfig) -> ScenarioSource | None:
         return ScenarioSource(section, "scenario.", loaded.file, loaded.lines, loaded.overrides)
     path = loaded.resolve(section)
     if not section or not path.is_file():
-        findings = loaded.findings()
         found, expected = f"no such file '{section}'", "a file with values and events"
         if (archive := archive_on_the_way(path)) is not None:
             found, expected = f"'{section}' inside '{archive.name}'", f"{expected}; `../NAME` is beside that archive"
         findings.add("scenario", found, expected, nearest_file(path))
-        findings.raise_any()
+        return None
     shown_path = loaded.file.parent / section  # from inside an archive, only the resolved path can be opened
     plain = read_file(shown_path if shown_path.is_file() else path)
-    findings = Findings(str(plain.file), plain.lines, None, plain.findings)
-    check(plain.data, scenario_type(), "", findings)
-    findings.raise_any()
-    return ScenarioSource(converted(plain.data), "", plain.file, plain.lines, {})
+    own = Findings(str(plain.file), plain.lines, None, plain.findings)
+    check(plain.data, scenario_type(), "", own)
+    config = partial_scenario(plain.data, own.places)
+    findings.merge(own)
+    wrong = frozenset(place for place in own.places if not CONTAINERS.fullmatch(place))
+    return ScenarioSource(config, "", plain.file, plain.lines, {}, wrong) if config is not None else None
 
 
 def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kinds) -> tuple[LoadedConfig, Findings]:

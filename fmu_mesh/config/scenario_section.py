@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-import msgspec
 from msgspec import Meta, inspect
 
 from fmu_mesh.config.base import Base
@@ -92,6 +91,7 @@ class ScenarioSource(NamedTuple):
         file: the file that it stands in; relative paths in it refer to the folder of this file.
         lines: line numbers, counted from 1, by path in the file.
         overrides: the option that replaced a value, by path in the file.
+        wrong: the places in a file of its own for which there are findings already.
     """
 
     config: ScenarioConfig
@@ -99,10 +99,13 @@ class ScenarioSource(NamedTuple):
     file: Path
     lines: dict[str, int]
     overrides: dict[str, str]
+    wrong: frozenset[str] = frozenset()
 
     def findings(self) -> Findings:
         """An empty collection of findings about this file."""
-        return Findings(str(self.file), self.lines, self.overrides)
+        made = Findings(str(self.file), self.lines, self.overrides)
+        made.explain(self.wrong)
+        return made
 
     def resolve(self, relative: str) -> Path:
         """The absolute path for a path in the file."""
@@ -112,8 +115,3 @@ class ScenarioSource(NamedTuple):
 def scenario_type() -> inspect.Type:
     """The type of a file with a scenario, as msgspec sees it."""
     return inspect.type_info(ScenarioConfig)
-
-
-def converted(data: object) -> ScenarioConfig:
-    """The scenario in values that `fmu_mesh.config.structure.check` has found right."""
-    return msgspec.convert(data, ScenarioConfig)

@@ -155,7 +155,9 @@ def _check_struct(value: dict[str, Plain], kind: inspect.StructType, path: str, 
         findings.add(place, "an unknown key" if key else "an empty key", f"one of {listed(list(fields))}", suggestion)
     for name in absent:
         place = f"{path}.{name}" if path else name
-        if fields[name].required and name not in meant and place not in findings.places:
+        if fields[name].required and name in meant:
+            findings.explain([place])
+        elif fields[name].required and place not in findings.places:
             findings.add(place, "missing", describe(fields[name].type))
 
 

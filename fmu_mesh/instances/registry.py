@@ -175,7 +175,7 @@ def check_engines(
     sections: Mapping[str, InstanceSection],
     models: Mapping[str, tuple[Path, ModelDescription]],
     limits: LimitsConfig,
-    file: str,
+    findings: Findings,
 ) -> None:
     """Check that this host has what all instances need that no `host` is named for: engines, and libraries of a system.
 
@@ -183,12 +183,8 @@ def check_engines(
         sections: the sections of a configuration, by instance.
         models: the absolute path and the description of the model of each.
         limits: how large an FMU may be.
-        file: the configuration.
-
-    Raises:
-        ConfigurationError: it has not; with a finding for each of these instances.
+        findings: where one goes for each instance that misses something.
     """
-    findings = Findings(file)
     reasons: dict[object, LoadFailed | None] = {}
     for name, section in sections.items():
         if section.host is not None:
@@ -206,7 +202,6 @@ def check_engines(
                 expected = f"{needed}, or the `host` of the instance. {reason.hint or ''}".rstrip()
                 findings.add(f"instances.{name}.{key}", reason.message, expected)
                 break
-    findings.raise_any()
 
 
 def _refusal(check: Callable[[], None]) -> LoadFailed | None:

@@ -35,7 +35,6 @@ from ..variables.model_description import ModelDescription
 from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
-from .results import check_results
 from .run_plan import RunPlan
 
 __all__ = ["KnownModels", "plan_run", "planned", "prepare"]
@@ -154,8 +153,12 @@ def planned(
     loaded = _located(loaded)
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
     check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
+    obstacles = loaded.findings()
     if not len(findings):  # otherwise the world may be what is wrong
-        check_showing(loaded.config.instances, showing)
+        try:
+            check_showing(loaded.config.instances, showing)
+        except ConfigurationError as error:
+            obstacles.add("`view=True`" if options.view else f"`video={options.video}`", str(error), "")
     known = known or KnownModels()
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
@@ -168,14 +171,21 @@ def planned(
         path = loaded.resolve(own.path) if own.path else Path()
         return known.claims(path, own, descriptions[name], loaded.config.limits)
 
-    system = build(loaded, descriptions, tuple(findings), scenario, claimed)
-    check_results(loaded, system)
+    system = build(loaded, descriptions, findings, scenario, claimed, obstacles)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
-    plan = make_plan(system, file=str(loaded.file), contents=contents)
+    try:
+        plan = make_plan(system, file=str(loaded.file), contents=contents)
+    except ConfigurationError as error:
+        if not error.findings:
+            raise
+        for finding in error.findings:
+            obstacles.add(finding.path, finding.found, finding.expected, finding.suggestion)
+        obstacles.raise_any()
+        raise
     warnings = loaded.findings()
     warn_of_point_loops(plan, warnings)
     plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))
-    return RunPlan(
+    run = RunPlan(
         loaded,
         plan,
         contents,
@@ -184,6 +194,8 @@ def planned(
         profile=options.profile is not False,
         connect=tuple(options.connect or ()),
     )
+    obstacles.raise_any(run)
+    return run
 
 
 def _scenario(
@@ -191,7 +203,7 @@ def _scenario(
 ) -> Scenario | None:
     """The scenario with the values of its bags; None if there is none, or after a finding."""
     try:
-        source = read_scenario(loaded)
+        source = read_scenario(loaded, findings)
     except ConfigurationError as error:
         findings.merge(error.findings)
         return None

@@ -1,4 +1,4 @@
-"""The result files of a run: checked before the run, opened in their formats, counted after their writer was killed.
+"""The result files of a run: opened in their formats, counted after their writer was killed.
 
 Knows no format: `fmu_mesh.system.recording` finds the format by the name of the file.
 
@@ -29,22 +29,10 @@ from ..system.records import record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
 
-__all__ = ["check_results", "open_result", "open_results", "rows_left", "what_is_kept"]
+__all__ = ["open_result", "open_results", "rows_left", "what_is_kept"]
 
 _NAME = "recorded"
 _NOTE = struct.Struct("<qq")
-
-
-def check_results(loaded: LoadedConfig, system: ResolvedSystem) -> None:
-    """Check that the result files can hold what is recorded.
-
-    Raises:
-        ConfigurationError: one of them cannot; carries all findings.
-    """
-    findings = loaded.findings()
-    for record, recording in zip(system.records, _recordings(loaded, system), strict=True):
-        _format(record.file).check(recording, findings)
-    findings.raise_any()
 
 
 def open_results(

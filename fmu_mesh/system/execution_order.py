@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
+from .connections import Connection
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
-from .system import Connection, ResolvedSystem
 
 __all__ = ["ExecutionOrder", "execution_order"]
 
@@ -22,48 +23,52 @@ class ExecutionOrder(NamedTuple):
     cycles: tuple[tuple[str, ...], ...]
 
 
-def execution_order(system: ResolvedSystem, file: str) -> ExecutionOrder:
+def execution_order(
+    names: Collection[str], connections: Sequence[Connection], algorithm: str, file: str
+) -> ExecutionOrder:
     """The connections with their delays, the order of the instances, and the cycles.
 
     Args:
-        system: the system.
+        names: the instances.
+        connections: between them.
+        algorithm: of the configuration.
         file: name of the configuration file, for errors.
 
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
     """
-    connections, closing = _with_delays(system)
+    connections, closing = _with_delays(names, connections, algorithm)
     instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
-    loops = [loop for loop in strongly_connected(system.instances, instant) if is_cycle(loop, instant)]
+    loops = [loop for loop in strongly_connected(names, instant) if is_cycle(loop, instant)]
     if loops:
         findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
         text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
         raise ConfigurationError(text, findings=findings)
     edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
-    order = topological_order(system.instances, instant)
-    cycles = tuple(tuple(part) for part in strongly_connected(system.instances, edges) if is_cycle(part, edges))
+    order = topological_order(names, instant)
+    cycles = tuple(tuple(part) for part in strongly_connected(names, edges) if is_cycle(part, edges))
     return ExecutionOrder(connections, closing, tuple(order), cycles)
 
 
-def _with_delays(system: ResolvedSystem) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
+def _with_delays(
+    names: Collection[str], given: Sequence[Connection], algorithm: str
+) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
     """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle.
 
     A connection to a parameter keeps None: it has no part in the steps.
     """
-    if system.config.simulation.algorithm == "jacobi":
-        return tuple(
-            replace(c, delay=1) if c.delay is None and not c.initial_only else c for c in system.connections
-        ), ()
-    free = [c for c in system.connections if c.delay != 1 and not c.initial_only]
+    if algorithm == "jacobi":
+        return tuple(replace(c, delay=1) if c.delay is None and not c.initial_only else c for c in given), ()
+    free = [c for c in given if c.delay != 1 and not c.initial_only]
     edges = [(c.source_instance, c.target_instance, c.delay is None) for c in free]
-    closing = {id(free[index]) for index in feedback_edges(system.instances, edges)}
+    closing = {id(free[index]) for index in feedback_edges(names, edges)}
     connections = []
-    for connection in system.connections:
+    for connection in given:
         delay = connection.delay
         if delay is None and not connection.initial_only:
             delay = 1 if id(connection) in closing else 0
         connections.append(replace(connection, delay=delay))
-    chosen = tuple(new for old, new in zip(system.connections, connections, strict=True) if id(old) in closing)
+    chosen = tuple(new for old, new in zip(given, connections, strict=True) if id(old) in closing)
     return tuple(connections), chosen
 
 

@@ -211,7 +211,9 @@ def make_plan(
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
     """
-    connections, closing, order, cycles = execution_order(system, file)
+    connections, closing, order, cycles = execution_order(
+        system.instances, system.connections, system.config.simulation.algorithm, file
+    )
     initialization = plan_initialization(system, connections)
     check_loops(initialization, connections, system, file)
     outputs = _output_layouts(system, connections)

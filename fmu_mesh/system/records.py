@@ -16,12 +16,14 @@ import msgspec
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
+from ..errors import ConfigurationError
+from ..files import archive_on_the_way
 from ..simtime import TimeGrid, steps_between
 from ..text import EXPRESSION, is_pattern, listed, matched, nearest, short_number, shown
 from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
-from .recording import has_unknown_ending, is_in_memory, result_endings, result_format
+from .recording import Recording, has_unknown_ending, is_in_memory, result_endings, result_format
 
 __all__ = ["RecordPlan", "record_paths", "record_warnings", "resolve_records", "union_of"]
 
@@ -86,7 +88,7 @@ def union_of(records: Sequence[RecordPlan]) -> tuple[tuple[str, str], ...]:
 
 
 def resolve_records(
-    loaded: LoadedConfig, variables: Variables, grid: TimeGrid | None, findings: Findings
+    loaded: LoadedConfig, variables: Variables, grid: TimeGrid | None, findings: Findings, obstacles: Findings
 ) -> tuple[RecordPlan, ...]:
     """The result files of a configuration; one without a path or without columns is left out.
 
@@ -95,15 +97,18 @@ def resolve_records(
         variables: all variables of all instances; None in place of those that are not known.
         grid: the communication points; None after a finding about them.
         findings: where findings go.
+        obstacles: where findings go about the files themselves, such as a folder of that name, or a missing package.
     """
     records: list[RecordPlan] = []
     first_of: dict[str, str] = {}
     for place, section in loaded.config.records.items():
         chosen = _chosen(section, f"{place}.variables", variables, findings)
-        file = _file(loaded, place, section, findings)
+        file = _file(loaded, place, section, obstacles)
         first = _first_point(section, f"{place}.from", grid, findings)
         if file is None:
             continue
+        known = tuple((i, v) for i, v in chosen if (own := variables.descriptions.get(i)) and own.variable_of(v))
+        _check_format(file, Recording(loaded, variables.descriptions, known, place, first, section.every), obstacles)
         other = first_of.setdefault(file, place)
         if other != place:
             findings.add(f"{place}.file", f"'{section.file}', which is also the file of {other}", "a file of its own")
@@ -167,10 +172,22 @@ def _file(loaded: LoadedConfig, place: str, section: RecordConfig, findings: Fin
         return None
     if is_folder:
         findings.add(place, f"the folder '{text}'", "a file, or null to record nothing")
-    elif result_format(path) is None:
-        endings = " or ".join(result_endings())
-        findings.add(place, f"'{text}', a format that is not written", f"a name ending in {endings}")
+    elif (file := archive_on_the_way(path)) is not None:
+        findings.add(place, f"'{text}' in the file '{file}'", "a file in a folder")
     return str(path)
+
+
+def _check_format(file: str, recording: Recording, findings: Findings) -> None:
+    """Check that a file of this name can be written, and can hold what is recorded."""
+    place, text = f"{recording.place}.file", recording.loaded.config.records[recording.place].file
+    try:
+        if (format_ := result_format(file)) is None:
+            endings = " or ".join(result_endings())
+            findings.add(place, f"'{text}', a format that is not written", f"a name ending in {endings}")
+        else:
+            format_.check(recording, findings)
+    except ConfigurationError as error:  # a package is missing
+        findings.add(place, str(error), "")
 
 
 def _first_point(section: RecordConfig, place: str, grid: TimeGrid | None, findings: Findings) -> int:
@@ -233,7 +250,9 @@ def _add_matched(
     for instance, variable in found:
         for element in variable.elements:
             columns.setdefault((instance, element), None)
-    if not found and all(own is not None for own in variables.values()):
+    instance, dot, _ = _parts(reference)[1].partition(".")
+    possible = variables if is_pattern(instance) or not dot else {instance} & variables.keys()
+    if not found and all(variables[name] is not None for name in possible):
         _nothing_matches(reference, pattern, place, variables, findings)
 
 

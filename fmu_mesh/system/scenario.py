@@ -6,7 +6,8 @@ values in them are an argument, because only `fmu_mesh.ros` knows messages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -22,7 +23,7 @@ from ..variables.model_description import Value, Variable
 from ..variables.units import BaseUnit, Linear, conversion
 from ..variables.value_conversion import FINITE, ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue, is_float
-from .connections import Connection, Variables, resolve_variable
+from .connections import Variables, resolve_variable
 from .schedule import Course, Schedule, SeriesFile
 from .series_files import SeriesRefused, columns_of, content_of, course_of, read_series
 from .settable import why_not_settable
@@ -113,7 +114,7 @@ def resolve_scenario(  # noqa: PLR0913, PLR0917  what a scenario refers to
     scenario: Scenario,
     variables: Variables,
     instances: Mapping[str, ScenarioInput],
-    connections: Iterable[Connection],
+    sources: Mapping[str, str],
     grid: TimeGrid,
     findings: Findings,
 ) -> ResolvedScenario:
@@ -123,11 +124,11 @@ def resolve_scenario(  # noqa: PLR0913, PLR0917  what a scenario refers to
         scenario: the scenario.
         variables: all variables of all instances; None for an instance without a model description.
         instances: those with a model description.
-        connections: what is connected cannot be set.
+        sources: the source instance of each `instance.variable` that is connected, and so cannot be set.
         grid: the communication points.
         findings: where everything goes that is wrong; its paths are those of the file of the scenario.
     """
-    return _Resolving(scenario, variables, instances, connections, grid, findings).resolved()
+    return _Resolving(scenario, variables, instances, sources, grid, findings).resolved()
 
 
 class _Resolving:
@@ -138,14 +139,14 @@ class _Resolving:
         scenario: Scenario,
         variables: Variables,
         instances: Mapping[str, ScenarioInput],
-        connections: Iterable[Connection],
+        sources: Mapping[str, str],
         grid: TimeGrid,
         findings: Findings,
     ) -> None:
         self._scenario = scenario
         self._variables = variables
         self._instances = instances
-        self._sources = {(c.target_instance, c.target.name): c.source_instance for c in connections}
+        self._sources = sources
         self._grid = grid
         self._findings = findings
         self._files: dict[str, str] = {}
@@ -203,7 +204,7 @@ class _Resolving:
             for reference, plain, path in self._of_event(index, event):
                 end = self._settable(reference, path)
                 value = self._value(plain, end[1], path) if end is not None else None
-                if end is None or value is None:
+                if end is None or value is None or event.at == math.inf:  # its time is wrong
                     continue
                 key = end[0], end[1].name
                 if (*key, event.at) in given:
@@ -230,7 +231,7 @@ class _Resolving:
             found = f"'{reference}', an element of the array '{variable.name}'"
             self._findings.add(path, found, f"the whole array: {instance}.{variable.name}")
             return None
-        why = why_not_settable(variable, self._sources.get((instance, variable.name)))
+        why = why_not_settable(variable, self._sources.get(f"{instance}.{variable.name}"))
         if why is not None:
             expected = "an input that is not connected, or a tunable parameter"
             self._findings.add(path, f"'{reference}', which {why.partition(';')[0]}", expected)
@@ -292,7 +293,7 @@ class _Resolving:
                 self._findings.add(f"{path}.times[{index}]", found, "a time that is not before the one in front of it")
                 return None
         values = [self._value(one, variable, f"{path}.values[{i}]", change) for i, one in enumerate(plain)]
-        if any(value is None for value in values):
+        if any(value is None for value in values) or any(map(math.isnan, times)):  # a time that is wrong
             return None
         return Schedule(variable.name, tuple(times), tuple(value for value in values if value is not None))
 

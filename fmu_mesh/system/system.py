@@ -19,7 +19,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
-from fmu_mesh.errors import Finding
+from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import (
     Connection,
@@ -28,6 +28,7 @@ from fmu_mesh.system.connections import (
     unit_warnings,
 )
 from fmu_mesh.system.couplings import coupled_connections
+from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess
@@ -104,12 +105,13 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         return self.records[0].file if self.records else None
 
 
-def build(
+def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about it before
     loaded: LoadedConfig,
     descriptions: Mapping[str, ModelDescription],
     findings: Iterable[Finding] = (),
     scenario: Scenario | None = None,
     claims: ClaimsOf = lambda _name: {},
+    obstacles: Findings | None = None,
 ) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
@@ -120,6 +122,8 @@ def build(
         findings: earlier findings; the error has them, too.
         scenario: the scenario, if there is one.
         claims: what an instance claims of its process.
+        obstacles: where findings go that prevent a run on this host, and not its plan, such as a missing package; None:
+            to the others. An error has them, too.
 
     Raises:
         ConfigurationError: there are findings; it has all of them.
@@ -140,9 +144,22 @@ def build(
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
-    records = resolve_records(loaded, variables, grid, collected)
-    prescribed = _prescribed(scenario, variables, instances, connections, grid, collected)
+    here = loaded.findings()
+    here.explain(collected.places)
+    records = resolve_records(loaded, variables, grid, collected, here)
+    (obstacles := obstacles if obstacles is not None else collected).merge(here)
+    sources = {c.target: c.source.partition(".")[0] for c in config.connections}  # also those of wrong connections
+    sources |= {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
+    prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)
     _check_zenoh(loaded, collected)
+    if len(collected):
+        if obstacles is not collected:
+            collected.merge(obstacles)
+        try:
+            execution_order(instances, connections, config.simulation.algorithm, str(loaded.file))
+        except ConfigurationError as error:
+            for finding in error.findings:
+                collected.add(finding.path, finding.found, finding.expected)
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
         missing = [name for name in config.instances if name not in descriptions]
@@ -168,18 +185,19 @@ def _prescribed(  # noqa: PLR0913, PLR0917  what a scenario refers to
     scenario: Scenario | None,
     variables: Variables,
     instances: Mapping[str, SystemInstance],
-    connections: Iterable[Connection],
+    sources: Mapping[str, str],
     grid: TimeGrid | None,
     findings: Findings,
 ) -> ResolvedScenario:
-    """What the scenario prescribes; nothing without a time grid, for which there is a finding."""
-    if scenario is None or grid is None:
+    """What the scenario prescribes. Without a time grid, for which there is a finding, it is checked all the same."""
+    if scenario is None:
         return ResolvedScenario()
+    grid = grid or TimeGrid(start_time=0.0, step_size=1.0, last_point=ENDLESS)
     inputs = {name: ScenarioInput(own.start_values, own.step_points, own.not_finite) for name, own in instances.items()}
     if scenario.source.prefix:
-        return resolve_scenario(scenario, variables, inputs, connections, grid, findings)
+        return resolve_scenario(scenario, variables, inputs, sources, grid, findings)
     own = scenario.source.findings()
-    prescribed = resolve_scenario(scenario, variables, inputs, connections, grid, own)
+    prescribed = resolve_scenario(scenario, variables, inputs, sources, grid, own)
     findings.merge(own)
     return prescribed
 
@@ -195,11 +213,11 @@ def _grid(config: Config, findings: Findings) -> TimeGrid | None:
     if simulation.real_time_factor < 0.0:
         found = f"{simulation.real_time_factor:g}"
         findings.add("simulation.real_time_factor", found, "0 (as fast as possible) or a positive factor")
-    if any(time is not None and math.isnan(time) for time in (start, stop, step)):
-        return None  # a placeholder, for which there is a finding already
-    if not (math.isfinite(step) and step > 0.0):
+    if step <= 0.0 or math.isinf(step):
         findings.add("simulation.step_size", f"{step:g}", "a step size > 0 in s")
         return None
+    if any(time is not None and math.isnan(time) for time in (start, stop, step)):
+        return None  # a placeholder, for which there is a finding already
     last_point = _last_point(start, stop, step, findings) if stop is not None else ENDLESS
     return TimeGrid(start_time=start, step_size=step, last_point=last_point) if last_point is not None else None
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import fmu_mesh
 from fmu_mesh import text
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
@@ -165,6 +166,128 @@ def test_all_errors_of_a_file_are_told_at_once(refused: Callable[[str], str]) ->
         assert place in message
     for number in range(3):
         assert f"connections[{number}]" in message
+
+
+MANY = f"""\
+mesh: many
+simulation: {{stop_time: 1, step_size: 0.01, windw: 3}}
+instances:
+  gain: {{fmu: {FMUS}/Gain.fmu, start_values: {{kk: 2}}}}
+  delay: {{fmu: {FMUS}/TransportDelay.fmu}}
+  two words: {{fmu: {FMUS}/Gain.fmu}}
+  lost: {{fmu: lost.fmu}}
+  seven: 7
+connections:
+  - {{from: gain.yy, to: delay.x}}
+  - {{from: gain.y, too: delay.x}}
+  - {{from: 7, to: gain.uu}}
+  - lost.y -> gain.u
+  - {{from: gain.y, to: gain.u, delay: 0}}
+  - seven.y -> delay.xx
+record:
+  file: mesh.yaml/many.csv
+  variables:
+    - 7
+    - gain.q
+    - gain.z*
+    - re:(
+scenario:
+  values:
+    gain.q: 1
+    gain.k: {{times: [0, later], values: [1, 2]}}
+    delay.x: 1
+  events:
+    - {{at: later, set: {{gain.q: 1}}}}
+    - 7
+    - {{at: 1, set: {{gain.k: fast}}}}
+ros:
+  topics:
+    - 7
+    - gain.q
+    - {{topic: /y, varable: gain.y}}
+    - {{topic: /1 a, variable: gain.y}}
+  clock_rate: -1
+zenoh: {{config: lost.json5}}
+"""
+"""Mistakes of all phases; none is a consequence of another one."""
+
+MANY_PLACES = """
+2 simulation.windw
+4 instances.gain.start_values.kk
+6 instances.two words
+7 instances.lost.fmu
+8 instances.seven
+10 connections[0].from
+11 connections[1].too
+12 connections[2].from
+12 connections[2].to
+14 connections[4]
+14 connections[4].delay
+15 connections[5].to
+17 record.file
+19 record.variables[0]
+20 record.variables[1]
+21 record.variables[2]
+22 record.variables[3]
+25 scenario.values.gain.q
+26 scenario.values.gain.k.times[1]
+27 scenario.values.delay.x
+29 scenario.events[0].at
+29 scenario.events[0].set.gain.q
+30 scenario.events[1]
+31 scenario.events[2].set.gain.k
+34 ros.topics[0]
+35 ros.topics[1]
+36 ros.topics[2].varable
+37 ros.topics[3].topic
+38 ros.clock_rate
+39 zenoh.config
+"""
+
+
+def test_no_mistake_of_any_phase_hides_another_one(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.yaml"
+    path.write_text(MANY)
+
+    findings = fmu_mesh.load(path).check().findings
+
+    assert [f"{one.line} {one.path}" for one in sorted(findings, key=lambda one: (one.line, one.path))] == (
+        MANY_PLACES.split("\n")[1:-1]
+    )
+
+
+def test_mistakes_in_a_scenario_of_its_own_are_told_together(tmp_path: Path) -> None:
+    lines = MANY.splitlines()
+    (tmp_path / "drive.yaml").write_text("\n".join(line[2:] for line in lines[lines.index("scenario:") + 1 :][:8]))
+    (tmp_path / "mesh.yaml").write_text(f"{GOOD}scenario: drive.yaml\n".replace("pendulum", "gain"))
+
+    findings = fmu_mesh.load(tmp_path / "mesh.yaml").check().findings
+
+    own = [f"{one.line} {one.path}" for one in findings if Path(one.file).name == "drive.yaml"]
+    places = [line.removeprefix("scenario.") for line in MANY_PLACES.split() if line.startswith("scenario.")]
+    assert sorted(line.split()[1] for line in own) == sorted(places)
+
+
+@pytest.mark.parametrize("wrong_too", [False, True])
+def test_missing_packages_and_files_in_the_way_hide_no_plan(
+    *, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong_too: bool
+) -> None:
+    for package in ("pyarrow", "rosbags", "rosbags.typesys"):
+        monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / "out.csv").mkdir()
+    text = GOOD.replace("record: {file: pair.csv}", "record: [{file: out.csv}, {file: pair.parquet}]")
+    topics = "[nobody.y, delay.q]" if wrong_too else "[delay.y]"
+    (tmp_path / "mesh.yaml").write_text(f"{text}ros: {{topics: {topics}}}\n" if wrong_too else text)
+
+    check = fmu_mesh.load(tmp_path / "mesh.yaml").check()
+
+    places = [finding.path for finding in check.findings]
+    ros = ["ros", "ros.topics[0]", "ros.topics[1]"] if wrong_too else []
+    assert (sorted(places), bool(check), check.plan is None) == (
+        sorted(["record[0].file", "record[1].file", *ros]),
+        False,
+        wrong_too,
+    )
 
 
 def no_archive(path: Path) -> None:

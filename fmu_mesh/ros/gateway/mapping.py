@@ -66,12 +66,14 @@ def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings
         return None
     types = message_types(loaded, findings)
     _check_section(loaded.config, section, findings)
-    if types is None:
-        return None
     # Array sizes that are too large are reported with the start values that set them, so not here.
     instances, ignored = loaded.config.instances, loaded.findings()
     full = {name: sized(name, own, instances[name], ignored) for name, own in descriptions.items() if name in instances}
-    return Resolver(loaded.config, section, full, types, findings).plan()
+    resolver = Resolver(loaded.config, section, full, types, findings)
+    if types is None:  # the names can be checked
+        resolver.topics()
+        return None
+    return resolver.plan()
 
 
 def descriptions_of(infos: Mapping[str, InstanceInfo]) -> dict[str, ModelDescription]:

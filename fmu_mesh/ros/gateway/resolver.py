@@ -33,7 +33,7 @@ class Resolver:
         config: the configuration.
         section: its section `ros`, or another one in its place.
         descriptions: the model descriptions by instance name.
-        types: the message types.
+        types: the message types; None checks names only.
         findings: where the findings go.
     """
 
@@ -42,7 +42,7 @@ class Resolver:
         config: Config,
         section: RosConfig,
         descriptions: Descriptions,
-        types: MessageTypes,
+        types: MessageTypes | None,
         findings: Findings,
     ) -> None:
         self._config = config
@@ -54,17 +54,22 @@ class Resolver:
         self._owners: dict[tuple[str, Direction], str] = {}
         self._messages: dict[str, tuple[str, str]] = {}
 
-    def plan(self) -> RosPlan:
-        """The plan; after findings it is incomplete."""
+    def topics(self) -> list[Topic]:
+        """The topics without a finding."""
         topics = []
         for entry in self._entries():
             for topic in self._topics(entry):
                 self._check_unique(topic, entry.path)
                 topics.append(topic)
+        return topics
+
+    def plan(self) -> RosPlan:
+        """The plan; after findings it is incomplete. It needs message types."""
+        assert self._types is not None
         step_size, rate = self._config.simulation.step_size, self._section.clock_rate
         return RosPlan(
             types=self._types,
-            topics=tuple(topics),
+            topics=tuple(self.topics()),
             parameters=tuple(self._parameters()),
             node=self._section.node or ros_name(self._config.mesh),
             namespace=self._section.namespace,
@@ -174,7 +179,8 @@ class Resolver:
             reliability=entry.item.reliability,
             constants=tuple(entry.item.constants.items()),
         )
-        check_topic(entry, topic, self._types, self._findings)
+        if self._types is not None:
+            check_topic(entry, topic, self._types, self._findings)
         if len(self._findings) == before:
             yield topic
 
