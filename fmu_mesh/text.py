@@ -32,6 +32,7 @@ __all__ = [
 
 _LISTED_NAMES = 8
 _SHOWN_CHARACTERS = 60
+_WEIGHT_OF_ENDING = 0.3
 
 _REPETITION = re.compile(r"[*+?{]")
 _MATCHING = """
@@ -64,11 +65,20 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 
 
 def nearest_file(path: Path) -> str | None:
-    """The existing file in the folder of ``path`` that has the nearest name, or None."""
+    """The existing file in the folder of ``path`` that has the nearest name, or None. Endings decide among equals."""
     try:
-        name = nearest(path.name, sorted(entry.name for entry in path.parent.iterdir() if entry.is_file()))
+        names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file())
     except OSError:
         return None
+    wanted, stems = Path(path.name.casefold()), {name: Path(name.casefold()).stem for name in names}
+
+    def likeness(name: str) -> float:
+        ending = difflib.SequenceMatcher(None, wanted.suffix, Path(name.casefold()).suffix).ratio()
+        return difflib.SequenceMatcher(None, wanted.stem, stems[name]).ratio() + _WEIGHT_OF_ENDING * ending
+
+    close = {*difflib.get_close_matches(wanted.stem, {*stems.values()}, n=_LISTED_NAMES)}
+    near = [name for name in names if stems[name] in close]
+    name = max(near, key=likeness) if near else nearest(path.name, names)
     return str(path.with_name(name)) if name is not None else None
 
 

@@ -31,7 +31,7 @@ from ..run.local_system import LocalSystem, SavedSystem, opening_of
 from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
-from ..system.settable import check_settable
+from ..system.settable import check_settable, sources_of, why_not_settable
 from ..text import listed, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
@@ -361,7 +361,9 @@ class System:
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)
         if variable is None or (rest != variable.name and rest not in variable.elements):
-            names = [one.name for one in description.variables]
+            sources = sources_of(self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance))
+            free = [one.name for one in description.variables if not why_not_settable(one, sources.get(one.name))]
+            names = [one.name for one in description.variables] if elements else free
             near = nearest(rest, names)
             hint = f"Did you mean '{instance}.{near}'?" if near else f"There are {listed(names)}."
             if (clock := description.clock(rest)) is not None:

@@ -111,9 +111,10 @@ def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
 
 def start_value_origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> ValueOrigin:
     """Where a start value comes from: a line of a file, as short as a person would write its path, or an option."""
-    is_own = variable in loaded.config.instances[instance.name].start_values  # the scenario has none of these
-    path = f"instances.{instance.name}.start_values.{variable}"
-    origin = loaded.origin(path) if is_own else loaded.scenario_origin
+    own = loaded.config.instances[instance.name].start_values  # the scenario has none of these
+    written = variable if variable in own else next((name for name in own if name.startswith(f"{variable}[")), None)
+    path = f"instances.{instance.name}.start_values.{written}"
+    origin = loaded.origin(path) if written is not None else loaded.scenario_origin
     return origin._replace(file=short_path(origin.file)) if origin.file else origin
 
 

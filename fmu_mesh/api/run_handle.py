@@ -235,7 +235,7 @@ class Run:
         """
         client = self._running()
         try:
-            return client.set(target_of(client, name), value, at)
+            return client.set(target_of(client, name, to_set=True), value, at)
         except ConfigurationError as error:
             raise CallRefused(error.message, hint=error.hint) from error
 

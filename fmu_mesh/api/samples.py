@@ -88,14 +88,14 @@ def targets_of(client: MeshClient, *names: str) -> list[Target]:
         raise UnknownName(error.message, hint=error.hint) from error
 
 
-def target_of(client: MeshClient, name: str) -> Target:
-    """The one variable that a name or a pattern means.
+def target_of(client: MeshClient, name: str, *, to_set: bool = False) -> Target:
+    """The one variable that a name or a pattern means; for an unknown name, ``to_set`` suggests what can be set.
 
     Raises:
         UnknownName: there is none, or there are several.
     """
     try:
-        return client.target(name)
+        return client.target(name, to_set=to_set)
     except ConfigurationError as error:
         raise UnknownName(error.message, hint=error.hint) from error
 

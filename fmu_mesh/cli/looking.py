@@ -203,7 +203,7 @@ def _add_set(parser: CommandParser) -> None:
 
 def _set(arguments: argparse.Namespace, meshes: Meshes) -> int:
     client = meshes.one(arguments.key)
-    target = client.target(arguments.key)
+    target = client.target(arguments.key, to_set=True)
     answer = client.set(target, _value(target, arguments.value), arguments.at)
     key = printable(answer.key)
     if arguments.json:

@@ -344,22 +344,14 @@ def _at_its_end(own: InstanceStatus) -> InstanceStatus:
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:
     variables = {f"{name}.{v.name}": v for name, info in infos.items() for v in info.variables}
-    fed = {own.target for info in infos.values() for own in info.connections if not own.initial_only}
     elements = {
         f"{name.partition('.')[0]}.{element}": (name, number)
         for name, v in variables.items()
         if v.type not in ("String", "Binary")
         for number, element in enumerate(element_names(v.name, v.shape))
     }
-    settable = {name: v for name, v in variables.items() if _may_be_set(name, v, fed)}
+    settable = {name: v for name, v in variables.items() if v.settable}
     return Catalogue(variables, elements, settable, graph_of_infos(mesh, [*infos.values()]))
-
-
-def _may_be_set(name: str, variable: VariableView, fed: set[str]) -> bool:
-    if variable.causality == "input":
-        elements = element_names(name, variable.shape)
-        return name not in fed and not any(element in fed for element in elements)
-    return variable.causality in ("parameter", "calculatedParameter") and variable.variability == "tunable"
 
 
 def _is_a_second(old: Mapping[str, InstanceStatus], new: Mapping[str, InstanceStatus]) -> bool:

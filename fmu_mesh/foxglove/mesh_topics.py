@@ -7,7 +7,7 @@ topics, so only what a panel shows travels through the mesh, and a quoted topic 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, cast
 
 import msgspec
@@ -20,7 +20,6 @@ __all__ = [
     "STATUS_SCHEMA",
     "message_of",
     "schema_of",
-    "settable",
     "status_message",
     "topic_of",
     "topics_by_instance",
@@ -93,19 +92,6 @@ def status_message(status: MeshStatus) -> bytes:
     )
 
 
-def settable(infos: Iterable[InstanceInfo], targets: Iterable[Target]) -> dict[str, Target]:
-    """The unconnected inputs and tunable parameters among variables, by `instance.variable`.
-
-    Args:
-        infos: of all instances.
-        targets: all variables.
-    """
-    connected = {own.target for info in infos for own in info.connections if not own.initial_only}
-    connected |= {element[0] for name in connected if (element := split_element(name)) is not None}
-    names = {target.name: target for target in targets}
-    return {name: target for name, target in names.items() if name not in connected and _is_open(target.variable)}
-
-
 def topics_by_instance(
     infos: Mapping[str, InstanceInfo], targets: Sequence[Target]
 ) -> dict[str, tuple[str, tuple[str, ...]]]:
@@ -117,13 +103,6 @@ def topics_by_instance(
             for source in (connection.source, *([element[0]] if element is not None else ())):
                 readers.setdefault(source, {})[name] = None
     return {topic_of(target): (target.instance, tuple(readers.get(target.name, ()))) for target in targets}
-
-
-def _is_open(view: VariableView) -> bool:
-    if view.type == "Binary":  # Foxglove has no field for it
-        return False
-    is_parameter = view.causality in ("parameter", "calculatedParameter")
-    return view.causality == "input" or (is_parameter and view.variability == "tunable")
 
 
 def _description(view: VariableView) -> str:

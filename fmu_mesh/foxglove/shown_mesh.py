@@ -21,7 +21,7 @@ from ..wire.client.value_stream import ValueStream
 from ..wire.views import MeshInfo, MeshStatus
 from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
-from .mesh_topics import message_of, schema_of, settable, status_message, topic_of, topics_by_instance
+from .mesh_topics import message_of, schema_of, status_message, topic_of, topics_by_instance
 
 __all__ = ["ShownMesh"]
 
@@ -62,9 +62,9 @@ class ShownMesh:
             else [target for target in everything if target.variable.causality == "output"]
         )
         self._targets = {topic_of(target): target for target in offered}
-        self._parameters = MeshParameters(
-            client, settable(self._infos.values(), everything), self._refused, read_only=read_only
-        )
+        has_field = {one.name: one for one in everything if one.variable.type != "Binary"}  # Foxglove has none for it
+        settable = {name: target for name, target in has_field.items() if target.variable.settable}
+        self._parameters = MeshParameters(client, settable, self._refused, read_only=read_only)
         self._stream = ValueStream(client, _WAITING_VALUES)
         self._without: dict[str, Target] = {}
         self._asking = False

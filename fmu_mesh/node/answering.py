@@ -16,7 +16,7 @@ import msgspec
 import zenoh
 
 from ..system.plan import NodePlan
-from ..system.settable import check_settable
+from ..system.settable import check_settable, sources_of, why_not_settable
 from ..variables.model_description import Value, Variable
 from ..variables.value_conversion import to_plain
 from ..wire.inbox import Inbox
@@ -293,6 +293,7 @@ class _Pending:
 def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
+    sources = sources_of(runner.plan)
     return InstanceInfo(
         instance=runner.name,
         model_name=description.model_name,
@@ -318,6 +319,7 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
                 v.minimum,
                 v.maximum,
                 v.items,
+                why_not_settable(v, sources.get(v.name)) is None,
             )
             for v in description.variables
             if (kind := kind_of(v)) is not None

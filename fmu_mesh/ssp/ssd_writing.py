@@ -131,8 +131,10 @@ class _Writer:
     # --- components
 
     def _component(self, parent: XmlNode, name: str) -> None:
-        start_values = self._system.config.instances[name].start_values
         description = self._system.instances[name].description
+        named = [description.variable_of(key) for key in self._system.config.instances[name].start_values]
+        resolved = self._system.instances[name].start_values  # where elements are written, the whole array
+        start_values = {variable.name: resolved[variable.name] for variable in named if variable is not None}
         # The type is the default of the standard, but OMSimulator leaves out components of SSP 2.0 without one.
         source, type_ = self._names.sources[name], "application/x-fmu-sharedlibrary"
         component = child(parent, "ssd:Component", name=self._names.elements[name], type=type_, source=source)

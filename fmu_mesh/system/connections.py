@@ -6,7 +6,7 @@ Owns the names of the ends (the first dot ends the instance name), causality, ty
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
 import msgspec
@@ -29,7 +29,17 @@ from fmu_mesh.variables.value_types import (
     takes,
 )
 
-__all__ = ["Connection", "Variables", "resolve_connections", "resolve_variable", "unit_warnings"]
+__all__ = [
+    "Connection",
+    "Variables",
+    "element_of",
+    "offered",
+    "resolve_connections",
+    "resolve_variable",
+    "unit_warnings",
+]
+
+Offer = Callable[[str, Variable], bool]
 
 
 class Variables(dict[str, Mapping[str, Variable] | None]):
@@ -134,8 +144,14 @@ def resolve_connections(
     return tuple(connections)
 
 
+def offered(instance: str, variables: Variables, offer: str | Offer) -> list[str]:
+    """The variables of an instance with a causality, or of which ``offer`` is true."""
+    own = (variables.get(instance) or {}).values()
+    return [v.name for v in own if (v.causality == offer if isinstance(offer, str) else offer(instance, v))]
+
+
 def resolve_variable(
-    reference: str, path: str, variables: Variables, causality: str, findings: Findings
+    reference: str, path: str, variables: Variables, offer: str | Offer, findings: Findings
 ) -> tuple[Variable, tuple[int, ...]] | None:
     """The variable that `instance.variable` names; None after a finding, or without a model description.
 
@@ -148,12 +164,12 @@ def resolve_variable(
         reference: instance name and FMI variable name; the first dot is between them.
         path: the place of the reference in the file.
         variables: all variables of all instances.
-        causality: the causality that names are suggested from.
+        offer: the causality of the variables that are suggested, or which of them can be set, by instance and variable.
         findings: where unknown names go.
     """
     instance, dot, name = reference.partition(".")
     if not instance or not dot or not name:
-        names = [v.name for v in (variables.get(instance) or {}).values() if v.causality == causality]
+        names = offered(instance, variables, offer)
         findings.add(path, f"'{reference}'", f"{instance}.{names[0]}" if len(names) == 1 else "instance.variable")
         return None
     if instance not in variables:
@@ -165,14 +181,17 @@ def resolve_variable(
         return None
     if name not in own:
         if (parts := split_element(name)) is not None and parts[0] in own:
-            return _element(own[parts[0]], parts[1], path, reference, findings)
-        names = [variable.name for variable in own.values() if variable.causality == causality]
-        expected = f"one of the {causality}s of '{instance}': {listed(names)}"
+            return element_of(own[parts[0]], parts[1], path, reference, findings)
+        names = offered(instance, variables, offer)
+        near, words = nearest(name, names), f"{offer}s of '{instance}'"
+        if not isinstance(offer, str):
+            words = f"variables of '{instance}' that can be set"
+        expected = f"one of the {words}: {listed(sorted(names, key=lambda one: one != near))}"
         if (clock := variables.descriptions[instance].clock(name)) is not None:
             findings.add(path, clock, "")
         else:
             found = f"the unknown variable '{name}' of instance '{instance}'"
-            findings.add(path, found, expected, nearest(name, names))
+            findings.add(path, found, expected, near)
         return None
     return own[name], ()
 
@@ -324,9 +343,7 @@ def _is_open_parameter(target: Variable) -> bool:
 
 def _names_of(instance: str, causality: str, variables: Variables) -> str:
     """The variables of an instance with a causality, as the end of the sentence `an output ...`."""
-    own = variables[instance] or {}
-    names = [variable.name for variable in own.values() if variable.causality == causality]
-    return f" of '{instance}': {listed(names)}"
+    return f" of '{instance}': {listed(offered(instance, variables, causality))}"
 
 
 def _check_types(connection: Connection, findings: Findings) -> None:
@@ -370,7 +387,7 @@ def _end(variable: Variable, index: tuple[int, ...]) -> str:
     return variable.type_name.partition("[")[0] if index else variable.type_name
 
 
-def _element(
+def element_of(
     variable: Variable, index: tuple[int, ...], path: str, reference: str, findings: Findings
 ) -> tuple[Variable, tuple[int, ...]] | None:
     """An element of an array; None after a finding, if it has no such index."""

@@ -7,7 +7,7 @@ values in them are an argument, because only `fmu_mesh.ros` knows messages.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,12 +18,12 @@ from ..config.findings import Findings
 from ..config.scenario_section import ScenarioEvent, ScenarioSource, ScenarioValues
 from ..errors import Finding
 from ..simtime import TimeGrid
-from ..text import shown
+from ..text import listed, shown
 from ..variables.model_description import Value, Variable
 from ..variables.units import BaseUnit, Linear, conversion
 from ..variables.value_conversion import FINITE, ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue, is_float
-from .connections import Variables, resolve_variable
+from .connections import Variables, offered, resolve_variable
 from .schedule import Course, Schedule, SeriesFile
 from .series_files import SeriesRefused, columns_of, content_of, course_of, read_series
 from .settable import why_not_settable
@@ -171,7 +171,9 @@ class _Resolving:
             if (course := self._course(entry)) is None:
                 continue
             schedules.setdefault(entry.instance, []).append(entry.schedule)
-            self._check_end(entry, course)
+            if entry.schedule.file or not entry.schedule.initial:
+                begin = self._grid.time(course.first_step * self._instances[entry.instance].step_points)
+                self._tell_late([(entry.path, begin)], entry.instance)
             start = course.value(0) if entry.schedule.initial else None
             if start is not None:
                 start_values.setdefault(entry.instance, {})[entry.variable.name] = start
@@ -211,6 +213,7 @@ class _Resolving:
                     text = f"'{reference}' at {event.at:g} s a second time"
                     self._findings.add(path, text, "one event for a variable at a time")
                 given.add((*key, event.at))
+                self._tell_late([(path, event.at)], end[0])
                 found.setdefault(key, []).append((event.at, value))
                 ends.setdefault(key, _Entry(*end, path, Schedule(end[1].name, (), ())))
         for key, pairs in found.items():
@@ -223,7 +226,7 @@ class _Resolving:
 
     def _settable(self, reference: str, path: str) -> tuple[str, Variable] | None:
         """The instance and the variable of a reference that may be set; None after a finding, or without a model."""
-        end = resolve_variable(reference, path, self._variables, "input", self._findings)
+        end = resolve_variable(reference, path, self._variables, self._is_settable, self._findings)
         if end is None:
             return None
         (variable, index), instance = end, reference.partition(".")[0]
@@ -233,10 +236,14 @@ class _Resolving:
             return None
         why = why_not_settable(variable, self._sources.get(f"{instance}.{variable.name}"))
         if why is not None:
-            expected = "an input that is not connected, or a tunable parameter"
+            names = offered(instance, self._variables, self._is_settable)
+            expected = f"an input that is not connected, or a tunable parameter of '{instance}': {listed(names)}"
             self._findings.add(path, f"'{reference}', which {why.partition(';')[0]}", expected)
             return None
         return instance, variable
+
+    def _is_settable(self, instance: str, variable: Variable) -> bool:
+        return why_not_settable(variable, self._sources.get(f"{instance}.{variable.name}")) is None
 
     # --- one variable
 
@@ -255,6 +262,9 @@ class _Resolving:
             return None
         if given.file is None:
             schedule = self._listed(given, variable, change, path)
+            times = enumerate(schedule.times) if schedule is not None else ()
+            places = [(f"{path}.times[{index}]", time) for index, time in times]
+            self._tell_late(places, reference.partition(".")[0], linear=linear)
         elif is_bag(given):
             schedule = self._bag(reference, given, variable, change, path)
         else:
@@ -398,13 +408,14 @@ class _Resolving:
             return None
         return course
 
-    def _check_end(self, entry: _Entry, course: Course) -> None:
-        """Warn of what comes after the last step: most likely the stop time, or the unit of a time, is wrong."""
-        begin = course.first_step * self._instances[entry.instance].step_points
-        if begin >= self._grid.last_point > 0:
-            found = f"the first value of '{entry.instance}.{entry.variable.name}' comes after the last step"
-            stop = self._grid.stop_time
-            self._late.add(entry.path, found, f"a time before {stop:g} s" if stop is not None else "an earlier time")
+    def _tell_late(self, places: Sequence[tuple[str, float]], instance: str, *, linear: bool = False) -> None:
+        """Warn of the first time after the last step: it, the stop time, or the unit of a time may be wrong."""
+        points, last, time_of = self._instances[instance].step_points, self._grid.last_point, self._grid.time
+        late = [self._grid.step_at(time, points) * points >= last > 0 for _, time in places]
+        for path, time in places[late.index(True) + linear :][:1] if any(late) else ():  # the first one may end a line
+            found = f"never reached: at {time:.9g} s, stop time {time_of(last):.9g} s"
+            end = time_of((last - 1) // points * points)
+            self._late.add(path, found, f"a time up to {end:.9g} s, that of the last step")
 
     def _check_start(self, entry: _Entry) -> None:
         """A value for the start is a start value: there must be no other one, and it must be allowed."""

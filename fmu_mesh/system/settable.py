@@ -1,4 +1,7 @@
-"""What may be set between two steps: unconnected inputs and tunable parameters; everything else with a reason."""
+"""What may be set between two steps: unconnected inputs and tunable parameters; everything else with a reason.
+
+Nobody else decides it: `VariableView.settable` tells tools of a running mesh.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,12 @@ from ..variables.value_conversion import ValueRefused
 if TYPE_CHECKING:
     from .plan import InstancePlan
 
-__all__ = ["check_settable", "why_not_settable"]
+__all__ = ["check_settable", "sources_of", "why_not_settable"]
+
+
+def sources_of(plan: InstancePlan) -> dict[str, str]:
+    """The source instance of each input of an instance that is connected, or of which an element is."""
+    return {plan.inputs.column(own.target).name: feed.source for feed in plan.feeds for own in feed.columns}
 
 
 def check_settable(plan: InstancePlan, variable: Variable) -> None:
@@ -19,15 +27,7 @@ def check_settable(plan: InstancePlan, variable: Variable) -> None:
     Raises:
         ValueRefused: it may not; the message is the predicate of a sentence whose subject is the variable.
     """
-    source = None
-    if variable.name in plan.inputs.names:
-        layout = plan.inputs
-        source = next(
-            feed.source
-            for feed in plan.feeds
-            if variable.name in {layout.column(own.target).name for own in feed.columns}
-        )
-    why = why_not_settable(variable, source)
+    why = why_not_settable(variable, sources_of(plan).get(variable.name))
     if why is not None:
         raise ValueRefused(why)
 

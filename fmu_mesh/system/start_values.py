@@ -9,13 +9,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
+import numpy as np
+from msgspec.structs import replace
+
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.mesh import Config
+from fmu_mesh.system.connections import element_of
 from fmu_mesh.text import listed, nearest, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
-from fmu_mesh.variables.value_types import MAX_ELEMENTS
+from fmu_mesh.variables.value_types import MAX_ELEMENTS, flattened, nested, split_element
 
 __all__ = ["forbidden", "forbidden_start_values", "resolve_start_values", "sized"]
 
@@ -61,9 +65,11 @@ def resolve_start_values(
     """
     settable = [variable.name for variable in description.variables if variable.settable_before_start]
     values: dict[str, Value] = {}
-    for variable_name, value in config.start_values.items():
+    # Elements come last: they replace those of the array.
+    for variable_name, value in sorted(config.start_values.items(), key=lambda one: not description.variable(one[0])):
         path = f"instances.{name}.start_values.{variable_name}"
-        variable = description.variable(variable_name)
+        variable, parts = description.variable_of(variable_name), split_element(variable_name)
+        index = parts[1] if parts is not None and variable is not None and variable.name != variable_name else ()
         if (clock := description.clock(variable_name)) is not None:
             findings.add(path, clock, "")
         elif variable is None:
@@ -73,10 +79,21 @@ def resolve_start_values(
             found = f"'{variable_name}', {variable.role} that cannot be set before the start"
             findings.add(path, found, f"one of {listed(settable)}")
         else:
+            if index and element_of(variable, index, path, variable_name, findings) is None:
+                continue
+            whole, own = values.get(variable.name, variable.start), replace(variable, shape=()) if index else variable
+            if index and whole is None:
+                findings.add(path, f"an element of '{variable.name}', which has no start value", "that of all elements")
+                continue
             try:
-                values[variable_name] = to_value(value, variable, finite=finite)
+                converted = to_value(value, own, finite=finite)
+                if index and whole is not None:
+                    elements = flattened(whole, len(variable.shape))
+                    elements[int(np.ravel_multi_index(index, variable.shape))] = converted
+                    converted = nested(elements, variable.shape)
+                values[variable.name] = converted
             except ValueRefused as refused:
-                found = f"{shown(value)} for the {variable.type_name} '{variable_name}'"
+                found = f"{shown(value)} for the {own.type_name} '{variable_name}'"
                 if refused.out_of_range:
                     found = f"{shown(value)} for '{variable_name}', which is out of its range"
                 findings.add(path, found, refused.expected, refused.suggestion)
@@ -97,10 +114,9 @@ def forbidden_start_values(
     for name, instance in config.instances.items():
         if not instance.follows_fmi or name not in descriptions or config.is_strict(instance) != strict:
             continue
-        variables = {variable.name: variable for variable in descriptions[name].variables}
-        settable = [variable.name for variable in variables.values() if variable.settable_before_start]
+        settable = [variable.name for variable in descriptions[name].variables if variable.settable_before_start]
         for variable_name, value in instance.start_values.items():
-            variable = variables.get(variable_name)
+            variable = descriptions[name].variable_of(variable_name)
             if variable is None or variable.settable_before_start or not variable.may_take_start_value:
                 continue  # it is allowed, or `resolve_start_values` refuses it
             found = f"{shown(value)} for {forbidden(variable, descriptions[name])}"

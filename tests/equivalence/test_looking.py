@@ -228,10 +228,25 @@ def test_status_and_info_name_meshes_and_instances_in_every_form(call: Call) -> 
 
 def test_start_values_are_those_in_effect(call: Call) -> None:
     for command in (("info", "gain"), ("ls", "gain"), ("ls", "-l")):
-        assert "\n  param/k   Real  tunable      2.0    Gain\n" in call(*command)[1]
+        assert "\n  param/k   Real  tunable      yes       2.0    Gain\n" in call(*command)[1]
     views = json.loads(call("info", "pendulum", "--json")[1])["variables"]
     starts = {view["name"]: view.get("start") for view in views}
     assert starts == {"a": 1.3, "der(a)": 0.0, "der(a,2)": None, "l": 1.0, "d": 0.1, "g": 9.81}
+
+
+def test_views_say_what_a_running_mesh_lets_one_set(call: Call) -> None:
+    for instance in ("pendulum", "gain", "free"):
+        for view in json.loads(call("info", instance, "--json")[1])["variables"]:
+            refused = call("set", f"{instance}.{view['name']}", "no number")[2]
+
+            assert view.get("settable", False) == ("expected a number" in refused), refused
+
+
+def test_setting_an_unknown_name_offers_what_can_be_set(call: Call) -> None:
+    near, other = (call("set", f"gain.{name}", "1")[2] for name in ("kk", "z"))
+
+    assert near.endswith("instance 'gain' has no variable 'kk'. Did you mean 'k'?\n")
+    assert other.endswith("instance 'gain' has no variable 'z'. There are: k.\n")
 
 
 def test_get_takes_names_keys_and_wildcards(call: Call) -> None:

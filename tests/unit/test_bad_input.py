@@ -338,6 +338,30 @@ def test_a_missing_file_is_told_with_the_nearest_that_there_is(
 
 
 @pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("pendulum.yml", "pendulum.yaml"),
+        ("Gain.fmy", "gain.fmu"),
+        ("gain", "gain.fmu"),
+        ("pendulum_dely.yaml", "pendulum_delay.yaml"),
+        ("other.yaml", None),
+    ],
+)
+def test_the_nearest_file_is_found_whatever_its_ending(typed: str, meant: str | None, tmp_path: Path) -> None:
+    for name in (
+        "pendulum.yaml",
+        "pendulums.yml",
+        "pendulum.csv",
+        "pendulum_delay.yaml",
+        "pendulum_delay.csv",
+        "gain.fmu",
+    ):
+        (tmp_path / name).touch()
+
+    assert text.nearest_file(tmp_path / typed) == (str(tmp_path / meant) if meant is not None else None)
+
+
+@pytest.mark.parametrize(
     ("option", "says"),
     [
         ("--set=pendulun.l=2", "Did you mean 'pendulum'?"),

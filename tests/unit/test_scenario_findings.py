@@ -135,16 +135,52 @@ def test_a_wrong_table_is_told_by_its_line(table: str, given: dict[str, Any], ex
     assert expected in str(found)
 
 
-def test_a_value_after_the_last_step_is_a_warning(tmp_path: Path) -> None:
-    path = tmp_path / "mesh.yaml"
-    path.write_text(BASE)
-    mesh = fmu_mesh.load(path)
-    mesh.scenario(events=[{"at": 1000.0, "set": {"gain.u": 1.0}}])
+@pytest.mark.parametrize(
+    ("values", "events", "path", "time"),
+    [
+        ({}, [{"at": 1000.0, "set": {"gain.u": 1.0}}], "events[0].set.gain.u", "1000"),
+        ({"gain.u": 1.0}, [{"at": 0.5, "set": {"gain.u": 2}}, {"at": 1.5, "set": {"gain.u": 3}}], "events[1]", "1.5"),
+        ({"gain.u": {"times": [0, 0.5, 2, 3], "values": [0, 1, 2, 3]}}, [], "values.gain.u.times[2]", "2"),
+        (
+            {"gain.u": {"times": [0, 0.5, 2, 3], "values": [0, 1, 2, 3], "interpolation": "linear"}},
+            [],
+            "values.gain.u.times[3]",  # the line that ends at 2 s is in use before
+            "3",
+        ),
+        ({"gain.u": {"file": "t.csv"}}, [], "values.gain.u", "5"),
+    ],
+)
+def test_a_value_that_is_never_reached_is_a_warning(
+    values: dict[str, Any], events: list[dict[str, Any]], path: str, time: str, tmp_path: Path
+) -> None:
+    (tmp_path / "t.csv").write_text("time,u\n5,1\n6,2\n")
+    (tmp_path / "mesh.yaml").write_text(BASE)
+    mesh = fmu_mesh.load(tmp_path / "mesh.yaml")
+    mesh.scenario(values, events)
 
-    check = mesh.check()
+    check, longer = mesh.check(), mesh.check(stop_time=2000.0)
 
     assert check
-    assert "the first value of 'gain.u' comes after the last step" in check.warnings[0]
+    [warning] = check.warnings
+    assert f"scenario.{path}" in warning
+    assert warning.endswith(
+        f"never reached: at {time} s, stop time 1 s; expected a time up to 0.9 s, that of the last step"
+    )
+    assert not longer.warnings
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("gain.kk", "expected one of the variables of 'gain' that can be set: k, u. Did you mean 'k'?"),
+        ("delay.xx", "expected one of the variables of 'delay' that can be set: none"),
+        ("gain.y", "expected an input that is not connected, or a tunable parameter of 'gain': u, k"),
+    ],
+)
+def test_a_wrong_name_in_a_scenario_offers_what_can_be_set(name: str, expected: str, tmp_path: Path) -> None:
+    [found] = findings_of(tmp_path, f"  values: {{{name}: 1.0}}")
+
+    assert found.endswith(expected)
 
 
 def test_check_shows_what_a_scenario_does(tmp_path: Path) -> None:

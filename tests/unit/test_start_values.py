@@ -16,6 +16,7 @@ import fmpy
 import pytest
 import yaml
 
+import fmu_mesh
 from fmu_mesh import FMIAdapter
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, InitializationFailed
@@ -265,3 +266,64 @@ def test_the_adapter_tells_a_refusal_of_the_fmu() -> None:
             adapter.exit_initialization_mode(0.0)
 
     assert "leave its start value out" in str(caught.value)
+
+
+ARRAYS = """
+import fmu_mesh
+
+class Grid(fmu_mesh.Component):
+    p = fmu_mesh.Input([[1.0, 2.0], [3.0, 4.0]], shape=(2, 2))
+    q = fmu_mesh.Parameter(1.0)
+    y = fmu_mesh.Output(shape=(2, 2))
+
+    def step(self, time, step_size):
+        self.y = self.p * 1.0
+"""
+
+
+def grid_mesh(folder: Path, **start_values: object) -> fmu_mesh.Mesh:
+    """One step of a component with an array."""
+    (folder / "grid.py").write_text(ARRAYS)
+    text = "mesh: grids\nsimulation: {stop_time: 0.1, step_size: 0.1}\ninstances: {grid: {python: 'grid.py:Grid'}}\n"
+    (folder / "mesh.yaml").write_text(text)
+    mesh = fmu_mesh.load(folder / "mesh.yaml")
+    mesh.configuration.data["instances"]["grid"]["start_values"] = start_values
+    return mesh
+
+
+@pytest.mark.parametrize(
+    ("start_values", "expected"),
+    [
+        ({"p[2,1]": 5}, [1.0, 2.0, 5.0, 4.0]),
+        ({"p[1, 2]": 7, "p[2,2]": -0.5}, [1.0, 7.0, 3.0, -0.5]),
+        ({"p[1,1]": 9, "p": [[0, 0], [0, 0]]}, [9.0, 0.0, 0.0, 0.0]),
+        ({"p": [[0, 0], [0, 0]], "p[1,1]": 9}, [9.0, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_an_element_replaces_that_of_the_start_value(
+    start_values: dict[str, object], expected: list[float], tmp_path: Path
+) -> None:
+    given = {f"grid.{name}": value for name, value in start_values.items()}
+
+    results = [
+        grid_mesh(tmp_path, **start_values).run(processes=False, record="memory"),
+        grid_mesh(tmp_path).run(processes=False, record="memory", start_values=given),
+        fmu_mesh.sweep(grid_mesh(tmp_path), [given], folder=tmp_path / "sweep").wait().curves(0),
+    ]
+
+    for result in results:
+        assert [float(result[f"grid.y[{i},{j}]"][-1]) for i in (1, 2) for j in (1, 2)] == expected
+
+
+def test_a_wrong_element_of_a_start_value_is_told(tmp_path: Path) -> None:
+    wrong = {"p[3,1]": 1, "p[1]": 1, "q[1]": 1, "p[2,2]": "x", "y[1,1]": 1}
+
+    findings = grid_mesh(tmp_path, **wrong).check().findings
+
+    assert [f"{one.path.rpartition('.')[2]}: {one.expected}" for one in findings] == [
+        "p[3,1]: an index from [1,1] to [2,2]",
+        "p[1]: an index from [1,1] to [2,2]",
+        "q[1]: an element of an array only: this variable is a scalar",
+        "p[2,2]: a number",
+        "y[1,1]: one of p, q",
+    ]

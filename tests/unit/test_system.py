@@ -264,7 +264,7 @@ CONNECTIONS = [
     ("pendulum.a -> dely.x", ("[0].to: the unknown instance 'dely'; "
      "expected one of the instances pendulum, delay. Did you mean 'delay'?")),
     ("pendulum.moda -> delay.x", ("[0].from: the unknown variable 'moda' of instance 'pendulum'; "
-     "expected one of the outputs of 'pendulum': a, der(a,2), count, flag, mode, name. Did you mean 'mode'?")),
+     "expected one of the outputs of 'pendulum': mode, a, der(a,2), count, flag, name. Did you mean 'mode'?")),
     ("pendulum.a -> delay.y", "[0].to: 'delay.y' is an output; expected an input of 'delay': x, body[1].u, i, b, e, s"),
     ("pendulum.l -> delay.x", ("[0].from: 'pendulum.l' is a parameter; "
      "expected an output of 'pendulum': a, der(a,2), count, flag, mode, name")),

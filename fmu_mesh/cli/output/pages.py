@@ -28,10 +28,19 @@ __all__ = [
 def variables(info: InstanceInfo) -> list[str]:
     """One line for each variable of an instance."""
     rows = [
-        [v.key, _type(v), v.variability, v.unit or "", "" if v.start is None else _text(v.start), v.description or ""]
+        [
+            v.key,
+            _type(v),
+            v.variability,
+            "yes" if v.settable else "",
+            v.unit or "",
+            "" if v.start is None else _text(v.start),
+            v.description or "",
+        ]
         for v in info.variables
     ]
-    return table(rows, heading=["variable", "type", "variability", "unit", "start", "description"], indent=2)
+    heading = ["variable", "type", "variability", "settable", "unit", "start", "description"]
+    return table(rows, heading=heading, indent=2)
 
 
 def instances(statuses: Iterable[InstanceStatus]) -> list[str]:

@@ -211,7 +211,8 @@ class Resolver:
         description = self._descriptions.get(instance)
         variable = description.variable(name) if dot and description is not None else None
         if variable is None and description is not None:
-            near = [own.name for own in description.with_causality("output", "input")]
+            ends = description.with_causality("output", "input")
+            near = [own.name for own in ends if f"{instance}.{own.name}" not in self._driven]
             found = f"the unknown variable '{name}' of instance '{instance}'"
             if (clock := description.clock(name)) is not None:
                 self._findings.add(path, clock, "")

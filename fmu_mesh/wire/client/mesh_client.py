@@ -164,9 +164,9 @@ class MeshClient:
         found = [target for reference in references for target in self._meant(self._within(reference), info)]
         return [*{target.key: target for target in found}.values()]
 
-    def _meant(self, reference: str, info: MeshInfo) -> list[Target]:
+    def _meant(self, reference: str, info: MeshInfo, *, to_set: bool = False) -> list[Target]:
         if not is_key(reference, self.keys):
-            return self._targets_by_name(reference, info)
+            return self._targets_by_name(reference, info, to_set=to_set)
         asked = key_expression(reference)
         instances = [
             name for name in info.instances if asked.intersects(zenoh.KeyExpr(f"{self.keys.instance(name)}/**"))
@@ -180,9 +180,9 @@ class MeshClient:
             raise _unknown(f"no variable has the key '{reference}'", reference, [target.key for target in found])
         return matching
 
-    def target(self, reference: str) -> Target:
-        """The one variable that a reference means."""
-        found = self.targets(reference)
+    def target(self, reference: str, *, to_set: bool = False) -> Target:
+        """The one variable that a reference means; for an unknown name, ``to_set`` suggests what can be set."""
+        found = self._meant(self._within(reference), self.info(), to_set=to_set)
         if len(found) > 1:
             names = listed([target.name for target in found])
             raise ConfigurationError(f"'{reference}' means {len(found)} variables: {names}.")
@@ -280,7 +280,7 @@ class MeshClient:
             return reference
         return f"{self.keys.root}/{short}" if "/" in short.partition(".")[0] else short
 
-    def _targets_by_name(self, reference: str, info: MeshInfo) -> list[Target]:
+    def _targets_by_name(self, reference: str, info: MeshInfo, *, to_set: bool) -> list[Target]:
         instance, _, name = reference.partition(".")
         names = info.instances
         if not name and not is_pattern(reference):
@@ -295,7 +295,7 @@ class MeshClient:
         found = each[0] if len(each) == 1 else {full: target for own in each for full, target in own.items()}
         meant = [found[full_name] for full_name in matching(reference, found)]
         if not meant and instance in names:
-            own = [target.variable.name for target in found.values()]
+            own = [target.variable.name for target in found.values() if target.variable.settable or not to_set]
             for clock in self.instance_info(instance).clocks:
                 if clock.name == name:
                     raise ConfigurationError(f"{clock.refusal}.")
