@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Collection, Iterable, Sequence
+from difflib import SequenceMatcher
 from pathlib import Path
 
 from .errors import ConfigurationError
@@ -32,7 +33,8 @@ __all__ = [
 
 _LISTED_NAMES = 8
 _SHOWN_CHARACTERS = 60
-_WEIGHT_OF_ENDING = 0.3
+_WEIGHT_OF_ENDING, _LIKE = 0.3, 0.85
+"""What the ending of a file counts beside the rest of its name, and how like two names are, of 1.3."""
 
 _REPETITION = re.compile(r"[*+?{]")
 _MATCHING = """
@@ -70,15 +72,16 @@ def nearest_file(path: Path) -> str | None:
         names = sorted(entry.name for entry in path.parent.iterdir() if entry.is_file())
     except OSError:
         return None
-    wanted, stems = Path(path.name.casefold()), {name: Path(name.casefold()).stem for name in names}
+    wanted = Path(path.name.casefold())
 
     def likeness(name: str) -> float:
-        ending = difflib.SequenceMatcher(None, wanted.suffix, Path(name.casefold()).suffix).ratio()
-        return difflib.SequenceMatcher(None, wanted.stem, stems[name]).ratio() + _WEIGHT_OF_ENDING * ending
+        own = Path(name.casefold())
+        stem, ending = SequenceMatcher(None, wanted.stem, own.stem), SequenceMatcher(None, wanted.suffix, own.suffix)
+        return stem.ratio() + _WEIGHT_OF_ENDING * ending.ratio()
 
-    close = {*difflib.get_close_matches(wanted.stem, {*stems.values()}, n=_LISTED_NAMES)}
-    near = [name for name in names if stems[name] in close]
-    name = max(near, key=likeness) if near else nearest(path.name, names)
+    name = max(names, key=likeness, default=None)
+    if name is None or likeness(name) < _LIKE:
+        name = nearest(path.name, names)
     return str(path.with_name(name)) if name is not None else None
 
 

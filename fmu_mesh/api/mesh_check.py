@@ -101,12 +101,7 @@ class Check(msgspec.Struct, frozen=True):
 
 
 def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
-    """Check a plan, and that this host has what its run needs.
-
-    Args:
-        file: the configuration, as messages name it.
-        plan: makes the plan.
-    """
+    """Check what ``plan`` makes of the file, and that this host has what the run needs."""
     run, errors = None, []
     try:
         run = plan()

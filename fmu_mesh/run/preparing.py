@@ -173,15 +173,7 @@ def planned(
 
     system = build(loaded, descriptions, findings, scenario, claimed, obstacles)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
-    try:
-        plan = make_plan(system, file=str(loaded.file), contents=contents)
-    except ConfigurationError as error:
-        if not error.findings:
-            raise
-        for finding in error.findings:
-            obstacles.add(finding.path, finding.found, finding.expected, finding.suggestion)
-        obstacles.raise_any()
-        raise
+    plan = make_plan(system, findings=obstacles, contents=contents)
     warnings = loaded.findings()
     warn_of_point_loops(plan, warnings)
     plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from ..errors import ConfigurationError, Finding
+from ..config.findings import Findings
 from .connections import Connection
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
 
@@ -24,7 +24,7 @@ class ExecutionOrder(NamedTuple):
 
 
 def execution_order(
-    names: Collection[str], connections: Sequence[Connection], algorithm: str, file: str
+    names: Collection[str], connections: Sequence[Connection], algorithm: str, findings: Findings
 ) -> ExecutionOrder:
     """The connections with their delays, the order of the instances, and the cycles.
 
@@ -32,18 +32,18 @@ def execution_order(
         names: the instances.
         connections: between them.
         algorithm: of the configuration.
-        file: name of the configuration file, for errors.
+        findings: where cycles without a delay go.
 
     Raises:
-        ConfigurationError: a cycle has no delay; names the cycle.
+        ConfigurationError: there is one; has all findings.
     """
     connections, closing = _with_delays(names, connections, algorithm)
     instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
     loops = [loop for loop in strongly_connected(names, instant) if is_cycle(loop, instant)]
+    for loop in loops:
+        _add_algebraic_loop(loop, connections, findings)
     if loops:
-        findings = tuple(_algebraic_loop(loop, connections, file) for loop in loops)
-        text = f"{file}: {len(findings)} algebraic loops" if len(findings) > 1 else str(findings[0])
-        raise ConfigurationError(text, findings=findings)
+        findings.raise_any()
     edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
     order = topological_order(names, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(names, edges) if is_cycle(part, edges))
@@ -72,16 +72,13 @@ def _with_delays(
     return tuple(connections), chosen
 
 
-def _algebraic_loop(loop: list[str], connections: tuple[Connection, ...], file: str) -> Finding:
-    """The finding for a cycle on which every connection has delay 0."""
+def _add_algebraic_loop(loop: list[str], connections: tuple[Connection, ...], findings: Findings) -> None:
+    """Add a finding for a cycle on which every connection has delay 0."""
     edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
     walk = cycle_through(loop, edges)
     first = next(
         c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1])
     )
-    return Finding(
-        file=file,
-        path=first.path,
-        found=f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0",
-        expected="at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)",
-    )
+    found = f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0"
+    expected = "at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)"
+    findings.add(first.path, found, expected)

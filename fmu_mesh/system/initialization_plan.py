@@ -13,7 +13,7 @@ from operator import itemgetter
 
 import msgspec
 
-from ..errors import ConfigurationError, Finding
+from ..config.findings import Findings
 from ..variables.model_description import ModelDescription, Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue, Value, VariableType, nested, zero
@@ -115,26 +115,31 @@ def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection
     return InitializationPlan(levels=levels, loops=tuple(loops))
 
 
-def check_loops(plan: InitializationPlan, connections: Sequence[Connection], system: ResolvedSystem, file: str) -> None:
+def check_loops(
+    plan: InitializationPlan, connections: Sequence[Connection], system: ResolvedSystem, findings: Findings
+) -> None:
     """Refuse parameters of FMI 1.0 in a loop: they cannot be set again after the initialization.
 
     Args:
         plan: what `plan_initialization` returned.
         connections: all connections.
         system: the system.
-        file: name of the configuration file, for the error.
+        findings: where they go.
 
     Raises:
-        ConfigurationError: there is one; names the connection.
+        ConfigurationError: there is one; has all findings.
     """
+    wrong = False
     for c in connections:
         target, source = c.target_instance, (c.source_instance, c.source.name)
         if not c.initial_only or not system.instances[target].description.fmi_version.startswith("1"):
             continue
         if any(source in loop.outputs and any(name == target for name, _ in loop.outputs) for loop in plan.loops):
             found = f"{c}, whose value depends on '{target}' itself in the initialization"
-            finding = Finding(file, c.path, found, "no such dependency: FMI 1.0 cannot set a parameter again")
-            raise ConfigurationError(str(finding), findings=(finding,))
+            findings.add(c.path, found, "no such dependency: FMI 1.0 cannot set a parameter again")
+            wrong = True
+    if wrong:
+        findings.raise_any()
 
 
 def _torn(

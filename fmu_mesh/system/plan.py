@@ -12,6 +12,7 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
+from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, placed
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
@@ -197,7 +198,7 @@ def make_plan(
     system: ResolvedSystem,
     *,
     window: int | None = None,
-    file: str = "",
+    findings: Findings | None = None,
     contents: Mapping[str, str] = {},
 ) -> Plan:
     """Plan a validated system.
@@ -205,17 +206,17 @@ def make_plan(
     Args:
         system: the system.
         window: overrides the window of the configuration, in points.
-        file: name of the configuration file, for errors.
+        findings: those about this host; an error has them, too.
         contents: the SHA-256 of the content of each model, by instance name.
 
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
     """
-    connections, closing, order, cycles = execution_order(
-        system.instances, system.connections, system.config.simulation.algorithm, file
-    )
+    findings = Findings(system.config.mesh) if findings is None else findings
+    algorithm = system.config.simulation.algorithm
+    connections, closing, order, cycles = execution_order(system.instances, system.connections, algorithm, findings)
     initialization = plan_initialization(system, connections)
-    check_loops(initialization, connections, system, file)
+    check_loops(initialization, connections, system, findings)
     outputs = _output_layouts(system, connections)
     points = window_of(system, outputs.values(), window)
     plan = Plan(

@@ -19,7 +19,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
-from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.errors import Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import (
     Connection,
@@ -144,22 +144,16 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     connections = resolve_connections(config.connections, variables, collected)
     check_extrapolation(connections, config.instances, descriptions, collected)
     connections += coupled_connections(config, variables, connections, collected)
-    here = loaded.findings()
-    here.explain(collected.places)
-    records = resolve_records(loaded, variables, grid, collected, here)
-    (obstacles := obstacles if obstacles is not None else collected).merge(here)
+    if obstacles is not None:
+        obstacles.explain(collected.places)
+    records = resolve_records(loaded, variables, grid, collected, collected if obstacles is None else obstacles)
     sources = {c.target: c.source.partition(".")[0] for c in config.connections}  # also those of wrong connections
     sources |= {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
     prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)
     _check_zenoh(loaded, collected)
     if len(collected):
-        if obstacles is not collected:
-            collected.merge(obstacles)
-        try:
-            execution_order(instances, connections, config.simulation.algorithm, str(loaded.file))
-        except ConfigurationError as error:
-            for finding in error.findings:
-                collected.add(finding.path, finding.found, finding.expected)
+        collected.merge(obstacles or ())
+        execution_order(instances, connections, config.simulation.algorithm, collected)  # for its findings
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
         missing = [name for name in config.instances if name not in descriptions]

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import fmpy
@@ -281,14 +282,15 @@ class Grid(fmu_mesh.Component):
 """
 
 
-def grid_mesh(folder: Path, **start_values: object) -> fmu_mesh.Mesh:
-    """One step of a component with an array."""
+def grid_mesh(folder: Path, start_values: Mapping[str, object] = MappingProxyType({})) -> fmu_mesh.Mesh:
+    """One step of a component with an array, from a file."""
     (folder / "grid.py").write_text(ARRAYS)
-    text = "mesh: grids\nsimulation: {stop_time: 0.1, step_size: 0.1}\ninstances: {grid: {python: 'grid.py:Grid'}}\n"
-    (folder / "mesh.yaml").write_text(text)
-    mesh = fmu_mesh.load(folder / "mesh.yaml")
-    mesh.configuration.data["instances"]["grid"]["start_values"] = start_values
-    return mesh
+    grid = {"python": "grid.py:Grid", "start_values": {**start_values}}
+    simulation = {"stop_time": 0.1, "step_size": 0.1}
+    (folder / "mesh.yaml").write_text(
+        yaml.safe_dump({"mesh": "grids", "simulation": simulation, "instances": {"grid": grid}})
+    )
+    return fmu_mesh.load(folder / "mesh.yaml")
 
 
 @pytest.mark.parametrize(
@@ -301,12 +303,12 @@ def grid_mesh(folder: Path, **start_values: object) -> fmu_mesh.Mesh:
     ],
 )
 def test_an_element_replaces_that_of_the_start_value(
-    start_values: dict[str, object], expected: list[float], tmp_path: Path
+    start_values: dict[str, Any], expected: list[float], tmp_path: Path
 ) -> None:
     given = {f"grid.{name}": value for name, value in start_values.items()}
 
     results = [
-        grid_mesh(tmp_path, **start_values).run(processes=False, record="memory"),
+        grid_mesh(tmp_path, start_values).run(processes=False, record="memory"),
         grid_mesh(tmp_path).run(processes=False, record="memory", start_values=given),
         fmu_mesh.sweep(grid_mesh(tmp_path), [given], folder=tmp_path / "sweep").wait().curves(0),
     ]
@@ -316,14 +318,14 @@ def test_an_element_replaces_that_of_the_start_value(
 
 
 def test_a_wrong_element_of_a_start_value_is_told(tmp_path: Path) -> None:
-    wrong = {"p[3,1]": 1, "p[1]": 1, "q[1]": 1, "p[2,2]": "x", "y[1,1]": 1}
+    wrong = {"p[1]": 1, "p[2,2]": "x", "p[3,1]": 1, "q[1]": 1, "y[1,1]": 1}
 
-    findings = grid_mesh(tmp_path, **wrong).check().findings
+    findings = grid_mesh(tmp_path, wrong).check().findings
 
     assert [f"{one.path.rpartition('.')[2]}: {one.expected}" for one in findings] == [
-        "p[3,1]: an index from [1,1] to [2,2]",
         "p[1]: an index from [1,1] to [2,2]",
-        "q[1]: an element of an array only: this variable is a scalar",
         "p[2,2]: a number",
+        "p[3,1]: an index from [1,1] to [2,2]",
+        "q[1]: an element of an array only: this variable is a scalar",
         "y[1,1]: one of p, q",
     ]
