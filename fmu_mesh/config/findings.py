@@ -119,10 +119,7 @@ class Findings:
         return iter(self._items)
 
     def raise_any(self, plan: object = None) -> None:
-        """Raise one error with all findings in the order of files and lines; do nothing if there are none.
-
-        Args:
-            plan: see `ConfigurationError`.
+        """Raise one error with all findings in the order of files and lines, and the plan; nothing if there are none.
 
         Raises:
             ConfigurationError: there is at least one finding.

@@ -412,3 +412,40 @@ def test_what_cannot_come_from_a_bag_is_a_finding(given: dict[str, str], expecte
     [found] = mesh.check().findings
 
     assert expected in str(found)
+
+
+def two_gains(folder: Path) -> fmu_mesh.Mesh:
+    """Two gains, and `a.mcap` with the messages of a pendulum."""
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
+    coupled.run(processes=False, stop_time=0.02, output=folder / "a.mcap")
+    mesh = fmu_mesh.Mesh("played", step_size=0.002, stop_time=0.02)
+    mesh.add("first", fmu=FMUS / "Gain.fmu")
+    mesh.add("second", fmu=FMUS / "Gain.fmu")
+    return mesh
+
+
+def test_one_topic_of_a_bag_goes_to_several_inputs(tmp_path: Path) -> None:
+    mesh, file = two_gains(tmp_path), tmp_path / "a.mcap"
+
+    with mesh.start(paused=True, record="memory") as run:
+        run.play(file, topics=["/pendulum/a=first.u", "/pendulum/a=second.u"])
+        played = run.wait()
+    mesh.scenario({f"{name}.u": {"file": file, "topic": "/pendulum/a"} for name in ("first", "second")})
+    prescribed = mesh.run(processes=False, record="memory")
+
+    for result in (played, prescribed):
+        assert result["first.y"].tolist() == result["second.y"].tolist() == played["first.y"].tolist()
+        assert len(set(result["first.y"].tolist())) > 5
+
+
+def test_each_wrong_entry_of_one_bag_is_told_at_its_place(tmp_path: Path) -> None:
+    mesh = two_gains(tmp_path)
+    mesh.scenario({f"{n}.u": {"file": tmp_path / "a.mcap", "topic": f"/pendulum/a:{n}"} for n in ("first", "second")})
+
+    findings = mesh.check().findings
+
+    assert [(one.path, one.found.rpartition(" has no ")[2].partition(",")[0]) for one in findings] == [
+        ("scenario.values.first.u.topic", "field 'first'"),
+        ("scenario.values.second.u.topic", "field 'second'"),
+    ]

@@ -204,7 +204,7 @@ ros:
   topics:
     - 7
     - gain.q
-    - {{topic: /y, varable: gain.y}}
+    - {{topic: /y, variables: gain.y}}
     - {{topic: /1 a, variable: gain.y}}
   clock_rate: -1
 zenoh: {{config: lost.json5}}
@@ -238,7 +238,7 @@ MANY_PLACES = """
 31 scenario.events[2].set.gain.k
 34 ros.topics[0]
 35 ros.topics[1]
-36 ros.topics[2].varable
+36 ros.topics[2].variables
 37 ros.topics[3].topic
 38 ros.clock_rate
 39 zenoh.config

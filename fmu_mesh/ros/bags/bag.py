@@ -115,7 +115,9 @@ class Bag:
         Raises:
             ConfigurationError: a message has no such array element, or an array of another size.
         """
-        wanted = {topic.name: [(path_parts(port.path), port) for port in topic.ports] for topic in topics}
+        wanted: dict[str, list[tuple[list[str | int], Port]]] = {}
+        for topic in topics:  # several of one name give one message to several variables
+            wanted.setdefault(topic.name, []).extend((path_parts(port.path), port) for port in topic.ports)
         connections = [connection for connection in self._reader.connections if connection.topic in wanted]
         with reading(self.path, "bag"):
             for connection, logged, data in self._reader.messages(connections) if connections else ():
@@ -150,19 +152,19 @@ def topics_for(
     """As `chosen_topics`, for model descriptions by instance name."""
     there = bag.topics
     section = loaded.config.ros or RosConfig()
-    if choices:
-        section = replace(section, topics=list(_entries(choices, there)))
     config = replace(loaded.config, ros=section)
     findings = loaded.findings()
     types = message_types(replace(loaded, config=config), findings)
     findings.raise_any()
     assert types is not None
     bag.add_types(types)
-    plan = Resolver(config, section, descriptions, types, findings).plan()
+    # Each choice is a section of its own: a field may go to several variables.
+    sections = [replace(section, topics=[_entry(choice, there)]) for choice in choices] or [section]
+    found = [one for own in sections for one in Resolver(config, own, descriptions, types, findings).topics()]
     if choices and len(findings):
         problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
         raise ConfigurationError(f"`topics=...`: {problems}.")
-    topics = [topic for topic in plan.topics if topic.direction == "in" and topic.name in there]
+    topics = [topic for topic in found if topic.direction == "in" and topic.name in there]
     for topic in topics:
         if there[topic.name] != topic.message:
             raise ConfigurationError(
@@ -171,7 +173,7 @@ def topics_for(
                 hint=f"Say which field goes where: `topics=['{topic.name}:FIELD=INSTANCE.VARIABLE']`.",
             )
     if not topics:
-        wanted = [topic.name for topic in plan.topics if topic.direction == "in"]
+        wanted = [topic.name for topic in found if topic.direction == "in"]
         raise ConfigurationError(
             f"no topic of '{bag.path}' is one that the mesh subscribes to: it has {listed(sorted(there))}, and the "
             f"mesh wants {listed(wanted)}.",
@@ -192,21 +194,17 @@ def timed(samples: Iterable[BagSample], start: float | None) -> list[tuple[float
     return [((sample.stamp + shift) / 1e9, sample) for sample in ordered]
 
 
-def _entries(choices: Sequence[str], there: Mapping[str, str]) -> Iterator[RosTopicConfig]:
-    """The choices as entries of a `ros` section; ``there`` has the message type of every topic of the bag."""
-    fields: dict[str, dict[str, str]] = {}
-    for choice in choices:
-        found = _CHOICE.fullmatch(choice)
-        if found is None:
-            raise ConfigurationError(f"`topics=[{choice!r}]`: expected TOPIC=INSTANCE.VARIABLE or TOPIC:FIELD=….")
-        topic = "/" + found["topic"].lstrip("/")
-        if topic not in there:
-            near = nearest(topic, there)
-            hint = f"Did you mean '{near}'?" if near else f"It has {listed(sorted(there))}."
-            raise ConfigurationError(f"`topics=[{choice!r}]`: the bag has no topic '{topic}'.", hint=hint)
-        fields.setdefault(topic, {})[found["field"] or "data"] = found["variable"]
-    for topic, own in fields.items():
-        yield RosTopicConfig(topic=topic, type=there[topic], fields=own)
+def _entry(choice: str, there: Mapping[str, str]) -> RosTopicConfig:
+    """A choice as an entry of a `ros` section; ``there`` has the message type of every topic of the bag."""
+    found = _CHOICE.fullmatch(choice)
+    if found is None:
+        raise ConfigurationError(f"`topics=[{choice!r}]`: expected TOPIC=INSTANCE.VARIABLE or TOPIC:FIELD=….")
+    topic = "/" + found["topic"].lstrip("/")
+    if topic not in there:
+        near = nearest(topic, there)
+        hint = f"Did you mean '{near}'?" if near else f"It has {listed(sorted(there))}."
+        raise ConfigurationError(f"`topics=[{choice!r}]`: the bag has no topic '{topic}'.", hint=hint)
+    return RosTopicConfig(topic=topic, type=there[topic], fields={found["field"] or "data": found["variable"]})
 
 
 def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosbags

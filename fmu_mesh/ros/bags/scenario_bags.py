@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from ...config.findings import Findings
 from ...config.loading import LoadedConfig
@@ -11,6 +12,7 @@ from ...errors import ConfigurationError
 from ...system.scenario import BagValues, is_bag
 from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value
+from ..messages.topics import Topic
 from .bag import Bag, timed, topics_for
 
 __all__ = ["bag_values"]
@@ -39,24 +41,19 @@ def bag_values(
             wanted.setdefault(key, {})[reference] = values
     found: dict[str, BagValues] = {}
     for (file, stamps, start), entries in wanted.items():
-        places = [f"{source.prefix}values.{reference}" for reference in entries]
+        places = {reference: f"{source.prefix}values.{reference}" for reference in entries}
         try:
             with Bag(source.resolve(file)) as bag:
-                choices = _choices(entries, bag, source.prefix, findings)
-                if not choices:
-                    continue
-                topics = topics_for(loaded, descriptions, bag, choices)
+                find = partial(topics_for, loaded, descriptions, bag)
+                topics = _topics(entries, bag, find, source.prefix, findings)
                 samples = timed(bag.samples(topics, "log" if stamps == "log" else "header"), start)
         except ConfigurationError as error:
-            of_topic = error.message.startswith("`topics=...`: ")
-            place = f"{places[0]}.{'topic' if of_topic else 'file'}"
-            expected = error.hint or ("another field" if of_topic else "a bag that can be read")
-            findings.add(place, error.message.removeprefix("`topics=...`: ").rstrip("."), expected.rstrip("."))
+            _add(f"{next(iter(places.values()))}.file", error, "a bag that can be read", findings)
             continue
         pairs: dict[str, list[tuple[float, Value]]] = {}
         for time, sample in samples:
             pairs.setdefault(f"{sample.instance}.{sample.variable}", []).append((time, sample.value))
-        for reference, place in zip(entries, places, strict=True):
+        for reference, place in places.items():
             if own := pairs.get(reference):
                 times, values_ = zip(*own, strict=True)
                 found[reference] = BagValues(times, values_)
@@ -65,15 +62,28 @@ def bag_values(
     return found
 
 
-def _choices(entries: Mapping[str, ScenarioValues], bag: Bag, prefix: str, findings: Findings) -> list[str]:
-    """What `fmu-mesh play --topic` would be given for these entries, without those whose topic is not in the bag."""
-    choices = []
+def _add(place: str, error: ConfigurationError, expected: str, findings: Findings) -> None:
+    found = error.message.removeprefix("`topics=...`: ").rstrip(".")
+    findings.add(place, found, (error.hint or expected).rstrip("."))
+
+
+def _topics(
+    entries: Mapping[str, ScenarioValues],
+    bag: Bag,
+    find: Callable[[list[str]], list[Topic]],
+    prefix: str,
+    findings: Findings,
+) -> list[Topic]:
+    """The topics of all entries, each as for `fmu-mesh play --topic`, and a finding for each entry without one."""
+    topics: list[Topic] = []
     for reference, values in entries.items():
-        topic = "/" + (values.topic or "").partition(":")[0].lstrip("/")
-        if topic in bag.topics:
-            choices.append(f"{values.topic}={reference}")
+        topic, place = "/" + (values.topic or "").partition(":")[0].lstrip("/"), f"{prefix}values.{reference}.topic"
+        if topic not in bag.topics:
+            found, expected = f"the unknown topic '{topic}' of '{values.file}'", f"one of {listed(sorted(bag.topics))}"
+            findings.add(place, found, expected, nearest(topic, bag.topics))
             continue
-        found = f"the unknown topic '{topic}' of '{values.file}'"
-        expected = f"one of {listed(sorted(bag.topics))}"
-        findings.add(f"{prefix}values.{reference}.topic", found, expected, nearest(topic, bag.topics))
-    return choices
+        try:
+            topics += find([f"{values.topic}={reference}"])
+        except ConfigurationError as error:
+            _add(place, error, "another field", findings)
+    return topics
