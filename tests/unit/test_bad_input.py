@@ -345,7 +345,7 @@ def test_a_missing_file_is_told_with_the_nearest_that_there_is(
         ("gain", "gain.fmu"),
         ("pendulum_dely.yaml", "pendulum_delay.yaml"),
         ("other.yaml", None),
-        ("lays.fmu", None),
+        ("lost.fmu", None),
     ],
 )
 def test_the_nearest_file_is_found_whatever_its_ending(typed: str, meant: str | None, tmp_path: Path) -> None:
