@@ -49,6 +49,7 @@ def attach(
     with ExitStack() as stack:
         found = stack.enter_context(Meshes(_endpoints(connect), timeout))
         client = found.named(name) if wait is None else appearance(found, name, wait)
+        stack.enter_context(client.noticing())
         return Run(client.keys.mesh, attached=(client, stack.pop_all()))
 
 

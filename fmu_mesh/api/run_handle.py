@@ -412,6 +412,8 @@ class Run:
             MeshLost: it has ended before.
             FmuMeshError: it has failed before.
         """
+        if self._own is not None and self._own.future.done() and self.status.state == state:
+            return self.status
         return wait_for(self._client(), state, timeout)
 
     # --- the end
@@ -497,12 +499,13 @@ class Run:
         """
         with self._opening:
             if self._closed:
-                raise CallRefused(f"this handle of mesh '{self.name}' is closed")
+                hint = "The values of its run are in `run.wait()`." if self._own is not None else None
+                raise CallRefused(f"this handle of mesh '{self.name}' is closed", hint=hint)
+            if self._own is not None:
+                self._own.over()
             if self._found is None:
                 assert self._own is not None  # otherwise it was found by whoever made this
                 self._found = reach(self._own, self.name, self._way)
-            if self._own is not None and self._own.future.done():
-                raise MeshLost(f"the run of mesh '{self.name}' has ended")
             return self._found
 
     def _running(self) -> MeshClient:

@@ -97,6 +97,17 @@ class RunThread:
             if self._runner is not None:
                 self._runner.interrupt()
 
+    def over(self) -> bool:
+        """False while it goes on.
+
+        Raises:
+            MeshLost: it has ended.
+        """
+        if not self.future.done():
+            return False
+        hint = "Its values are in `run.wait()`." if self.future.exception() is None else "`run.wait()` raises why."
+        raise MeshLost(f"the run of mesh '{self.plan.mesh}' has ended", hint=hint)
+
     def join(self) -> None:
         """Wait until the thread has ended, for some seconds at most."""
         self._thread.join(_JOIN_S)
@@ -193,6 +204,11 @@ class RunThread:
             log.warning("the results of '%s' take %d bytes of memory; the run ends at %d", self.plan.mesh, size, limit)
 
     def _result(self, outcome: Outcome | None) -> Result:
+        if outcome is not None and (self.status is None or self.status.state not in ("done", "failed")):
+            grid, progress = self.plan.plan.grid, dict.fromkeys(self.plan.plan.nodes, outcome.point)
+            rate = outcome.point / outcome.seconds if outcome.seconds > 0.0 else 0.0
+            ended = outcome.point, grid.last_point, outcome.time, rate, rate * grid.step_size
+            self.status = MeshStatus(self.plan.mesh, outcome.state, *ended, progress, outcome.error)
         if self._memory is None or outcome is None:
             return result_of(self.plan, outcome)
         types = types_of(self.plan.plan.system) or {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import Future
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,15 +9,16 @@ from typing import TYPE_CHECKING
 
 from ..errors import (
     CallRefused,
+    ConfigurationError,
     DeadlineExceeded,
     FmuMeshError,
     Interrupted,
     KeyboardInterrupted,
-    MeshLost,
     from_report,
 )
 from ..wire.client.mesh_client import MeshClient
-from ..wire.client.reaching import Meshes
+from ..wire.keys import Keys
+from ..wire.session import Wiring, close_session, open_session
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that starts one
     from .result import Result
@@ -29,7 +29,7 @@ __all__ = ["TIMEOUT_S", "ended_by_keyboard", "follow", "reach"]
 TIMEOUT_S = 5.0
 """Default deadline of a question in s."""
 
-_LOOK_S = 0.2
+_TRY_S = 0.25
 _FOREVER_S = 1e9
 
 
@@ -46,23 +46,26 @@ def reach(own: RunThread, name: str, way: ExitStack) -> MeshClient:
         DeadlineExceeded: it has not started in time.
         MeshLost: it has ended.
     """
+    own.over()
     if own.in_process:
         hint = "Start it with processes=True, or step it by hand with `Mesh.open`."
         raise CallRefused(f"the run of mesh '{name}' is in this process, where nobody can reach it", hint=hint)
-    timeout = own.plan.loaded.config.timeouts.start
-    if not own.reached.wait(timeout):
-        raise DeadlineExceeded(f"mesh '{name}' cannot be reached within {timeout:g} s")
-    if not own.endpoints:
-        raise MeshLost(f"the run of mesh '{name}' has ended")
-    meshes = way.enter_context(Meshes(own.endpoints[:1], TIMEOUT_S))
-    with meshes.changes() as wait:
-        end = time.monotonic() + timeout
-        while (client := meshes.appeared(name)) is None:
-            if time.monotonic() > end or own.future.done():
-                raise MeshLost(f"mesh '{name}' does not answer")
-            wait(_LOOK_S)
-            meshes.look()
-    return client
+    config = own.plan.loaded.config
+    if not own.reached.wait(config.timeouts.start):
+        raise DeadlineExceeded(f"mesh '{name}' cannot be reached within {config.timeouts.start:g} s")
+    patience_s = _TRY_S  # Zenoh tries for all of it, also if the mesh ends meanwhile
+    while True:
+        own.over()
+        wiring = Wiring(mode="client", connect=own.endpoints[:1], patience_s=patience_s)
+        try:
+            session = open_session(wiring)
+        except ConfigurationError as error:
+            patience_s *= 2
+            if patience_s > TIMEOUT_S:
+                raise DeadlineExceeded(f"mesh '{name}' does not answer at {own.endpoints[0]}") from error
+        else:
+            way.callback(close_session, session)
+            return MeshClient(session, Keys(config.zenoh.key_prefix, name), own.endpoints[:1], TIMEOUT_S, own.over)
 
 
 def follow(client: MeshClient, future: Future[Result]) -> None:

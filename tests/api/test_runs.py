@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.run_handle import TIMEOUT_S
 from fmu_mesh.run.events import Event, Reachable, Status
 from fmu_mesh.wire.views import MeshStatus
 from tests.api.test_mesh_building import built, same
@@ -288,3 +291,84 @@ def test_a_program_that_forgets_its_run_ends_it(place: Place) -> None:
     assert forgotten.wait() == 0
     assert forgotten.output == "0.0\n"
     assert not forgotten.errors
+
+
+def asked_in_vain(run: fmu_mesh.Run) -> list[str]:
+    """The errors of all questions and commands to a mesh that has ended."""
+    questions: list[Callable[[], object]] = [
+        run.info,
+        run.all_status,
+        run.pause,
+        run.step,
+        run.resume,
+        lambda: run.variables,
+        lambda: run.instance_info("gain"),
+        lambda: run.instance_status("gain"),
+        lambda: run.get("gain.y"),
+        lambda: run.samples("gain.*"),
+        lambda: run.set("gain.u", 1.0),
+        lambda: run.watch("gain.y"),
+        lambda: list(run.logs()),
+        lambda: run.replay([]),
+        lambda: run.wait_for("paused"),
+        lambda: run.until_end().__enter__(),
+    ]
+    errors = []
+    for question in questions:
+        with pytest.raises(fmu_mesh.MeshLost) as caught:
+            question()
+        errors.append(str(caught.value))
+    return errors
+
+
+@pytest.mark.parametrize("processes", [True, False])
+def test_a_run_that_has_ended_says_so_at_once(processes: bool) -> None:  # noqa: FBT001  a parameter of the test
+    with steered(stop_time=0.1).start(record="memory", processes=processes) as run:
+        result = run.wait(DEADLINE_S)
+        began = time.monotonic()
+        errors = asked_in_vain(run)
+        took = time.monotonic() - began
+
+    assert {*errors} == {"the run of mesh 'steered' has ended. Its values are in `run.wait()`."}
+    assert took < TIMEOUT_S  # one question without an answer takes longer
+    assert (run.status.state, run.status.point, run.wait_for("done")) == ("done", 10, run.status)
+    assert run.stop() is None
+    assert run.wait() is result
+
+
+def test_a_run_that_has_failed_says_where_its_error_is(tmp_path: Path) -> None:
+    mesh = fmu_mesh.Mesh("failing", step_size=0.1, stop_time=1.0)
+    mesh.add("gain", fmu=find_fmu("Faulty", tmp_path), start_values={"fail_at": 0.5})
+    run = mesh.start(record="memory", processes=False)
+    with pytest.raises(fmu_mesh.FmuError):
+        run.wait(DEADLINE_S)
+
+    with pytest.raises(fmu_mesh.MeshLost, match=r"`run\.wait\(\)` raises why"):
+        run.get("gain.y")
+    assert run.status.state == "failed"
+
+
+def test_a_question_under_way_ends_with_the_run() -> None:
+    def look_for_ever(run: fmu_mesh.Run) -> None:
+        while True:
+            run.get("delay.y")
+
+    with built().start(record="memory") as run, pytest.raises(fmu_mesh.MeshLost) as caught:
+        look_for_ever(run)
+
+    assert str(caught.value) == "the run of mesh 'pair' has ended. Its values are in `run.wait()`."
+
+
+def test_a_mesh_of_somebody_else_that_has_ended_says_so_at_once() -> None:
+    with steered().start(record="memory", paused=True) as own:
+        own.wait_for("paused")
+        with fmu_mesh.attach("steered") as run:
+            assert run.get("gain.y") == 0.0
+            own.stop()
+            own.wait(DEADLINE_S)
+            began = time.monotonic()
+            errors = asked_in_vain(run)
+            took = time.monotonic() - began
+
+    assert {*errors} == {"mesh 'steered' has ended"}
+    assert took < TIMEOUT_S

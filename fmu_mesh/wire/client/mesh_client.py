@@ -48,6 +48,8 @@ __all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
 
+_LOOK_S = 0.05
+
 
 class MeshClient:
     """One running mesh, seen from outside.
@@ -57,17 +59,27 @@ class MeshClient:
         keys: the keys of the mesh.
         endpoints: where the session reaches the mesh, for messages.
         timeout_s: the deadline of every query in s.
+        over: raises `MeshLost` if the mesh has ended, where the caller knows it; otherwise returns False.
 
     Raises:
         ConfigurationError: (every method) a name is unknown, or the mesh refused; the message has the reason.
         DeadlineExceeded: (every method) there was no answer in time.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, endpoints: Sequence[str], timeout_s: float) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        endpoints: Sequence[str],
+        timeout_s: float,
+        over: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.keys = keys
         self.endpoints = tuple(endpoints)
         self._session = session
         self._timeout_s = timeout_s
+        self._over = over
+        self._lost = threading.Event()
         self._known: dict[str, dict[str, Target]] = {}
         self._known_run = ""
 
@@ -135,6 +147,12 @@ class MeshClient:
         return status, {view.instance: view for view in views}
 
     @contextmanager
+    def noticing(self) -> Iterator[None]:
+        """In the block, a question to a mesh that has ended raises `MeshLost` at once."""
+        with self.until_end(self._lost.set):
+            yield
+
+    @contextmanager
     def until_end(self, tell: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
         """An event that is set when the mesh ends or is gone; then ``tell`` is called, on a thread of Zenoh."""
         ended = threading.Event()
@@ -144,7 +162,7 @@ class MeshClient:
             tell()
 
         with Follower[None](self._session, self.keys, end) as follower:
-            if not follower.there.wait(self._timeout_s):
+            if not self._is_there(follower, self._timeout_s):
                 ended.set()
             yield ended
 
@@ -233,7 +251,7 @@ class MeshClient:
         deadline = time.monotonic() + timeout_s
         with Follower[MeshStatus](self._session, self.keys) as follower:
             follower.subscribe({self.keys.mesh_key("status")}, partial(_decoded, kind=MeshStatus))
-            there = follower.there.wait(min(timeout_s, self._timeout_s))
+            there = self._is_there(follower, min(timeout_s, self._timeout_s))
             yield follower.to_the_last(deadline) if there else iter(())
 
     @contextmanager
@@ -252,10 +270,10 @@ class MeshClient:
                 through = f"{self.keys.instance(name)}/*/*" if every else None
                 follower.subscribe(own.keys(), partial(_reading_among, own), through)
                 subscribed[name] = None if every else [target.variable.name for target in own.values()]
-            there = follower.there.wait(self._timeout_s)
+            there = self._is_there(follower, self._timeout_s)
             if there:
                 # An answer of a node comes after the subscribers of this session have come to it.
-                with suppress(ConfigurationError, DeadlineExceeded):  # it is about to end
+                with suppress(ConfigurationError, MeshLost):  # it is about to end
                     self.all_status(subscribed)
             yield follower.to_the_last() if there else iter(())
 
@@ -267,9 +285,27 @@ class MeshClient:
                 follower.subscribe({self.keys.mesh_key("log")}, partial(_decoded, kind=LogLine))
             kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
             last = kept[-1].number if kept else 0
-            there = follow and follower.there.wait(self._timeout_s)
+            there = follow and self._is_there(follower, self._timeout_s)
             new = follower.to_the_last() if there else iter(())
             yield chain(kept, (line for line in new if line.number > last))
+
+    def _is_over(self) -> bool:
+        """Whether the mesh has ended, in the words of who knows it.
+
+        Raises:
+            MeshLost: it has.
+        """
+        if self._lost.is_set() and self.info_if_running() is None:  # a token that was lost may be there again
+            raise MeshLost(f"mesh '{self.keys.mesh}' has ended")
+        return self._over()
+
+    def _is_there(self, follower: Follower[Any], timeout_s: float) -> bool:
+        """Whether a follower finds the mesh in time."""
+        end = time.monotonic() + timeout_s
+        while not follower.there.wait(_LOOK_S):
+            if self._is_over() or time.monotonic() >= end:
+                return False
+        return True
 
     # --- names
 
@@ -338,11 +374,12 @@ class MeshClient:
         self, key: str, who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> list[zenoh.Sample]:
         try:
-            return answers(self._session, Question(key, who, self._timeout_s, payload, attachment))
+            return answers(self._session, Question(key, who, self._timeout_s, payload, attachment), self._is_over)
         except DeadlineExceeded:
             text = f"no answer from {who} within {self._timeout_s:g} s."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
         except MeshLost as error:
+            self._is_over()
             raise ConfigurationError(error.message) from error
 
     def _get(self, key: str, attachment: bytes | None = None) -> list[zenoh.Sample]:
