@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -13,17 +13,20 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import CallRefused, ConfigurationError, UnknownName
+from ..files import unwritable
 from ..instances.python.unit_names import base_unit_of
+from ..recorder.csv_file import CsvFile
+from ..recorder.parquet_file import ParquetFile
 from ..run.options import checked
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
-from ..system.recording import joined
+from ..system.recording import ResultFile, joined
 from ..system.run_metadata import machine_difference
 from ..system.system import ResolvedSystem
 from ..text import listed, short_path
 from ..variables.model_description import Variable
 from ..variables.units import BaseUnit
-from ..variables.value_types import VariableType, is_float
+from ..variables.value_types import DTYPES, VariableType, is_float
 from .compared_rows import Side, compared, differences_of, values_in_unit_of
 from .comparison import Comparison
 from .drawing import thinned
@@ -174,7 +177,36 @@ class Result(Mapping[str, NDArray[Any]]):
             ConfigurationError: pandas is not installed.
         """
         pd = imported_pandas()
-        return pd.DataFrame(dict(self), index=pd.Index(self.times, name="time"))
+        frame = pd.DataFrame(dict(self), index=pd.Index(self.times, name="time"))
+        frame.attrs["units"] = self.units
+        return frame
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the result as `launch` writes it: a CSV, and `<path>.json` with the units and what is known of the run.
+
+        Every float has the digits that give the same bits again.
+
+        Example:
+            >>> import fmu_mesh
+            >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=0.1, record="memory")
+            >>> result.to_csv("results/angles.csv")
+            >>> fmu_mesh.Result.read("results/angles.csv").compare(result).equal
+            True
+
+        Raises:
+            CallRefused: it has no rows.
+            ConfigurationError: the file cannot be written.
+        """
+        self._write(lambda types, columns: CsvFile(Path(path), [*types.items()], columns.metadata))
+
+    def to_parquet(self, path: str | Path) -> None:
+        """As `to_csv`, into one Parquet file.
+
+        Raises:
+            CallRefused: it has no rows.
+            ConfigurationError: the file cannot be written, or pyarrow is not installed.
+        """
+        self._write(lambda types, columns: ParquetFile.of_columns(Path(path), types, columns))
 
     @checked
     def plot(
@@ -330,6 +362,26 @@ class Result(Mapping[str, NDArray[Any]]):
             return iter([Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})])
         return result_pieces(self.file, types_of(self._system, self._record))
 
+    def _write(self, opened: Callable[[dict[str, VariableType], Columns], ResultFile]) -> None:
+        """Write a whole result file; ``opened`` gets the types of the columns, and what is known of all of them."""
+        if not len(self.times):
+            raise CallRefused(f"the result of '{self.title}' has no rows")
+        units = {name: unit for name, unit in self.units.items() if unit is not None}
+        types = types_of(self._system, self._record) or {name: _type_of(array) for name, array in self.items()}
+        about = {name: {"type": type_, "unit": units.get(name)} for name, type_ in types.items()}
+        metadata = self.metadata or {"mesh": self.title, "variables": about}
+        noted = metadata.pop("set", ())
+        file = opened(types, self._columns._replace(units=units, metadata=metadata))
+        try:
+            try:
+                file.write(self.times, [*self.values()])
+                for entry in noted:
+                    file.note(entry)
+            finally:
+                file.close()
+        except OSError as error:
+            raise unwritable(file.path, error) from error
+
     def _of_file(self, number: int) -> Result:
         assert self.outcome is not None  # it has files
         file, rows = self.outcome.files[number]
@@ -415,6 +467,13 @@ def _ends_of(values: NDArray[Any] | None) -> tuple[object, object]:
     if values is None or not len(values) or values.dtype.kind not in "fiub":
         return None, None
     return values.min().item(), values.max().item()
+
+
+def _type_of(array: NDArray[Any]) -> VariableType:
+    """The type of an array of which nothing else is known; it has an element."""
+    if array.dtype == object:
+        return "Binary" if isinstance(array[0], bytes) else "String"
+    return next(type_ for type_, dtype in DTYPES.items() if dtype == array.dtype)
 
 
 def summary_of(outcome: Outcome, step_size: float) -> str:

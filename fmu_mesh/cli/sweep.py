@@ -85,7 +85,7 @@ def _add_sweep(parser: CommandParser) -> None:
     add_options(what, "sampler", "seed", options=SweepOptions)
     add_options(parser.add_argument_group("what is kept"), "reduce", "folder", "curves", options=SweepOptions)
     how = parser.add_argument_group("how it runs")
-    add_options(how, "resume", "workers", "max_instances", "processes", "reset", options=SweepOptions)
+    add_options(how, "resume", "force", "workers", "max_instances", "processes", "reset", options=SweepOptions)
     how.add_argument(
         "--dask",
         nargs="?",

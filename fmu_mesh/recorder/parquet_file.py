@@ -40,6 +40,7 @@ __all__ = ["ParquetFile"]
 _STREAM: Final = ".arrows"
 _TIME: Final = "time"
 _UNIT: Final = b"unit"
+_ABOUT_TIME: Final = {"type": "Float64", "unit": "s"}
 
 _BLOCK_ROWS: Final = 16384
 _BLOCK_BYTES: Final = 1 << 22
@@ -112,6 +113,16 @@ class ParquetFile:
             hint = "Record into a .csv file."
             raise ConfigurationError(f"'{path}' is not a file, and a Parquet file cannot replace it.", hint=hint)
         return cls(path, _schema_of(recording))
+
+    @classmethod
+    def of_columns(cls, path: Path, types: Mapping[str, VariableType], columns: Columns) -> Self:
+        """Open a file for columns of which only the types, units and metadata are known."""
+        pa = pyarrow_module()
+        fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata=_ABOUT_TIME)]
+        for name, type_ in types.items():
+            about = {"type": type_} | ({"unit": columns.units[name]} if name in columns.units else {})
+            fields.append(pa.field(name, getattr(pa, _ARROW_TYPES[type_])(), nullable=False, metadata=about))
+        return cls(path, pa.schema(fields, {KEY: msgspec.json.encode(columns.metadata)}))
 
     @staticmethod
     def growing_file(path: Path) -> Path:
@@ -325,7 +336,7 @@ class _Sink(io.RawIOBase):
 def _schema_of(recording: Recording) -> Any:  # noqa: ANN401  pyarrow has no types
     """The columns of a recording as pyarrow has them, with what is known of each variable."""
     pa = pyarrow_module()
-    fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata={"type": "Float64", "unit": "s"})]
+    fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata=_ABOUT_TIME)]
     recorded, place = recording.recorded, 0
     while place < len(recorded):
         instance, name = recorded[place]

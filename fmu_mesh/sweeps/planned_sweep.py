@@ -18,7 +18,7 @@ from ..api.mesh_builder import Mesh, load
 from ..api.result import Result, types_of
 from ..config.loading import PlainConfig
 from ..config.mesh import Config
-from ..errors import ConfigurationError, FmuError
+from ..errors import CallRefused, ConfigurationError, FmuError
 from ..run.allowed_code import check_owner
 from ..run.one_process import apart
 from ..run.options import Option, VariantOptions, takes
@@ -81,6 +81,7 @@ class SweepOptions(VariantOptions, frozen=True, kw_only=True):
     ] = None
     curves: Annotated[bool, Option("False: keep the table only", "--no-curves")] = True
     resume: Annotated[bool, Option("keep the runs that the folder has, and run what is missing", "--resume")] = False
+    force: Annotated[bool, Option("remove the sweep that the folder has, and no other files", "--force")] = False
     processes: Annotated[bool, Option("run each variant in processes, as `Mesh.run` does", "--processes")] = False
     reset: Annotated[bool, Option("reset the instances of FMUs between two runs (fmi2Reset)", "--reset")] = False
     max_instances: Annotated[
@@ -137,8 +138,12 @@ def planned_sweep(
     given = options.given()
     base = {name: given[name] for name in _OF_EACH_RUN if name in given}
     folder = SweepFolder(Path(options.folder).absolute() if options.folder is not None else _usual_folder(own, base))
-    if is_sweep(folder.path) and not options.resume:
-        hint = "Continue it with `resume=True`, or choose another folder with `folder=...`."
+    if options.resume and options.force:
+        raise CallRefused(
+            "`resume=True` keeps the runs of the folder, and `force=True` removes them", hint="Choose one of them."
+        )
+    if is_sweep(folder.path) and not (options.resume or options.force):
+        hint = "Continue it with `resume=True`, replace it with `force=True`, or choose another folder."
         raise ConfigurationError(f"there is a sweep in '{folder.path}' already", hint=hint)
     wanted = Wanted(
         version=__version__,
@@ -164,6 +169,8 @@ def planned_sweep(
     check_reductions([read_reduction(text) for text in texts], recorded)
     wanted = replace(wanted, recorded=tuple(recorded), reductions=tuple(texts), units=_units(plan, wanted.names))
     functions = {_column(one): one for one in options.reduce if not isinstance(one, str)}
+    if options.force:
+        folder.clear()
     return _planned(own, plan, wanted, folder, functions)
 
 

@@ -122,6 +122,22 @@ class SweepFolder:
         except OSError as error:
             raise self._unwritable(error) from error
 
+    def clear(self) -> None:
+        """Remove what a sweep has written, and nothing else.
+
+        Raises:
+            ConfigurationError: another process adds rows, or a file cannot be removed.
+        """
+        rows = [*self.path.glob(f"{_ROWS}*.jsonl")]
+        for file in rows:
+            RowFile(file).close()
+        slurm = [self.path / "sweep.sbatch", self.path / "slurm.json", *self.path.glob("slurm-[0-9]*.log")]
+        try:
+            for file in (*rows, *self.curves.glob(f"{16 * '[0-9a-f]'}.csv*"), *slurm, self.table, self.wanted_file):
+                file.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._unwritable(error) from error
+
     def wanted(self) -> Wanted:
         """What was asked.
 

@@ -169,7 +169,40 @@ class SweepResult(Sequence[SweepRow]):
             ConfigurationError: pandas is not installed.
         """
         rows = [cells_of(self._wanted, number, row, self.columns) for number, row in self._found]
-        return imported_pandas().DataFrame(rows)
+        frame = imported_pandas().DataFrame(rows)
+        frame.attrs["units"] = {name: self._wanted.units.get(name) for name in self.names}
+        return frame
+
+    def curves_to_pandas(self, *names: str) -> pd.DataFrame:
+        """The curves of all runs as one data frame, with `variant` and `time` as its index; not of those that failed.
+
+        Example:
+            >>> import fmu_mesh
+            >>> options = {"stop_time": 1.0, "folder": "results/frame"}
+            >>> with fmu_mesh.sweep("configs/pendulum_delay.yaml", {"pendulum.d": [0.1, 0.2]}, **options) as running:
+            ...     frame = running.wait().curves_to_pandas("pendulum.a")
+            >>> frame.loc[1].shape, frame.attrs["units"]
+            ((501, 1), {'pendulum.a': 'rad'})
+
+        Args:
+            names: names of variables, or patterns such as `motor.*`; default: all.
+
+        Raises:
+            CallRefused: no curves were kept.
+            ConfigurationError: there is no such variable, or pandas is not installed.
+        """
+        pd = imported_pandas()
+        chosen = [*chosen_names(self.folder.name, self.variables, names)]
+        frames = {
+            number: self.curves(place).to_pandas()[chosen]
+            for place, (number, row) in enumerate(self._found)
+            if not row.exit_code and self._curves_of(row) is not None
+        }
+        if not frames:
+            raise CallRefused("no run of the sweep has curves", hint="See `curves` of `sweep`.")
+        frame = pd.concat(frames, names=["variant"])
+        frame.attrs["units"] = {name: self._wanted.units.get(name) for name in chosen}
+        return frame
 
     def values(self, name: str) -> list[Any]:
         """A parameter or a column of all rows, in their order.

@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
 from ..api.notebook_progress import ShownProgress, awaited
-from ..errors import FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
+from ..errors import CallRefused, FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
 from ..run.options import takes
 from ..text import counted
 from ..wire.runtime import remove_stale_folders
@@ -37,7 +37,7 @@ from .planned_sweep import PlannedSweep, SweepOptions, planned_sweep
 from .sweep_folder import RowFile
 from .sweep_result import SweepResult
 from .variant_run import Row, run_variant
-from .worker_pool import WorkerLost, WorkerPool
+from .worker_pool import WorkerLost, WorkerPool, unguarded_call
 
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 
@@ -50,10 +50,7 @@ _ELSEWHERE: Final = 64
 """Variants under way on an executor of the user, whose number of workers is not known."""
 _KILLED: Final = "KilledWorker"
 """The class with which Dask says that a job has ended several workers."""
-_GUARD: Final = (
-    'Write `if __name__ == "__main__":` before what your program does, if it has none: workers import it. '
-    "What else it may be is on standard error."
-)
+_GUARD: Final = 'Write `if __name__ == "__main__":` before what your program does.'
 
 
 class SweepPart(NamedTuple):
@@ -350,7 +347,8 @@ class ExecutorSweep(Sweep):
             lost = error
         if isinstance(lost, WorkerLost) and not lost.began:
             text = f"the workers do not start: {lost.message} before it was ready"
-            raise MeshLost(text, hint=_GUARD) from lost
+            hint = f"What it was is on standard error. If the program has a thread for the sweep: {_GUARD}"
+            raise MeshLost(text, hint=hint) from lost
         self._tries[number] += 1
         if self._tries[number] < _TRIES and not isinstance(lost, BrokenExecutor):
             return None
@@ -393,8 +391,12 @@ def sweep(
         options: see `SweepOptions`.
 
     Raises:
+        CallRefused: the program has no `if __name__ == "__main__":` before this, and the workers import it.
         ConfigurationError: the mesh, a parameter, or a column is wrong; or the folder holds another sweep.
     """
+    if options.executor is None and (place := unguarded_call()) is not None:
+        text = f"each worker of the sweep would come to '{place}', because it imports this program"
+        raise CallRefused(text, hint=_GUARD)
     planned = planned_sweep(mesh, vary, **options.given())
     return ExecutorSweep(planned, executor=options.executor, workers=options.workers)
 

@@ -7,8 +7,10 @@ need. They end with the process that uses them, and the fork server ends with th
 
 from __future__ import annotations
 
+import ast
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -16,16 +18,19 @@ from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
 from contextlib import suppress
 from functools import partial
+from inspect import currentframe
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess, parent_process
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from ..errors import MeshLost
 from ..run.child import how_it_ended
 from ..run.threads import one_thread_from_now_on
+from ..text import short_path
 
-__all__ = ["WorkerLost", "WorkerPool"]
+__all__ = ["WorkerLost", "WorkerPool", "unguarded_call"]
 
 _ENDS_S = 5.0
 _PRELOADED = "fmu_mesh.sweeps.preloaded"
@@ -79,6 +84,29 @@ class WorkerPool(Executor):
         """End all processes: when they have done their jobs, or at once with ``cancel_futures``."""
         for worker in self._workers:
             worker.shutdown(wait=wait, now=cancel_futures)
+
+
+def unguarded_call() -> str | None:
+    """The line at the top of the main program that calls this, if the workers would come to it when they import it.
+
+    Without `if __name__ == "__main__":` before it they would. They do not import the main program of a notebook or of
+    an interactive session, which is no file, or that of a package.
+    """
+    main = sys.modules["__main__"]
+    file, spec = getattr(main, "__file__", None), getattr(main, "__spec__", None)
+    frame = currentframe()
+    while frame is not None and not (frame.f_globals is vars(main) and frame.f_code.co_name == "<module>"):
+        frame = frame.f_back
+    if frame is None or file is None or (spec is not None and spec.name.endswith("__main__")):
+        return None
+    try:
+        tree = ast.parse(Path(file).read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return None
+    tests = [one for one in ast.walk(tree) if isinstance(one, ast.If) and "__name__" in ast.unparse(one.test)]
+    is_guarded = any(one.lineno <= frame.f_lineno <= (one.end_lineno or one.lineno) for one in tests)
+    is_own = Path(frame.f_code.co_filename).name == Path(file).name  # and no cell of a notebook
+    return f"{short_path(file)}:{frame.f_lineno}" if is_own and not is_guarded else None
 
 
 class _Job(NamedTuple):

@@ -117,3 +117,58 @@ def test_an_endless_run_ends_where_its_memory_does_with_what_was_recorded() -> N
     result = caught.value.result
     assert len(result.times) == len(result["pendulum.a"]) >= 1_000_000 // 32
     assert result.times.tolist() == [point * 0.001 for point in range(len(result.times))]
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+@pytest.mark.parametrize("from_file", [False, True])
+def test_a_result_is_written_and_read_back_unchanged(tmp_path: Path, ending: str, from_file: bool) -> None:  # noqa: FBT001  a parameter of the test
+    mesh = fmu_mesh.Mesh("types", step_size=0.1, stop_time=0.3)
+    mesh.add("it", fmu=find_fmu("AllTypes3", tmp_path))
+    result = mesh.run(output="types.parquet") if from_file else mesh.run(record="memory", processes=False)
+    if from_file:
+        result = fmu_mesh.Result.read("types.parquet")
+    path = tmp_path / f"new/again.{ending}"
+
+    getattr(result, f"to_{ending}")(path)
+
+    again = fmu_mesh.Result.read(path)
+    assert list(again) == list(result)
+    assert again.units == result.units
+    assert again.times.tobytes() == result.times.tobytes()
+    for name in result:
+        assert again[name].tolist() == result[name].tolist(), name
+        assert [type(value) for value in again[name].tolist()] == [type(value) for value in result[name].tolist()]
+
+
+def test_a_result_replaces_its_own_file_and_keeps_what_was_set(folder: Path) -> None:
+    mesh = fmu_mesh.Mesh("gain", step_size=0.1, stop_time=1.0)
+    mesh.add("gain", fmu=FMUS / "Gain.fmu")
+    with mesh.start(output="gain.csv", paused=True) as run:
+        run.set("gain.u", 0.1)
+        run.resume()
+        before = run.wait()
+    values, metadata = before["gain.y"].tolist(), fmu_mesh.Result.read("gain.csv").metadata
+
+    fmu_mesh.Result.read("gain.csv").to_csv("gain.csv")
+
+    again = fmu_mesh.Result.read(folder / "gain.csv")
+    assert again["gain.y"].tolist() == values
+    assert again.metadata == metadata
+    assert [(entry["variable"], entry["value"]) for entry in again.metadata["set"]] == [("u", 0.1)]
+
+
+def test_a_data_frame_knows_the_units(folder: Path) -> None:
+    result = fmu_mesh.load(write_config(folder)).run(record="memory", processes=False)
+
+    units = result.to_pandas().attrs["units"]
+
+    assert units == result.units
+    assert (units["pendulum.a"], units["delay.y"]) == ("rad", None)
+
+
+def test_a_result_without_rows_is_not_written(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.csv"
+    empty.write_text("time,a\n")
+
+    with pytest.raises(fmu_mesh.CallRefused, match="has no rows"):
+        fmu_mesh.Result.read(empty).to_csv(tmp_path / "new.csv")

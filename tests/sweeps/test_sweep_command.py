@@ -207,20 +207,45 @@ def test_the_folder_of_a_sweep_says_what_varies(place: Place, config: Path) -> N
     assert place.run("sweep", config, *VARY).message.startswith("fmu-mesh: there is a sweep in ")
 
 
-def test_a_program_without_a_guard_is_told_so(place: Place) -> None:
+@pytest.mark.parametrize("call", ["study()", "if True:\n    study()", "[study() for _ in range(2)]"])
+def test_a_program_without_a_guard_starts_no_sweep(place: Place, call: str) -> None:
     program = place.folder / "unguarded.py"
     program.write_text(
         "import fmu_mesh\n"
         f"mesh = fmu_mesh.Mesh('gain', step_size=0.01, stop_time=0.1)\nmesh.add('g', fmu='{FMUS / 'Gain.fmu'}')\n"
-        "with fmu_mesh.sweep(mesh, {'g.k': [1.0, 2.0]}) as running:\n"
-        "    print(running.wait().summary)\n"
+        "def study():\n"
+        "    with fmu_mesh.sweep(mesh, {'g.k': [1.0, 2.0]}) as running:\n"
+        "        print(running.wait().summary)\n"
+        f"{call}\n"
+        'if __name__ == "__main__":\n    print("too late")\n'
     )
 
     done = place.start_command([sys.executable, str(program)])
 
     assert done.wait() != 0
+    assert "fmu_mesh.errors.CallRefused: each worker of the sweep would come to 'unguarded.py:" in done.errors
     assert '`if __name__ == "__main__":`' in done.errors
+    assert not (place.folder / "gain_sweep").exists()
     place.assert_nothing_left(10.0)
+
+
+def test_force_replaces_a_sweep_and_no_other_file(place: Place, config: Path) -> None:
+    folder = place.folder / "pair_sweep"
+    place.run("sweep", config, *VARY)
+    old = {path.name for path in (folder / "runs").iterdir()}
+    for name in ("notes.txt", "runs/mine.csv"):
+        (folder / name).write_text("mine")
+
+    done = place.run("sweep", config, "--vary", "pendulum.d=0.3,0.5", "--force")
+    both = place.start("sweep", config, *VARY, "--force", "--resume")
+
+    new = {path.name for path in (folder / "runs").iterdir()} - {"mine.csv"}
+    assert "2 of 2 runs, 0 failed" in done.output
+    assert len((folder / "rows.jsonl").read_text().splitlines()) == len(new) == 2
+    assert not new & old
+    assert (folder / "notes.txt").read_text() == (folder / "runs/mine.csv").read_text() == "mine"
+    assert both.wait() == 2
+    assert "`--force` removes them" in both.message
 
 
 def test_the_folder_of_a_sweep_is_plotted(place: Place, config: Path) -> None:

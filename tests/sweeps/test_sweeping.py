@@ -443,6 +443,12 @@ def test_the_result_of_a_sweep_is_read_from_its_folder(config: Path, tmp_path: P
     assert frame["pendulum.d"].tolist() == result.values("pendulum.d")
     assert frame["max(pendulum.a)"].tolist() == result.values("max(pendulum.a)")
     assert again.curves(3)["delay.y"].tolist() == result.curves(3)["delay.y"].tolist()
+    curves = again.curves_to_pandas()
+    assert (curves.index.names, (*curves.columns,)) == (["variant", "time"], again.variables)
+    assert curves.attrs["units"] == result.curves(0).units
+    assert [*curves.index.unique("variant")] == [row.variant for row in again]
+    assert curves.loc[3]["delay.y"].tolist() == again.curves(3)["delay.y"].tolist()
+    assert [*again.curves_to_pandas("delay.*").columns] == ["delay.y"]
     with pytest.raises(fmu_mesh.UnknownName, match=r"Did you mean 'max\(pendulum.a\)'"):
         again.values("max(pendulum.b)")
     with pytest.raises(fmu_mesh.ConfigurationError, match="there is no sweep in"):

@@ -12,6 +12,7 @@ _FLAGS = {name: field.flag for name, field in option_fields(RunOptions).items() 
     name: f"--{name.replace('_', '-')}"
     for name in (
         "folder",
+        "force",
         "max_instances",
         "port",
         "resume",
