@@ -26,6 +26,16 @@ from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
 from .mesh_check import Check, check_of
+from .mesh_editing import (
+    check_part,
+    connections_of,
+    ends_of,
+    said_by,
+    sections_of,
+    unknown,
+    with_connections,
+    without_instance,
+)
 from .plan_options import memory_file, with_record
 from .rebasing import rebased
 from .run_handle import Run
@@ -214,6 +224,7 @@ class Mesh:
         start_values: Mapping[str, Any] | None = None,
         step_size: float | None = None,
         group: str | None = None,
+        replace: bool = False,
         **section: Any,  # noqa: ANN401  the kind of instance says what it takes
     ) -> None:
         """Add an instance.
@@ -232,14 +243,16 @@ class Mesh:
             start_values: by variable; an array as nested lists or as a numpy array.
             step_size: step size of this instance in s, a whole multiple of that of the mesh.
             group: instances of one group share one process.
+            replace: whether it takes the place of an instance of this name, whose connections stay.
             section: any other key of the section of an instance in a configuration file.
 
         Raises:
-            CallRefused: there is an instance of this name, or no key says what it is.
+            CallRefused: there is an instance of this name, no key says what it is, or a key is wrong.
             ConfigurationError: other processes cannot import the component.
         """
-        if name in self.instances:
-            raise CallRefused(f"mesh '{self.name}' has an instance '{name}' already")
+        if name in self.instances and not replace:
+            hint = "Call it with `replace=True`, or `remove` the other one."
+            raise CallRefused(f"mesh '{self.name}' has an instance '{name}' already", hint=hint)
         own = component_section(component)[0] if component is not None else {}
         keys = {"fmu": fmu, **own, **section, "start_values": start_values, "step_size": step_size, "group": group}
         given = {key: value for key, value in keys.items() if value is not None}
@@ -247,18 +260,71 @@ class Mesh:
             raise CallRefused(
                 f"nothing says what '{name}' is", hint=f"Give it one of the keys {listed(KINDS.names())}."
             )
-        self._section("instances")[name] = plain(given)
+        call, path, own = f"mesh.add({name!r})", f"instances.{name}", plain(given)
+        check_part(call, {"instances": {name: own}}, [path], path)
+        self._plain = said_by(self._plain, call, [path], new=name not in self.instances)
+        self._data["instances"] = {**self._section("instances"), name: own}
+
+    def remove(self, name: str) -> None:
+        """Remove an instance, its connections, what the scenario sets of it, and what was chosen of it to be recorded.
+
+        Example:
+            >>> import fmu_mesh
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.disconnect(target="delay.x")
+            >>> mesh.remove("delay")
+            >>> mesh.instances
+            ['pendulum']
+
+        Raises:
+            UnknownName: there is no such instance; suggests the nearest one.
+        """
+        if name not in self.instances:
+            raise unknown(f"mesh '{self.name}' has no instance '{name}'", name, self.instances)
+        self._plain = without_instance(self._plain, name)
 
     def connect(self, source: str, target: str, **keys: Any) -> None:  # noqa: ANN401  as the file has it
-        """Connect an output to an input, both as `instance.variable`.
+        """Connect an output to an input, both as `instance.variable`; the same two once again get other ``keys``.
 
         Args:
             source: the output.
             target: the input.
             keys: any other key of a connection in a configuration file, such as ``factor=2.0``.
+
+        Raises:
+            CallRefused: a key is wrong.
         """
-        connections = self._data.setdefault("connections", [])
-        connections.append(plain({"from": source, "to": target, **keys}))
+        call, own = f"mesh.connect({source!r}, {target!r})", plain({"from": source, "to": target, **keys})
+        check_part(call, {"connections": [own]}, ["connections[0]"], "connections[0]")
+        if wrong := [end for end in (source, target) if not all(end.partition(".")[::2])]:
+            raise CallRefused(f"{call}: '{wrong[0]}'; expected instance.variable")
+        connections = connections_of(self._plain)
+        place = next((n for n, one in enumerate(connections) if ends_of(one) == (source, target)), len(connections))
+        self._plain = said_by(self._plain, call, [f"connections[{place}]"], new=place == len(connections))
+        connections[place : place + 1] = [own]
+        self._data["connections"] = connections
+
+    def disconnect(self, source: str | None = None, target: str | None = None) -> None:
+        """Remove connections: of an output, of an input, or the one from an output to an input.
+
+        Args:
+            source: the output; None: any.
+            target: the input; None: any.
+
+        Raises:
+            UnknownName: there is no such connection; suggests the nearest one.
+        """
+        left = with_connections(
+            self._plain, lambda one, other: source not in (None, one) or target not in (None, other)
+        )
+        there = connections_of(self._plain)
+        if source is target is None or len(connections_of(left)) == len(there):
+            wanted, names = (
+                f"{source or '*'} -> {target or '*'}",
+                [" -> ".join(map(str, ends_of(one))) for one in there],
+            )
+            raise unknown(f"mesh '{self.name}' has no connection '{wanted}'", wanted, names)
+        self._plain = left
 
     def record(self, *variables: str, file: str | Path | None = None, also: bool = False, **keys: Any) -> None:  # noqa: ANN401  as the file has it
         """Choose what is recorded, and into which file.
@@ -277,8 +343,11 @@ class Mesh:
             also: whether this is one more result file, or the first one is changed.
             keys: any other key of the section in a configuration file; the key `from` is ``start``.
         """
-        keys = {"file": file, **keys}
-        self._data["record"] = with_record(self._data.get("record", {}), variables, keys, also=also)
+        section = self._data.get("record", {})
+        own = with_record(section, variables, {"file": file, **keys}, also=also)
+        base = "record" if not isinstance(own, list) else f"record[{len(own) - 1 if also else 0}]"
+        given = ["variables", *("from" if key == "start" else key for key in {"file": file, **keys})]
+        self._change("mesh.record(...)", {"record": own}, [base] if also else [f"{base}.{key}" for key in given])
 
     def scenario(
         self,
@@ -303,12 +372,17 @@ class Mesh:
             events: mappings with a time in s (``at``) and the values from then on (``set``), by `instance.variable`.
             file: a file with `values` and `events`, in the place of everything that was said before.
         """
+        call = "mesh.scenario(...)"
         if file is not None:
-            self._data["scenario"] = plain(Path(file))
+            self._change(call, {"scenario": plain(Path(file))}, ["scenario"])
             return
-        section = self._section("scenario")
-        section["values"] = {**section.get("values", {}), **plain(dict(values or {}))}
-        section["events"] = [*section.get("events", ()), *plain(list(events))]
+        section, own = self._section("scenario"), plain(dict(values or {}))
+        before = section.get("events", [])
+        new = [event for event in plain(list(events)) if event not in before]
+        paths = [f"scenario.values.{name}" for name in own]
+        paths += [f"scenario.events[{len(before) + place}]" for place in range(len(new))]
+        changed = {**section, "values": {**section.get("values", {}), **own}, "events": [*before, *new]}
+        self._change(call, {"scenario": changed}, paths)
 
     def configure(self, **sections: Any) -> None:  # noqa: ANN401  as the file has it
         """Set keys of other sections of the configuration, or of the top level.
@@ -321,11 +395,13 @@ class Mesh:
         Args:
             sections: a value, or a mapping that is merged into the section.
         """
+        paths: list[str] = []
+        changed: dict[str, Any] = {}
         for key, value in sections.items():
-            if isinstance(value, Mapping):
-                self._section(key).update(plain(dict(value)))
-            else:
-                self._data[key] = plain(value)
+            own = plain(value)
+            changed[key] = {**self._section(key), **own} if isinstance(own, dict) else own
+            paths += [f"{key}.{inner}" for inner in own] if isinstance(own, dict) else [key]
+        self._change(f"mesh.configure({', '.join(f'{key}=...' for key in sections)})", changed, paths)
 
     @checked
     def to_yaml(self, folder: str | Path | None = None) -> str:
@@ -536,15 +612,18 @@ class Mesh:
         file, here = self._plain.file, Path.cwd()
         return file.relative_to(here) if file.name.startswith("<") and file.is_relative_to(here) else file
 
+    def _change(self, call: str, sections: Mapping[str, Any], paths: Sequence[str]) -> None:
+        """Replace sections, if what the call gives in them is right."""
+        check_part(call, sections, paths)
+        self._data.update(sections)
+        self._plain = said_by(self._plain, call, paths)
+
     @property
     def _data(self) -> dict[str, Any]:
-        data = self._plain.data
-        if not isinstance(data, dict):
-            raise ConfigurationError(f"'{self._plain.file}' has {shown(data)} where a configuration should be")
-        return data
+        return sections_of(self._plain)
 
     def _section(self, key: str) -> dict[str, Any]:
-        section = self._data.setdefault(key, {})
+        section = self._data.get(key) or {}
         if not isinstance(section, dict):
             raise ConfigurationError(f"'{key}' of '{self._plain.file}' is {shown(section)}, where a mapping should be")
         return section

@@ -28,8 +28,11 @@ def with_record(section: Any, variables: Sequence[str], keys: Mapping[str, Any],
     given = {"from" if key == "start" else key: plain(value) for key, value in keys.items() if value is not None}
     given["variables"] = list(variables) or None
     sections = section if isinstance(section, list) else [section]
-    if also:
-        return [*sections, given]
+    if also:  # a file that is there already gets another section
+        return [
+            *(one for one in sections if not (isinstance(one, dict) and one.get("file") == given.get("file"))),
+            given,
+        ]
     changed = {**(sections[0] if sections and isinstance(sections[0], dict) else {}), **given}
     return [changed, *sections[1:]] if isinstance(section, list) else changed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,8 @@ def test_findings_name_their_place() -> None:
     with pytest.raises(fmu_mesh.ConfigurationError) as caught:
         mesh.run()
     assert caught.value.findings == check.findings
-    assert "  - <mesh pair>: connections[1].from: " in str(caught.value)
+    assert "  - mesh.connect('pendulum.b', 'delay.x'): connections[1].from: " in str(caught.value)
+    assert "  - mesh.add('gain'): instances.gain.fmu: " in str(caught.value)
 
 
 def test_what_is_right_has_a_plan() -> None:
@@ -192,3 +194,135 @@ def test_a_profile_is_in_the_outcome() -> None:
     assert outcome is not None
     assert outcome.profile is not None
     assert {node.node for node in outcome.profile.nodes} >= {"pendulum", "delay"}
+
+
+def cell(mesh: fmu_mesh.Mesh) -> None:
+    """What a cell of a notebook says, which its user runs again and again."""
+    mesh.add("gain", fmu=FMUS / "Gain.fmu", start_values={"k": 2.0}, replace=True)
+    mesh.connect("delay.y", "gain.u", factor=3.0)
+    mesh.record("gain.y", file="gain.csv")
+    mesh.record("delay.y", file="delay.csv", also=True)
+    mesh.scenario({"delay.d": 0.2}, [{"at": 0.5, "set": {"gain.k": 5.0}}])
+    mesh.configure(timeouts={"step": 5.0})
+
+
+def test_a_cell_that_runs_twice_says_the_same_as_once() -> None:
+    once, twice = built(), built()
+    cell(once)
+
+    cell(twice)
+    cell(twice)
+
+    assert twice.to_yaml() == once.to_yaml()
+    with pytest.raises(fmu_mesh.CallRefused, match=r"has an instance 'pendulum' already\. Call it with `replace=True`"):
+        twice.add("pendulum", fmu="x.fmu")
+
+
+def test_an_instance_with_another_section_keeps_its_connections() -> None:
+    mesh = built()
+    mesh.add("delay", fmu=FMUS / "TransportDelay.fmu", start_values={"d": 0.5}, replace=True)
+
+    result = mesh.run(record="memory", processes=False)
+
+    assert same(result, built().run(record="memory", processes=False, start_values={"delay.d": 0.5}))
+
+
+def test_what_belongs_to_an_instance_goes_with_it() -> None:
+    mesh = built()
+    mesh.add("gain", fmu=FMUS / "Gain.fmu")
+    mesh.add("gain2", fmu=FMUS / "Gain.fmu")
+    mesh.connect("delay.y", "gain.u")
+    mesh.connect("gain.y", "gain2.u")
+    mesh.record("pendulum.a", "gain.y", "in:gain.u", file="gain.csv")
+    mesh.record("gain.y", file="only.csv", also=True)
+    mesh.scenario(
+        {"gain2.k": 0.2}, [{"at": 0.5, "set": {"gain.k": 5.0}}, {"at": 0.6, "set": {"gain.k": 5.0, "gain2.k": 1}}]
+    )
+
+    mesh.remove("gain")
+
+    data: Any = mesh.configuration.data
+    assert [*data["instances"]] == ["pendulum", "delay", "gain2"]
+    assert [one["to"] for one in data["connections"]] == ["delay.x"]
+    assert [one["variables"] for one in data["record"]] == [["pendulum.a"], None]
+    assert data["scenario"] == {"values": {"gain2.k": 0.2}, "events": [{"at": 0.6, "set": {"gain2.k": 1}}]}
+    assert mesh.check()
+
+
+def test_connections_are_cut_by_their_ends() -> None:
+    mesh = built()
+    for name in ("one", "two"):
+        mesh.add(name, fmu=FMUS / "Gain.fmu")
+        mesh.connect("pendulum.a", f"{name}.u")
+
+    def targets() -> list[str]:
+        data: Any = mesh.configuration.data
+        return [one["to"] for one in data["connections"]]
+
+    mesh.disconnect(target="one.u")
+    assert targets() == ["delay.x", "two.u"]
+    mesh.disconnect("pendulum.a", "two.u")
+    assert targets() == ["delay.x"]
+    mesh.disconnect("pendulum.a")
+    assert targets() == []
+    with pytest.raises(fmu_mesh.UnknownName, match=r"no connection 'pendulum\.a -> \*'"):
+        mesh.disconnect("pendulum.a")
+
+
+def test_findings_of_a_file_keep_their_lines_and_those_of_calls_name_them(folder: Path) -> None:
+    (folder / "mesh.yaml").write_text(
+        f"mesh: lines\nsimulation: {{step_size: 0.1, stop_time: 1.0}}\ninstances:\n"
+        f"  one: {{fmu: '{FMUS / 'Gain.fmu'}'}}\n  two: {{fmu: '{FMUS / 'Gain.fmu'}'}}\n  old: {{fmu: gone.fmu}}\n"
+        "connections:\n  - one.y -> old.u\n  - two.y -> one.k\nscenario: {values: {two.q: 1.0}}\n"
+    )
+    mesh = fmu_mesh.load("mesh.yaml")
+    mesh.remove("old")
+    mesh.add("old", fmu="gone.fmu")
+    mesh.add("two", fmu="other.fmu", replace=True)
+    mesh.connect("one.y", "one.x")
+    mesh.scenario({"one.w": 1.0})
+
+    places = {finding.path: (finding.file, finding.line) for finding in mesh.check().findings}
+    mesh.add("two", fmu=FMUS / "Gain.fmu", replace=True)
+    places |= {finding.path: (finding.file, finding.line) for finding in mesh.check().findings}
+
+    assert places == {
+        "instances.old.fmu": ("mesh.add('old')", None),
+        "instances.two.fmu": ("mesh.add('two')", None),
+        "connections[0].to": ("mesh.yaml", 9),
+        "connections[1].to": ("mesh.connect('one.y', 'one.x')", None),
+        "scenario.values.one.w": ("mesh.scenario(...)", None),
+        "scenario.values.two.q": ("mesh.yaml", 10),
+    }
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda mesh: mesh.add("g", fmu="a.fmu", start_valus={}), r"mesh\.add\('g'\): start_valus: .*'start_values'"),
+        (lambda mesh: mesh.add("g", fmu="a.fmu", start_values=[1]), r"mesh\.add\('g'\): start_values: a list"),
+        (lambda mesh: mesh.add("a b", fmu="a.fmu"), r"mesh\.add\('a b'\): 'a b'; expected a name"),
+        (lambda mesh: mesh.connect("pendulum.a", "delay.x", factr=2), r"'delay\.x'\): factr: .*'factor'"),
+        (lambda mesh: mesh.connect("pendulum", "delay.x"), "'pendulum'; expected instance.variable"),
+        (lambda mesh: mesh.connect(None, "delay.x"), r"mesh\.connect\(None, 'delay\.x'\): from: "),
+        (lambda mesh: mesh.record("pendulum.a", evry=2), r"record\.evry: .*'every'"),
+        (lambda mesh: mesh.record("pendulum.a", file="b.csv", also=True, every=0), r"record\[1\]\.every: 0"),
+        (lambda mesh: mesh.scenario({"delay.d": {"tims": [0]}}), r"scenario\.values\.delay\.d\.tims: .*'times'"),
+        (lambda mesh: mesh.scenario(events=[{"at": 1.0}]), r"mesh\.scenario\(\.\.\.\): scenario\.events\[0\]\.set"),
+        (lambda mesh: mesh.configure(timeouts={"stepp": 1}), r"mesh\.configure\(timeouts=\.\.\.\): timeouts\.stepp"),
+        (lambda mesh: mesh.configure(group="auto", colour=3), "colour: an unknown key"),
+        (lambda mesh: mesh.configure(simulation=5), "simulation: 5; expected a mapping"),
+        (lambda mesh: mesh.remove("delai"), "no instance 'delai'. Did you mean 'delay'"),
+        (lambda mesh: mesh.disconnect("pendulum.a", "delay.y"), "Did you mean 'pendulum.a -> delay.x'"),
+        (lambda mesh: mesh.disconnect(), r"no connection '\* -> \*'"),
+    ],
+)
+def test_a_wrong_call_changes_nothing_and_names_itself(call: Callable[[fmu_mesh.Mesh], None], message: str) -> None:
+    mesh = built()
+    before, origins = mesh.to_yaml(), mesh.configuration.origins
+
+    with pytest.raises(fmu_mesh.CallRefused, match=message):
+        call(mesh)
+
+    assert mesh.to_yaml() == before
+    assert mesh.configuration.origins == origins

@@ -1,0 +1,166 @@
+"""Changes of a configuration by the calls of a program: what is wrong is refused, and findings name the call.
+
+Owns no values: a `Mesh` asks these functions before and after it changes its own. What needs the models, such as
+whether a variable exists, is checked by `Mesh.check`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from msgspec.structs import replace
+
+from ..config.findings import ValueOrigin
+from ..config.loading import PlainConfig
+from ..errors import CallRefused, ConfigurationError, UnknownName
+from ..instances.configuration import examine_data
+from ..text import listed, nearest, shown
+
+__all__ = [
+    "check_part",
+    "connections_of",
+    "ends_of",
+    "said_by",
+    "sections_of",
+    "unknown",
+    "with_connections",
+    "without_instance",
+]
+
+T = TypeVar("T")
+
+_CONNECTION: Final = re.compile(r"connections\[(\d+)\]")
+_REST: Final[dict[str, Any]] = {
+    "mesh": "mesh",
+    "simulation": {"step_size": 1.0, "stop_time": 1.0},
+    "instances": {"instance": {"fmu": "any.fmu"}},
+}
+"""A configuration without an error, around the part that is checked."""
+
+
+def check_part(call: str, part: Mapping[str, Any], paths: Sequence[str], inside: str = "") -> None:
+    """Check the structure of a part of a configuration, before it becomes one.
+
+    Args:
+        call: the call that gives it.
+        part: sections by name.
+        paths: what the call gives; findings about anything else in these sections are not its own.
+        inside: the start of these paths, which the call says already.
+
+    Raises:
+        CallRefused: there is a finding.
+    """
+    try:
+        findings = [*examine_data(PlainConfig({**_REST, **part}, Path(call)))[1]]
+    except ConfigurationError as error:
+        findings = [*error.findings]
+    own = [finding for finding in findings if any(_is_inside(finding.path, path) for path in paths)]
+    if own:
+        told = (replace(one, file=call, path=one.path.removeprefix(inside).removeprefix(".")) for one in own)
+        raise CallRefused("; ".join(map(str, told)))
+
+
+def said_by(plain: PlainConfig, call: str, paths: Sequence[str], *, new: bool = False) -> PlainConfig:
+    """The same values, of which findings about the ones at ``paths`` name a call, and no line of a file.
+
+    With ``new``, nothing is known about these paths; to look for it would make long programs slow.
+    """
+    left = plain if new else _without_places(plain, paths)
+    return left._replace(origins={**left.origins, **dict.fromkeys(paths, ValueOrigin(call, None))})
+
+
+def with_connections(plain: PlainConfig, keeps: Callable[[Any, Any], bool]) -> PlainConfig:
+    """The values with some connections only; ``keeps`` is called with the source and the target of each."""
+    connections = connections_of(plain)
+    kept = [place for place, one in enumerate(connections) if keeps(*ends_of(one))]
+
+    def moved(known: Mapping[str, T]) -> dict[str, T]:
+        found: dict[str, T] = {}
+        for path, own in known.items():
+            item = _CONNECTION.match(path)
+            if item is None:
+                found[path] = own
+            elif (place := int(item[1])) in kept:
+                found[f"connections[{kept.index(place)}]{path[item.end() :]}"] = own
+        return found
+
+    data = {**sections_of(plain), "connections": [connections[place] for place in kept]}
+    return plain._replace(data=data, lines=moved(plain.lines), origins=moved(plain.origins))
+
+
+def without_instance(plain: PlainConfig, name: str) -> PlainConfig:
+    """The values without an instance, its connections, what a scenario sets of it and what is recorded of it."""
+    plain = with_connections(plain, lambda *ends: not any(_is_of(end, name) for end in ends))
+    data = sections_of(plain)
+    data["instances"] = {one: own for one, own in data["instances"].items() if one != name}
+    for section in {"scenario", "record"} & data.keys():
+        data[section] = _without(data[section], name)
+    gone = f"instances.{name}", "scenario.events", "record"  # of lists, some items may be left out
+    return _without_places(plain, gone)._replace(data=data)
+
+
+def _without_places(plain: PlainConfig, paths: Sequence[str]) -> PlainConfig:
+    lines, origins = plain.lines, plain.origins
+    for path in paths:
+        lines = {own: line for own, line in lines.items() if not _is_inside(own, path)}
+        origins = {own: origin for own, origin in origins.items() if not _is_inside(own, path)}
+    return plain._replace(lines=lines, origins=origins)
+
+
+def _without(value: Any, name: str) -> Any:  # noqa: ANN401  as a file has it
+    """A value without keys and list items that are variables of an instance, and without an event that sets nothing."""
+    if isinstance(value, dict):
+        left = {key: _without(own, name) for key, own in value.items() if not _is_of(key, name)}
+        return left | {"variables": None} if left.get("variables") == [] else left  # nothing chosen: all outputs
+    if isinstance(value, list):
+        items = (_without(own, name) for own in value if not _is_of(own, name))
+        return [own for own in items if not (isinstance(own, dict) and own.get("set") == {})]
+    return value
+
+
+def _is_of(variable: object, name: str) -> bool:
+    return str(variable).removeprefix("in:").startswith(f"{name}.")
+
+
+def sections_of(plain: PlainConfig) -> dict[str, Any]:
+    """The sections of a configuration.
+
+    Raises:
+        ConfigurationError: it has none.
+    """
+    if not isinstance(plain.data, dict):
+        raise ConfigurationError(f"'{plain.file}' has {shown(plain.data)} where a configuration should be")
+    return plain.data
+
+
+def connections_of(plain: PlainConfig) -> list[Any]:
+    """The connections of a configuration.
+
+    Raises:
+        ConfigurationError: the section is no list.
+    """
+    own = sections_of(plain).get("connections") or []
+    if not isinstance(own, list):
+        raise ConfigurationError(f"'connections' of '{plain.file}' is {shown(own)}, where a list should be")
+    return own
+
+
+def ends_of(connection: Any) -> tuple[Any, Any]:  # noqa: ANN401  as a file has it
+    """Source and target of a connection in one of its two forms."""
+    if isinstance(connection, dict):
+        return connection.get("from"), connection.get("to")
+    source, _, target = str(connection).partition("->")
+    return source.strip(), target.strip()
+
+
+def unknown(what: str, name: str, there: Sequence[str]) -> UnknownName:
+    """The error for a name that is not there; suggests the nearest one."""
+    near = nearest(name, there)
+    return UnknownName(what, hint=f"Did you mean '{near}'?" if near else f"There are: {listed(there)}.")
+
+
+def _is_inside(path: str, outer: str) -> bool:
+    return path.startswith(outer) and path[len(outer) : len(outer) + 1] in ("", ".", "[")
