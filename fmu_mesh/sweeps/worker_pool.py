@@ -148,9 +148,10 @@ class _Worker:
                 return
             old, context = self._pool, self._context
             self._renew()
+            context.kill()
+            context.exit_code()  # it may have begun its next job, whose file it keeps open until it is gone
             for job in self.jobs:
                 self._give(job)
-        context.kill()
         old.shutdown(wait=False, cancel_futures=True)
 
     def shutdown(self, *, wait: bool, now: bool) -> None:
