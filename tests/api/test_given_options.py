@@ -49,6 +49,7 @@ RIGHT: Mapping[str, Any] = {
     "folder": "swept",
     "curves": False,
     "resume": True,
+    "force": True,
     "reset": True,
     "max_instances": {"DampedPendulum.fmu": 2},
 }
