@@ -67,6 +67,7 @@ __all__ = [
     "Inspection",
     "Interrupted",
     "KeyboardInterrupted",
+    "LibraryMissing",
     "LoadFailed",
     "LoopNotConverged",
     "Mesh",

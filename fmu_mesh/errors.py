@@ -3,7 +3,8 @@
 ```
 FmuMeshError                     1   an internal error
 ├── ConfigurationError           2   a file, an option or a command is wrong; carries all findings
-│   └── NotInOneProcess              instances of the mesh cannot share one process
+│   ├── NotInOneProcess              instances of the mesh cannot share one process
+│   └── LibraryMissing               an optional library is not installed; also a LoadFailed
 ├── CallRefused                  2   a program called the library wrongly; also a ValueError
 │   └── UnknownName                  there is no such name; also a KeyError
 ├── FmuError                     3   an FMU failed
@@ -47,6 +48,7 @@ __all__ = [
     "InitializationFailed",
     "Interrupted",
     "KeyboardInterrupted",
+    "LibraryMissing",
     "LoadFailed",
     "LoopNotConverged",
     "MeshLost",
@@ -278,6 +280,10 @@ class FmuError(FmuMeshError):
 
 class LoadFailed(FmuError):
     """An FMU cannot be extracted, loaded or instantiated."""
+
+
+class LibraryMissing(ConfigurationError, LoadFailed):
+    """An optional library is not installed. The message has the command that installs it here."""
 
 
 class InitializationFailed(FmuError):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import ConfigurationError
+from .installing import installed_from
 from .text import listed
 
 __all__ = ["own_plugin_names", "plugin", "plugin_names"]
@@ -80,7 +81,9 @@ def _own(group: str) -> dict[str, str]:
             own[name] = place
     if not own:
         text = f"the installation of {_OURS} is older than its source: it has no entry points '{group}'"
-        raise ConfigurationError(text, hint="Install it again, in a checkout with `pip install --editable .`.")
+        raise ConfigurationError(
+            text, hint=f"Install it again, as you did before, from {installed_from() or 'a clone'}."
+        )
     return own
 
 

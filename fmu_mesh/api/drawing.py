@@ -5,7 +5,6 @@ matplotlib is optional, so it is imported when something is drawn.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import warnings
 from collections.abc import Iterable, Sequence
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
 from ..files import replaced
+from ..installing import require
 from ..printing import printable
 from ..system.recording import Columns, joined
 
@@ -85,10 +85,9 @@ def require_matplotlib() -> None:
     """Check that matplotlib is installed.
 
     Raises:
-        ConfigurationError: it is not.
+        LibraryMissing: it is not.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigurationError("plots need matplotlib.", hint="Install it with `pip install 'fmu-mesh[plot]'`.")
+    require("matplotlib", "plots")
 
 
 def draw(figure: Figure, output: Path) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..files import unwritable
+from ..installing import importing
 from ..instances.python.unit_names import base_unit_of
 from ..recorder.csv_file import CsvFile
 from ..recorder.parquet_file import ParquetFile
@@ -453,12 +454,10 @@ def imported_pandas() -> ModuleType:
     """The module pandas.
 
     Raises:
-        ConfigurationError: it is not installed.
+        LibraryMissing: it is not installed.
     """
-    try:
+    with importing("pandas", "data frames"):
         import pandas as pd  # noqa: PLC0415  an extra, and slow to import
-    except ImportError as error:
-        raise ConfigurationError("pandas is not installed.", hint="Install it with `pip install pandas`.") from error
     module: ModuleType = pd
     return module
 

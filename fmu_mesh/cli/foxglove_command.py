@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from ..errors import ConfigurationError
+from ..installing import importing
 from .arguments import CommandParser, Parsers, add_quiet, add_reaching, port_number
 
 __all__ = ["PARSERS"]
@@ -41,11 +41,8 @@ def _add_foxglove(parser: CommandParser) -> None:
 
 
 def _foxglove(arguments: argparse.Namespace) -> int:
-    try:
+    with importing("foxglove-sdk", "connections of Foxglove"):
         from ..foxglove.serving import Serving, serve  # noqa: PLC0415  an extra
-    except ImportError as error:
-        hint = "Install it with `pip install 'fmu-mesh[foxglove]'`."
-        raise ConfigurationError("The package foxglove-sdk is not installed.", hint=hint) from error
     serving = Serving(
         mesh=arguments.mesh,
         connect=tuple(arguments.connect),

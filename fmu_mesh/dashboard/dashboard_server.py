@@ -6,7 +6,6 @@ Only this module and `live_page` import NiceGUI, and only when a dashboard is st
 from __future__ import annotations
 
 import errno
-import importlib.util
 import secrets
 import socket
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from ..errors import ConfigurationError
+from ..installing import require
 from .access import Access, is_loopback
 from .mesh_directory import MeshDirectory
 from .mesh_follower import CurveQuestion
@@ -66,10 +66,7 @@ def serve(options: DashboardOptions, ready: Callable[[str], None]) -> None:
         ConfigurationError: NiceGUI is not installed, the port is taken, or the mesh does not run.
         DeadlineExceeded: an endpoint does not answer.
     """
-    if importlib.util.find_spec("nicegui") is None:
-        raise ConfigurationError(
-            "the dashboard needs NiceGUI.", hint="Install it with `pip install 'fmu-mesh[dashboard]'`."
-        )
+    require("nicegui", "dashboards")
     with (
         _listening(options.host, options.port) as listener,
         MeshDirectory(options.mesh, options.connect, options.timeout) as directory,

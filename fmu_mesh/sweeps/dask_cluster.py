@@ -13,7 +13,8 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any, Final, TypeVar
 
-from ..errors import ConfigurationError, MeshLost
+from ..errors import MeshLost
+from ..installing import importing
 from ..wire.runtime import remove_stale_folders
 
 __all__ = ["dask_executor"]
@@ -34,16 +35,13 @@ def dask_executor(address: str | None, workers: int | None = None) -> Iterator[E
         workers: number of these processes; None: one for each processor.
 
     Raises:
-        ConfigurationError: Dask is not installed.
+        LibraryMissing: Dask is not installed.
         MeshLost: the scheduler does not answer.
     """
-    try:
+    with importing("distributed", "clusters of Dask"):
         from dask import config as dask_config  # noqa: PLC0415  an extra, and slow to import
         from distributed import Client, LocalCluster  # noqa: PLC0415  as above
         from distributed.security import Security  # noqa: PLC0415  as above
-    except ImportError as error:
-        hint = "Install it with `pip install 'fmu-mesh[dask]'`."
-        raise ConfigurationError("Dask is not installed.", hint=hint) from error
     logging.getLogger("distributed").setLevel(logging.WARNING)  # it tells every connection
     with ExitStack() as stack:
         where: Any = address

@@ -19,6 +19,7 @@ from ..config.findings import Findings
 from ..config.plain_values import plain
 from ..config.yaml_text import read
 from ..errors import CallRefused, ConfigurationError
+from ..installing import importing
 from ..text import listed, nearest, shown
 from ..variables.value_types import PlainValue
 
@@ -265,11 +266,8 @@ def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
     generator = _generator(seed)
     if name == "random":
         return generator.random((count, dimensions))
-    try:
+    with importing("scipy", f"samplers other than random:{count}"):
         from scipy.stats import qmc  # noqa: PLC0415  an extra, and slow to import
-    except ImportError as error:
-        hint = f"Install it with `pip install 'fmu-mesh[sweep]'`, or use random:{count}."
-        raise ConfigurationError(f"the sampler '{name}' needs scipy.", hint=hint) from error
     shares: NDArray[np.float64] = getattr(qmc, _SAMPLERS[name])(dimensions, seed=generator).random(count)
     return shares
 

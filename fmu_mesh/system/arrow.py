@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 
 import msgspec
 
-from ..errors import ConfigurationError
+from ..installing import importing
 from ..variables.value_types import MAX_ELEMENTS, element_names
 
 __all__ = [
@@ -41,15 +41,11 @@ def pyarrow_module() -> Any:  # noqa: ANN401  an optional dependency
     """The module pyarrow.
 
     Raises:
-        ConfigurationError: it is not installed.
+        LibraryMissing: it is not installed.
     """
-    try:
+    with importing("pyarrow", "results in .parquet"):
         import pyarrow as pa  # noqa: PLC0415  an optional dependency
         from pyarrow import ipc  # noqa: F401, PLC0415  an optional dependency; `pa.ipc`
-    except ImportError as error:
-        raise ConfigurationError(
-            "results in .parquet need the package pyarrow", hint="Install it: pip install 'fmu-mesh[parquet]'."
-        ) from error
     return pa
 
 

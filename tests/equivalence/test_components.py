@@ -615,7 +615,7 @@ def test_a_python_without_our_version_is_a_finding_that_says_what_to_install(pla
     errors = refused(place, elsewhere(place, python))
 
     has = f"has fmu-mesh {version}" if version else "has no fmu-mesh"
-    wanted = f"{python} -m pip install fmu-mesh=={fmu_mesh.__version__}"
+    wanted = f"{python} -m pip install {FMUS.parent}"
     assert f"the Python '{python}' {has} (Install fmu-mesh {fmu_mesh.__version__} there: {wanted})" in errors
 
 

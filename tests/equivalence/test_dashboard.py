@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import socket
+import sys
 from pathlib import Path
 
 import psutil
@@ -128,7 +129,8 @@ def test_without_the_extra_it_says_how_to_install_it(place: Place) -> None:
 
     assert missing.wait() == 2
     assert missing.message == (
-        "fmu-mesh: the dashboard needs NiceGUI. Install it with `pip install 'fmu-mesh[dashboard]'`."
+        "fmu-mesh: dashboards need the library nicegui. "
+        f"Install it with `{sys.executable} -m pip install 'nicegui<4,>=3.18'`."
     )
 
 

@@ -263,7 +263,7 @@ def test_the_missing_extra_is_named(place: Place) -> None:
     done = place.run("foxglove")
 
     assert done.wait() == 2
-    assert "pip install 'fmu-mesh[foxglove]'" in done.message
+    assert "-m pip install 'foxglove-sdk>=0.30'`" in done.message
     assert_readable(done.message)
 
 

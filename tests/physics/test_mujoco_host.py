@@ -91,7 +91,7 @@ def test_a_model_that_cannot_be_loaded_says_why(tmp_path: Path) -> None:
 def test_without_mujoco_the_way_out_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
 
-    with pytest.raises(LoadFailed, match=r"not installed.*pip install 'fmu-mesh\[physics\]'"):
+    with pytest.raises(LoadFailed, match=r"worlds of MuJoCo need the library mujoco"):
         load_world(write_world(tmp_path, slider()), SECTION)
 
 

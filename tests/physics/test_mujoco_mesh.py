@@ -137,8 +137,8 @@ def test_without_mujoco_check_says_what_to_install(
     assert main(["check", str(CONFIGS / "fluid_body.yaml")]) == 2
 
     message = capsys.readouterr().err
-    assert "instances.world.mujoco: MuJoCo is not installed" in message
-    assert "pip install 'fmu-mesh[physics]'" in message
+    assert "instances.world.mujoco: worlds of MuJoCo need the library mujoco" in message
+    assert "-m pip install 'mujoco>=3.3'`" in message
 
 
 def test_a_model_that_is_loaded_for_ever_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,7 @@ def ros_or_skip() -> None:
     missing = [name for name in needed[:4] if importlib.util.find_spec(name) is None]
     if missing:
         pytest.skip(
-            f"ROS 2 is not installed ({', '.join(missing)}); pip install 'fmu-mesh[test-ros]'", allow_module_level=True
+            f"ROS 2 is not installed ({', '.join(missing)}); pip install '.[test-ros]'", allow_module_level=True
         )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # a parser that ROS imports is older than this Python

@@ -17,7 +17,7 @@ from fmu_mesh.simtime import TimeGrid
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, Launched, Place, rows_of, wait_until, write_config
 
-pytest.importorskip("mcap", reason="the package mcap is not installed; pip install 'fmu-mesh[test]'")
+pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
 
 MS = 1_000_000
 ARRAY = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
@@ -370,7 +370,7 @@ def test_a_bag_in_a_scenario_gives_the_floats_of_playing_it_into_a_mesh_that_is_
     start: float | None, step_size: float, tmp_path: Path
 ) -> None:
     """The messages of the bag come every 2 ms, with stamps of simulation time from 0 s on."""
-    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install '.[test]'")
     coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
     coupled.configure(simulation={"stop_time": 0.2})
     coupled.run(processes=False, output=tmp_path / "a.mcap")
@@ -402,7 +402,7 @@ def test_a_bag_in_a_scenario_gives_the_floats_of_playing_it_into_a_mesh_that_is_
     ],
 )
 def test_what_cannot_come_from_a_bag_is_a_finding(given: dict[str, str], expected: str, tmp_path: Path) -> None:
-    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install '.[test]'")
     coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
     coupled.run(processes=False, stop_time=0.01, output=tmp_path / "a.mcap")
     mesh = fmu_mesh.Mesh("played", step_size=0.001, stop_time=0.3)

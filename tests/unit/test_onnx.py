@@ -427,8 +427,8 @@ def test_without_onnxruntime_the_finding_says_what_to_install(
     assert main(["check", str(config_of(tmp_path))]) == 2
 
     told = capsys.readouterr().err
-    assert "mesh.yaml:5: instances.policy.onnx: onnxruntime is not installed" in told
-    assert "pip install 'fmu-mesh[onnx]'" in told
+    assert "mesh.yaml:5: instances.policy.onnx: ONNX models need the library onnxruntime" in told
+    assert "-m pip install 'onnxruntime>=1.22'`" in told
 
 
 # --- no end

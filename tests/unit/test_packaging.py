@@ -50,8 +50,26 @@ def test_the_page_on_installation_has_every_optional_feature() -> None:
     assert {name for name, _ in rows} == EXTRAS.keys() - FOR_DEVELOPERS
 
 
-@pytest.mark.parametrize("folder", ["docs", "examples", "fmu_mesh"])
-def test_every_extra_that_a_page_or_a_message_names_exists(folder: str) -> None:
+def test_nobody_is_told_to_install_what_is_on_no_index() -> None:
+    """Whoever takes our name on an index would run code at those who follow the advice."""
+    files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    files += [file for folder in ("docs", "examples", "configs") for file in (ROOT / folder).rglob("*.*")]
+    files += (ROOT / "fmu_mesh").rglob("*.py")
+    advice = re.compile(r"install [^`\n]*['\" ]fmu[-_]mesh\b(?!/)|fmu[-_]mesh\[[a-z]|fmu[-_]mesh==")
+
+    advised = [
+        f"{file.relative_to(ROOT)}: {line}"
+        for file in files
+        if file.suffix in {".md", ".py", ".yaml"}
+        for line in file.read_text(encoding="utf-8").splitlines()
+        if advice.search(line) and "uninstall" not in line
+    ]
+
+    assert advised == []
+
+
+@pytest.mark.parametrize("folder", ["docs", "examples"])
+def test_every_extra_that_a_page_names_exists(folder: str) -> None:
     files = [*(ROOT / folder).rglob("*.md"), *(ROOT / folder).rglob("*.py"), *ROOT.glob("*.md")]
     named = {
         extra

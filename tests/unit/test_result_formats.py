@@ -576,7 +576,8 @@ def test_a_missing_package_is_told_by_check_and_by_reading(
 
     codes = main(["check", str(config)]), main(["plot", str(tmp_path / "a.parquet")])
 
-    told = "results in .parquet need the package pyarrow. Install it: pip install 'fmu-mesh[parquet]'."
+    told = "results in .parquet need the library pyarrow. "
+    told += f"Install it with `{sys.executable} -m pip install 'pyarrow>=17'`."
     assert codes == (2, 2)
     assert capsys.readouterr().err.count(told) == 2
 

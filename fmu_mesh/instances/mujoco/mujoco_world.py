@@ -35,6 +35,7 @@ import msgspec
 
 from ...errors import LoadFailed
 from ...files import opened
+from ...installing import importing
 from ...text import listed, nearest
 from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
 from .mujoco_section import MujocoConfig
@@ -142,13 +143,10 @@ def engine() -> ModuleType:
     """The module `mujoco`; it is imported on first use, because it is optional and slow to import.
 
     Raises:
-        LoadFailed: it is not installed.
+        LibraryMissing: it is not installed.
     """
-    try:
+    with importing("mujoco", "worlds of MuJoCo"):
         import mujoco  # noqa: PLC0415  an extra, and slow to import
-    except ImportError as error:
-        text = "MuJoCo is not installed"
-        raise LoadFailed(text, hint="Install it with `pip install 'fmu-mesh[physics]'`.") from error
     mujoco.set_mju_user_warning(warnings.append)
     module: ModuleType = mujoco
     return module

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import ctypes.util
-import importlib.util
 import logging
 import math
 import os
@@ -19,6 +18,7 @@ from typing import Any, Final, Protocol
 
 from ... import files
 from ...errors import ConfigurationError, LoadFailed
+from ...installing import require
 from .mujoco_world import engine
 
 __all__ = ["Film", "Picture", "Window", "check_film", "check_window"]
@@ -65,8 +65,7 @@ def check_film(path: Path) -> None:
         raise ConfigurationError(f"`video={str(path)!r}`: a film is one of {', '.join(FILM_RATES)}")
     if files.is_folder(path):
         raise ConfigurationError(f"`video={str(path)!r}`: a folder, not a file")
-    if importlib.util.find_spec("imageio") is None:
-        raise ConfigurationError("films need imageio.", hint="Install it with `pip install 'fmu-mesh[physics]'`.")
+    require("imageio", "films")
     _choose_backend()
 
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...files import opened
+from ...installing import importing
 from ...text import listed
 from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_types import MAX_ELEMENTS, VariableType, is_float, nested, zero
@@ -178,11 +179,8 @@ def _read(path: Path, limits: LimitsConfig) -> bytes:
 def _engine() -> ModuleType:
     # Some releases send usage data to their vendor, with threads and files of their own. Who wants that says so.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    try:
+    with importing("onnxruntime", "ONNX models"):
         import onnxruntime  # noqa: PLC0415  an extra, and slow to import
-    except ImportError as error:
-        text = "onnxruntime is not installed"
-        raise LoadFailed(text, hint="Install it with `pip install 'fmu-mesh[onnx]'`.") from error
     module: ModuleType = onnxruntime
     return module
 

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import msgspec
 
 from ... import __version__
 from ...errors import FmuMeshError, LoadFailed
+from ...installing import installed_from
 from ...variables.model_description import ModelDescription
 from ..child_question import ask_description_of, described, run_child
 from .component_description import check_arguments
@@ -81,5 +83,7 @@ def _check_version(python: str) -> None:
     version = output.decode(errors="replace").strip()
     if version != __version__:
         has = f"has fmu-mesh {version}" if version else "has no fmu-mesh"
-        hint = f"Install fmu-mesh {__version__} there: {python} -m pip install fmu-mesh=={__version__}"
+        place = installed_from()
+        how = f"{quote(python)} -m pip install {place}" if place else f"from a clone of version {__version__}"
+        hint = f"Install fmu-mesh {__version__} there: {how}"
         raise LoadFailed(f"the Python '{python}' {has}", hint=hint)

@@ -18,6 +18,7 @@ from ... import files
 from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
+from ...installing import importing
 from ...system.recording import reading
 from ...text import listed, nearest, nearest_file
 from ...variables.model_description import ModelDescription, Value
@@ -66,12 +67,8 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
+        with importing("rosbags", "bags of ROS"):
             from rosbags.highlevel import AnyReader  # noqa: PLC0415 an optional dependency
-        except ImportError as error:
-            raise ConfigurationError(
-                "reading a bag needs the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
-            ) from error
         self.path = path
         if not files.exists(path):
             near = nearest_file(path)

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ...config.findings import Findings
 from ...config.mesh import RosConfig
-from ...errors import ConfigurationError
 from ...files import Kept, open_alone
+from ...installing import importing
 from ...system.recording import Columns, Recording
 from ...variables.model_description import ModelDescription
 from ..gateway.mapping import message_types
@@ -324,10 +324,6 @@ def _variables(topic: Topic) -> set[tuple[str, str]]:
 
 
 def _writer_class() -> Any:  # noqa: ANN401 a class of an optional dependency
-    try:
+    with importing("mcap", "recordings into .mcap"):
         from mcap.writer import Writer  # noqa: PLC0415 an optional dependency
-    except ImportError as error:
-        raise ConfigurationError(
-            "a recording into .mcap needs the package mcap", hint="Install it: pip install 'fmu-mesh[ros]'."
-        ) from error
     return Writer

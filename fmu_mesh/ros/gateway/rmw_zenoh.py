@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import zenoh
 
+from ...installing import importing
 from ...wire.session import undeclare_all
 from ..messages.cdr import CdrError, Codec, Message
 from ..messages.ros_names import dds_type
@@ -106,7 +107,8 @@ class RmwZenoh:
 
     def _announce(self, kind: str, name: str, message: str, *, reliable: bool) -> bytes:
         """Declare the token of an entity, and return the 16 bytes that identify the entity."""
-        import xxhash  # noqa: PLC0415  an optional dependency
+        with importing("xxhash", "topics of rmw_zenoh"):
+            import xxhash  # noqa: PLC0415  an optional dependency
 
         qos = f"{_RELIABLE if reliable else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
         own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"

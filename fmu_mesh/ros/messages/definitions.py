@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 
 from ...errors import ConfigurationError
+from ...installing import importing
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -108,12 +109,8 @@ class MessageTypes:
     """
 
     def __init__(self, distribution: Distribution = "jazzy", custom: Mapping[str, str] | None = None) -> None:
-        try:
+        with importing("rosbags", "message types of ROS"):
             from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  an optional dependency
-        except ImportError as error:
-            raise ConfigurationError(
-                "ROS message types need the package rosbags", hint="Install it: pip install 'fmu-mesh[ros]'."
-            ) from error
         self.distribution = distribution
         # New types are put into `fielddefs`: `register` would execute code that it generates from a definition.
         self.store: Typestore = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
