@@ -52,8 +52,11 @@ class ScenarioValues(Base, frozen=True, kw_only=True):
         ),
     ] = None
     interpolation: Annotated[
-        Literal["hold", "linear"],
-        Meta(description="hold: constant from each time on; linear: a line between two times, for Real inputs."),
+        Literal["hold", "linear", "auto"],
+        Meta(
+            description="hold: constant from each time on; linear: a line between two times, for Real inputs; auto: "
+            "linear for continuous Real inputs, and hold for all others."
+        ),
     ] = "hold"
     unit: Annotated[
         str | None, Meta(description="Unit of the values; they are converted to the unit of the variable.")

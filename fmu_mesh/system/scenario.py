@@ -252,8 +252,10 @@ class _Resolving:
         return Schedule(variable.name, (self._grid.start_time,), (value,)) if value is not None else None
 
     def _over_time(self, reference: str, given: ScenarioValues, variable: Variable, path: str) -> Schedule | None:
-        linear = given.interpolation == "linear"
-        if linear and not (is_float(variable.type) and variable.causality == "input"):
+        can_be_linear = is_float(variable.type) and variable.causality == "input"
+        is_continuous = can_be_linear and variable.variability == "continuous"
+        linear = given.interpolation == "linear" or (given.interpolation == "auto" and is_continuous)
+        if linear and not can_be_linear:
             found = f"linear for '{reference}', {_what(variable)}"
             self._findings.add(f"{path}.interpolation", found, "hold; inputs of type Real may be linear")
             return None

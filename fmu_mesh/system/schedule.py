@@ -85,7 +85,7 @@ class Course:
 
     Args:
         times: in s, none before the one in front of it; at least one.
-        values: the value from each time on. Of equal times the last one counts.
+        values: the value from each time on. Of equal times the last one counts; a line from before ends at the first.
         grid: the communication points.
         points: points per own step.
         linear: whether numbers change linearly between two times.
@@ -115,9 +115,7 @@ class Course:
         self._arrays: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]] | None = None
         for time, value in zip(times, values, strict=True):
             step = grid.step_at(time, points, tolerance)
-            last = self._times[-1] if self._times else None
-            replaced = last is not None and (time == last if linear else step == self._steps[-1])
-            if replaced:
+            if not linear and self._steps and step == self._steps[-1]:
                 self._times.pop(), self._values.pop(), self._steps.pop()
             if linear or not self._values or not _same(self._values[-1], value):
                 self._times.append(time)

@@ -39,8 +39,13 @@ def test_of_several_values_for_one_step_the_last_one_counts() -> None:
     course = Course([1.0, 1.02, 1.04, 1.04, 1.2], [1.0, 2.0, 3.0, 4.0, 5.0], GRID, 1)
 
     assert values(course, 3) == [1.0, 4.0, 5.0]
-    line = Course([1.0, 1.2, 1.2, 1.4], [0.0, 1.0, 5.0, 5.0], GRID, 1, linear=True)
-    assert values(line, 4) == pytest.approx([0.0, 2.5, 5.0, 5.0], rel=1e-12)
+
+
+def test_a_line_ends_at_a_jump_and_the_next_one_begins_there() -> None:
+    line = Course([1.0, 1.2, 1.2, 1.4], [0.0, 1.0, 5.0, 6.0], GRID, 1, linear=True)
+
+    assert values(line, 5) == pytest.approx([0.0, 0.5, 5.0, 5.5, 6.0], rel=1e-12)
+    assert line.values(0, 5).tolist() == values(line, 5)
 
 
 def test_a_value_is_set_where_it_changes_and_nowhere_else() -> None:
