@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
+    from .api.simulating import simulate
     from .api.system_graph import SystemGraph
     from .errors import (
         CallRefused,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
         InitializationFailed,
         Interrupted,
         KeyboardInterrupted,
+        LibraryMissing,
         LoadFailed,
         LoopNotConverged,
         MeshLost,
@@ -97,6 +99,7 @@ __all__ = [
     "meshes",
     "recover",
     "rerun",
+    "simulate",
     "sweep",
 ]
 
@@ -119,6 +122,7 @@ _PLACES = {
     "System": "api.open_system",
     "SystemGraph": "api.system_graph",
     "SystemState": "api.open_system",
+    "simulate": "api.simulating",
     "attach": "api.attaching",
     "Inspection": "api.inspection",
     "PackageInspection": "api.package_inspection",

@@ -38,7 +38,6 @@ __all__ = [
     "legend_rows",
     "limited",
     "reduced",
-    "require_matplotlib",
     "short",
     "thinned",
 ]
@@ -81,15 +80,6 @@ _NAMES = 100
 _CHARACTERS = 60
 
 
-def require_matplotlib() -> None:
-    """Check that matplotlib is installed.
-
-    Raises:
-        LibraryMissing: it is not.
-    """
-    require("matplotlib", "plots")
-
-
 def draw(figure: Figure, output: Path) -> None:
     """Write a figure into a file; its suffix gives the format.
 
@@ -116,7 +106,7 @@ def empty_figure() -> Figure:
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
-    require_matplotlib()
+    require("matplotlib", "plots")
     # The object interface: no window, no global state of pyplot.
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
 

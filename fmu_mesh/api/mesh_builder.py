@@ -25,6 +25,7 @@ from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
+from ..variables.model_description import ModelDescription
 from .mesh_check import Check, check_of
 from .mesh_editing import (
     check_part,
@@ -36,7 +37,7 @@ from .mesh_editing import (
     with_connections,
     without_instance,
 )
-from .plan_options import memory_file, with_record
+from .plan_options import memory_file, memory_of, with_record
 from .rebasing import rebased
 from .run_handle import Run
 from .tables import html_table, shortened
@@ -130,7 +131,7 @@ class Mesh:
         path: str | Path,
         *,
         name: str | None = None,
-        simulation: Mapping[str, Any] = MappingProxyType({}),
+        simulation: Mapping[str, Any] | Callable[[ModelDescription], Mapping[str, Any]] = MappingProxyType({}),
         on_notice: Callable[[str], None] = log.info,
         **section: Any,  # noqa: ANN401  as the file has it
     ) -> Self:
@@ -145,7 +146,8 @@ class Mesh:
         Args:
             path: the FMU.
             name: name of the mesh and of its instance; None: the model identifier.
-            simulation: keys of the section `simulation`; by default, the FMU says the step size, and there is no end.
+            simulation: keys of the section `simulation`, or what gives them for a model description; by default, the
+                FMU says the step size, and there is no end.
             on_notice: called with a sentence before something that takes long, such as compiling the FMU.
             section: other keys of the instance, as in `add`.
 
@@ -163,7 +165,8 @@ class Mesh:
 
             raise with_way_out(error, file) from error
         own_name = name if name is not None else description.model_identifier
-        times = {"step_size": description.step_size, "stop_time": None, **simulation}
+        given = simulation(description) if callable(simulation) else simulation
+        times = {"step_size": description.step_size, "stop_time": None, **given}
         if times["step_size"] is None:
             raise CallRefused(
                 f"'{path}' has no default step size.", hint='Give one, as `simulation={"step_size": ...}`.'
@@ -550,7 +553,12 @@ class Mesh:
             FmuMeshError: the run ended early; names instance, variable and point, and its `result` has what was
                 recorded up to then.
         """
-        with self.start(**options.given()) as run:
+        from .run_thread import check_memory  # noqa: PLC0415  not for those who only build a mesh
+
+        plan, how = self._planned(options)
+        if memory_of(plan) is not None and "memory_limit" not in how:  # a chosen limit is an end
+            check_memory(plan, options.memory_limit, to_its_end=True)
+        with Run.start(plan, **how) as run:
             return run.wait()
 
     @takes(RunOptions)
@@ -566,9 +574,14 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
+        plan, how = self._planned(options)
+        return Run.start(plan, **how)
+
+    def _planned(self, options: RunOptions) -> tuple[RunPlan, dict[str, Any]]:
+        """The plan of a run, and how it is started."""
         given = options.given()
         how = {name: given.pop(name) for name in StartOptions.__struct_fields__ if name in given}
-        return Run.start(self.plan(**given), **how)
+        return self.plan(**given), how
 
     @takes(OpenOptions)
     def open(self, options: OpenOptions) -> System:

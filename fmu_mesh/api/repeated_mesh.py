@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +27,7 @@ from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_nam
 from .plan_options import memory_of
 from .result import Result, types_of
 from .result_reading import Columns
+from .run_thread import check_memory
 
 if TYPE_CHECKING:
     from .mesh_builder import Mesh
@@ -107,6 +109,7 @@ class RepeatedMesh:
         if options.output is None and options.record is None:
             options = replace(options, record="memory")
         plan = self._mesh.plan(**options.given())
+        check_memory(plan, sys.maxsize, to_its_end=True)
         self._rows = rows = _CollectedRows(plan)
         runs = self._runs(plan.mesh)
         try:

@@ -32,7 +32,7 @@ from .compared_rows import Side, compared, differences_of, values_in_unit_of
 from .comparison import Comparison
 from .drawing import thinned
 from .result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
-from .result_reading import Columns, chosen_names, read_result, result_pieces
+from .result_reading import Columns, chosen_names, of_one_instance, read_result, result_pieces
 from .tables import html_table
 
 if TYPE_CHECKING:
@@ -251,8 +251,8 @@ class Result(Mapping[str, NDArray[Any]]):
         results = (self, *others)
         there = [*dict.fromkeys(name for result in results for name in result)]
         chosen = [*chosen_names(self.title, there, names)]
-        for name in (*([x] if x is not None else []), *(name for _, name in annotate)):
-            chosen_names(self.title, there, [name])
+        x = chosen_names(self.title, there, [x])[0] if x is not None else None
+        annotate = {(time, chosen_names(self.title, there, [name])[0]): text for (time, name), text in annotate.items()}
         drawn: list[Curves] = []
         curves: dict[str, Curve] = {}
         for label, result in zip(_titles(results), results, strict=True):
@@ -308,19 +308,25 @@ class Result(Mapping[str, NDArray[Any]]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.
 
+        In a result of one instance, its name may be left out.
+
         Raises:
-            UnknownName: it was not recorded; suggests the nearest name.
+            UnknownName: it was not recorded; suggests the nearest name. Or it means several.
         """
         columns = self._columns.values
-        if name not in columns:
-            try:
-                chosen_names(self.title, list(columns), [name])
-            except ConfigurationError as error:
-                raise UnknownName(error.message, hint=error.hint) from None
-        return columns[name]
+        if name in columns:
+            return columns[name]
+        try:
+            found = chosen_names(self.title, list(columns), [name])
+        except ConfigurationError as error:
+            raise UnknownName(error.message, hint=error.hint) from None
+        if len(found) > 1:
+            raise UnknownName(f"'{name}' means {len(found)} columns of '{self.title}': {listed(found)}")
+        return columns[found[0]]
 
     def __contains__(self, name: object) -> bool:
-        return name in (self._variables or self._head.values)
+        names = self._variables or self._head.values
+        return name in names or ((instance := of_one_instance(names)) is not None and f"{instance}.{name}" in names)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._variables or self._head.values)

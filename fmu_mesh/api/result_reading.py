@@ -6,7 +6,7 @@ import base64
 import csv
 import re
 from codecs import BOM_UTF8
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, cast
@@ -22,7 +22,7 @@ from ..system.recording import Columns, PiecewiseFormat, ReadableFormat, joined,
 from ..text import listed, matching, nearest
 from ..variables.value_types import DTYPES, VariableType, is_float
 
-__all__ = ["Columns", "chosen_names", "read_result", "require_readable", "result_pieces"]
+__all__ = ["Columns", "chosen_names", "of_one_instance", "read_result", "require_readable", "result_pieces"]
 
 _TIME = "time"
 _FLAGS: Final = {"true": True, "false": False}
@@ -220,7 +220,7 @@ def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) 
     """The wanted variables of a result; all of them if none is named.
 
     A name may be that of an array, which means all of its elements, or a pattern: `*` stands for any characters, `?`
-    for one, and `re:` begins a regular expression.
+    for one, and `re:` begins a regular expression. In a result of one instance, it may lack the name of the instance.
 
     Example:
         >>> chosen_names("demo.csv", ["arm.a", "arm.v", "motor.i[1]", "motor.i[2]"], ["motor.i", "arm.?"])
@@ -233,6 +233,8 @@ def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) 
     unknown = []
     for text in wanted:
         own = matching(text, names) or _elements(text, names)
+        if not own and (instance := of_one_instance(names)):
+            own = matching(f"{instance}.{text}", names) or _elements(f"{instance}.{text}", names)
         found.update(dict.fromkeys(own))
         unknown += [text] if not own else []
     if unknown:
@@ -240,6 +242,12 @@ def chosen_names(path: Path | str, names: Sequence[str], wanted: Sequence[str]) 
         hint = f"Did you mean {_either(meant)}?" if meant else f"There are: {listed(names)}."
         raise ConfigurationError(f"'{path}' has no variable {_either(unknown)}.", hint=hint)
     return [*found] or names
+
+
+def of_one_instance(names: Iterable[str]) -> str | None:
+    """The instance that all columns are of; None if there are several."""
+    instances = {name.partition(".")[0] for name in names}
+    return min(instances) if len(instances) == 1 else None
 
 
 def _elements(array: str, names: Sequence[str]) -> list[str]:

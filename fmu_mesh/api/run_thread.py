@@ -30,7 +30,7 @@ from .plan_options import memory_of
 from .result import Result, result_of, types_of
 from .result_reading import Columns
 
-__all__ = ["RunThread"]
+__all__ = ["RunThread", "check_memory"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -70,7 +70,7 @@ class RunThread:
         self._changing = threading.RLock()  # a signal handler may interrupt the handler before it
         self._memory = memory_of(plan)
         if self._memory is not None:
-            _check_memory(plan, settings.memory_limit)
+            check_memory(plan, settings.memory_limit)
             _make_folder(self._memory.parent, plan)
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
@@ -247,8 +247,8 @@ def _make_folder(folder: Path, plan: RunPlan) -> None:
         ) from error
 
 
-def _check_memory(plan: RunPlan, limit: int) -> None:
-    """Check that all rows of a run fit into memory.
+def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None:
+    """Check that all rows of a run fit into memory; one without an end must be stopped, not awaited ``to_its_end``.
 
     Raises:
         CallRefused: they do not.
@@ -258,6 +258,9 @@ def _check_memory(plan: RunPlan, limit: int) -> None:
     size = records[0].rows_before(last + 1) * bytes_of_a_row(list(types.values())) if records else 0
     if last < ENDLESS and size > limit:
         raise _too_large(plan.mesh, limit, size)
+    if last >= ENDLESS and to_its_end and size:
+        text = f"the run of '{plan.mesh}' has no end, and its results would stay in memory"
+        raise CallRefused(text, hint="Give a `stop_time`, or a `memory_limit` at which it ends.")
 
 
 def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:

@@ -8,8 +8,9 @@ from pathlib import Path
 from msgspec.structs import asdict
 
 from ..api.comparison import Comparison
-from ..api.drawing import draw, require_matplotlib
+from ..api.drawing import draw
 from ..api.result import Result
+from ..installing import require
 from .arguments import CommandParser, Parsers, add_json, add_quiet, tolerance
 from .output.json_output import print_json
 
@@ -44,7 +45,7 @@ def _add_compare(parser: CommandParser) -> None:
 
 def _compare(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
-        require_matplotlib()
+        require("matplotlib", "plots")
     first, second = (Result(path.stem, file=path) for path in (arguments.first, arguments.second))
     comparison = first.compare(second, rtol=arguments.rtol, atol=arguments.atol, variables=tuple(arguments.variables))
     if arguments.json:

@@ -1,4 +1,4 @@
-"""`run`: one FMU as a free-running node in real time, without a configuration file.
+"""`run` and `simulate`: one FMU without a configuration file, in real time until it is stopped, or fast to its end.
 
 Owns the configuration of this mesh of one instance; everything else is as for any mesh.
 """
@@ -12,13 +12,15 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from ..api.mesh_builder import Mesh
+from ..api.simulating import SimulateOptions, experiment_of
 from ..config.base import NAME_PATTERN
 from ..errors import CallRefused, ConfigurationError, LoadFailed
+from ..run.options import option_fields
 from .arguments import CommandParser, Parsers, add_json
 from .output.display import teller
 from .output.reports import RunReporter
 from .run_options import add_options, given_options
-from .running import add_output, run_mesh
+from .running import add_output, add_plot, run_mesh
 
 __all__ = ["PARSERS"]
 
@@ -56,6 +58,32 @@ def _add_run(parser: CommandParser) -> None:
     add_output(parser)
     add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
     parser.set_defaults(run_command=_run)
+
+
+def _add_simulate(parser: CommandParser) -> None:
+    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU")
+    flags = [name for name, field in option_fields(SimulateOptions).items() if field.flag]
+    of_fmu = dict.fromkeys(("start_time", "stop_time", "step_size"), "that of the FMU")
+    add_options(parser, *flags, options=SimulateOptions, defaults={**of_fmu, "output": "nothing is written"})
+    add_plot(parser)
+    add_output(parser)
+    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
+    parser.set_defaults(run_command=_simulate)
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    with RunReporter(wanted=arguments.json) as reporter:
+        try:
+            options = SimulateOptions(**given_options(arguments, SimulateOptions))
+            mesh, given = experiment_of(arguments.fmu, options)
+        except (LoadFailed, CallRefused) as error:  # a wrong argument: nothing was going to run
+            raise ConfigurationError(error.message, hint=error.hint) from error
+        how = {"processes": given.pop("processes", True)}
+        try:
+            run_mesh(mesh, given, arguments, reporter, how)
+        except ConfigurationError as error:
+            raise _as_given(error, f"{mesh.name}.") from error
+    return 0
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -103,4 +131,4 @@ def _as_given(error: ConfigurationError, front: str) -> ConfigurationError:
     return ConfigurationError(short(error.message), findings=findings, hint=error.hint)
 
 
-PARSERS: Parsers = {"run": _add_run}
+PARSERS: Parsers = {"run": _add_run, "simulate": _add_simulate}

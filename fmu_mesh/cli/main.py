@@ -28,7 +28,8 @@ __all__ = ["COMMANDS", "command_parser", "main"]
 
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "launch": ("running", "run a mesh: one process per node, and the master"),
-    "run": ("free_running", "run one FMU as a free-running node, without a file"),
+    "simulate": ("free_running", "simulate one FMU to its end, as fast as possible; `run` keeps it live"),
+    "run": ("free_running", "run one FMU live until it is stopped; `simulate` runs it to its end"),
     "sweep": ("sweep", "run a mesh many times with other values, into one table"),
     "new": ("new_mesh", "write a configuration for FMUs, with suggested connections"),
     "check": ("checking", "check a configuration and show its plan, without running it"),
@@ -129,7 +130,7 @@ def _unknown(name: str) -> ConfigurationError:
     suffix = PurePath(name).suffix
     near = nearest(name, COMMANDS)
     if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
-        hint = f"Did you mean `fmu-mesh {'run' if suffix == '.fmu' else 'launch'} {name}`?"
+        hint = f"Did you mean `fmu-mesh {'simulate' if suffix == '.fmu' else 'launch'} {name}`?"
     else:
         hint = f"Did you mean '{near}'?" if near is not None else "`fmu-mesh --help` lists them."
     return ConfigurationError(f"there is no command '{name}'.", hint=hint)

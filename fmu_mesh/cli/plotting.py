@@ -8,10 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..api.drawing import draw, require_matplotlib
+from ..api.drawing import draw
+from ..api.plan_options import memory_of
 from ..api.result import Result
 from ..api.result_reading import require_readable
 from ..errors import ConfigurationError, FmuMeshError
+from ..installing import require
+from ..run.run_plan import RunPlan
 from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_result import SweepResult
 from ..system.plan import Plan
@@ -57,7 +60,7 @@ def _add_plot(parser: CommandParser) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    require_matplotlib()
+    require("matplotlib", "plots")
     first, *others = arguments.results
     sweeps = [str(path) for path in arguments.results if is_sweep(path)]
     of_curves = arguments.x or arguments.difference or arguments.title
@@ -117,34 +120,37 @@ def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure
     return sweep.plot(variables[0], colour=arguments.colour), variables[0]
 
 
-def check_plot(plot: Path, result: str | None) -> None:
+def check_plot(plot: Path, plan: RunPlan) -> None:
     """Check before a run that its result can be plotted at its end.
 
     Args:
         plot: the file of the picture.
-        result: the result file, or None if nothing is recorded.
+        plan: the plan of the run.
 
     Raises:
         ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
     """
-    require_matplotlib()
+    require("matplotlib", "plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
     formats = FigureCanvasAgg.get_supported_filetypes()
     if plot.suffix.removeprefix(".").lower() not in formats:
         raise ConfigurationError(f"a plot cannot be written as '{plot}'.", hint="Name it .png, .svg or .pdf.")
-    if result is None:
+    if (result := plan.plan.system.result_file) is None:
         raise ConfigurationError("nothing is recorded, so there is nothing to plot.", hint="Name a file with --output.")
-    require_readable(Path(result))
+    if memory_of(plan) is None:
+        require_readable(Path(result))
 
 
-def plot_results(result: Path, plot: Path, plan: Plan) -> None:
-    """Draw the result file of a run, with one axes for each unit of its plan.
+def plot_results(result: Path | Result, plot: Path, plan: Plan) -> None:
+    """Draw the result of a run, or its file, with one axes for each unit of its plan.
 
     Raises:
         ConfigurationError: the result cannot be read, or the plot cannot be written.
     """
-    draw(Result(plan.system.config.mesh, file=result, system=plan.system).plot(), plot)
+    if isinstance(result, Path):
+        result = Result(plan.system.config.mesh, file=result, system=plan.system)
+    draw(result.plot(), plot)
     print(f"plot: {plot}")
 
 
@@ -155,9 +161,11 @@ def plotted_where_it_ends(plan: Plan, plot: Path | None) -> Iterator[None]:
     before = _state_of(result)
     try:
         yield
-    except FmuMeshError:
+    except FmuMeshError as error:
         if plot is not None and result is not None and _state_of(result) != before:
             plot_results(Path(result), plot, plan)
+        elif plot is not None and isinstance(error.result, Result) and len(error.result.times):  # it is in memory
+            plot_results(error.result, plot, plan)
         raise
 
 

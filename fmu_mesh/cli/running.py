@@ -14,11 +14,11 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from ..api.mesh_builder import Mesh
+from ..api.result import Result, result_of
 from ..api.run_handle import Run
 from ..errors import ConfigurationError
 from ..run.events import Event, Reachable
 from ..run.gateway_role import run_gateway
-from ..run.outcome import Outcome
 from ..run.process import ended_by_signals
 from ..run.roles import run_master, run_node
 from ..run.run_plan import RunPlan
@@ -34,14 +34,14 @@ from .run_options import add_configuration, add_options, given_options, mesh_of
 if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
-__all__ = ["PARSERS", "add_output", "interrupted_by_signals", "run_mesh", "show_event"]
+__all__ = ["PARSERS", "add_output", "add_plot", "interrupted_by_signals", "run_mesh", "show_event"]
 
 
 def _add_launch(parser: CommandParser) -> None:
     add_configuration(parser)
     add_options(parser, "paused", "view", "video", "profile")
     add_options(parser, "processes", "restarts")
-    _add_plot(parser)
+    add_plot(parser)
     add_output(parser)
     add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
     parser.set_defaults(run_command=_launch)
@@ -57,7 +57,7 @@ def _add_node(parser: CommandParser) -> None:
 def _add_master(parser: CommandParser) -> None:
     add_configuration(parser)
     add_options(parser, "paused", "profile")
-    _add_plot(parser)
+    add_plot(parser)
     add_output(parser)
     parser.set_defaults(run_command=_master)
 
@@ -80,7 +80,8 @@ def _add_router(parser: CommandParser) -> None:
     parser.set_defaults(run_command=_router)
 
 
-def _add_plot(parser: CommandParser) -> None:
+def add_plot(parser: CommandParser) -> None:
+    """Add the flag for a picture of the result."""
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
 
 
@@ -129,9 +130,8 @@ def run_mesh(
         how["on_event"] = partial(show_event, reporter, display)
         run = Run.start(plan, **how)
         runs.append(run)
-        outcome = run.wait().outcome
-    assert outcome is not None  # it has run
-    _finish(plan.plan, outcome, arguments)
+        result = run.wait()
+    _finish(plan.plan, result, arguments)
 
 
 def show_event(reporter: RunReporter, display: Display, event: Event) -> None:
@@ -146,7 +146,7 @@ def _planned(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace)
     if not arguments.quiet:
         warn(plan.plan)
     if getattr(arguments, "plot", None) is not None:
-        check_plot(arguments.plot, plan.plan.system.result_file)
+        check_plot(arguments.plot, plan)
     return plan
 
 
@@ -168,16 +168,17 @@ def interrupted_by_signals() -> Iterator[list[Run | Sweep]]:
             signal.signal(number, handler)
 
 
-def _finish(plan: Plan, outcome: Outcome, arguments: argparse.Namespace) -> None:
+def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
     """Show what the options of the command ask for, and print the summary."""
+    outcome = result.outcome
+    assert outcome is not None  # it has run
     if outcome.profile is not None:
         file = arguments.profile if isinstance(arguments.profile, Path) else None
         show_profile(plan, outcome.profile, outcome.seconds, file)
     if (video := getattr(arguments, "video", None)) is not None:
         print(f"video: {video}")
-    plot = getattr(arguments, "plot", None)
-    if plot is not None and outcome.file is not None:
-        plot_results(Path(outcome.file), plot, plan)
+    if (plot := getattr(arguments, "plot", None)) is not None:
+        plot_results(result, plot, plan)
     for line in summary(plan, outcome):
         print(line)
 
@@ -196,7 +197,7 @@ def _master(arguments: argparse.Namespace) -> int:
         ) as display,
     ):
         outcome = run_master(plan, display.event)
-    _finish(plan.plan, outcome, arguments)
+    _finish(plan.plan, result_of(plan, outcome), arguments)
     return 0
 
 

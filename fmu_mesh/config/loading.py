@@ -243,7 +243,10 @@ def _text(path: Path, findings: Findings) -> str:
         line = data.count(b"\n", 0, error.start) + 1
         found = f"the byte 0x{data[error.start]:02x} in line {line}", "text in UTF-8"
         if data.startswith(_ARCHIVE):
-            found = "an archive, as FMUs are", f"a configuration file; `fmu-mesh run {path}` runs one FMU"
+            found = (
+                "an archive, as FMUs are",
+                f"a configuration file; `fmu-mesh simulate {path}` (`fmu_mesh.simulate`) simulates one FMU",
+            )
         findings.add("", *found)
         return ""
 

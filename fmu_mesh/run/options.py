@@ -150,7 +150,7 @@ class CallOptions(msgspec.Struct, frozen=True, kw_only=True):
     def given(self) -> dict[str, Any]:
         """The options that have another value than their default."""
         fields = option_fields(type(self))
-        return {name: value for name in fields if (value := getattr(self, name)) != fields[name].parameter.default}
+        return {name: value for name in fields if (value := getattr(self, name)) is not fields[name].parameter.default}
 
 
 class VariantOptions(CallOptions, frozen=True, kw_only=True):

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.simulating import SimulateOptions
 from fmu_mesh.run.options import CallOptions, OpenOptions, PlanOptions, RunOptions, option_fields
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
-from tests.helpers import write_config
+from tests.helpers import FMUS, write_config
 
 RIGHT: Mapping[str, Any] = {
     "algorithm": "jacobi",
@@ -70,6 +71,7 @@ class Call(NamedTuple):
     options: type[CallOptions]
     call: Callable[..., object]
     base: Mapping[str, Any]
+    right: Mapping[str, Any] = RIGHT
 
 
 def started(mesh: fmu_mesh.Mesh, **options: Any) -> None:  # noqa: ANN401 what is tested
@@ -85,31 +87,45 @@ def swept(mesh: fmu_mesh.Mesh, **options: Any) -> None:  # noqa: ANN401 what is 
     fmu_mesh.sweep(mesh, vary, **{"executor": Nowhere(), **options}).close()
 
 
+def simulated(_: fmu_mesh.Mesh, **options: Any) -> None:  # noqa: ANN401 what is tested
+    fmu_mesh.simulate(FMUS / "Gain.fmu", **options)
+
+
+OF_ONE_FMU = {
+    "start_time": 0.0,
+    "output_interval": 0.004,
+    "kind": "co_simulation",
+    "tolerance": 1e-6,
+    "solver": {},
+    "start_values": {"k": 2.0},
+    "inputs": {"u": 1.0},
+    "record": ["y"],
+}
 SHORT = {"stop_time": 0.004, "processes": False}
 CALLS = {
     "check": Call(PlanOptions, lambda mesh, **options: mesh.check(**options).require(), {}),
     "run": Call(RunOptions, fmu_mesh.Mesh.run, SHORT),
     "start": Call(RunOptions, started, SHORT),
     "open": Call(OpenOptions, opened, {}),
+    "simulate": Call(SimulateOptions, simulated, {**SHORT, "step_size": 0.002}, {**RIGHT, **OF_ONE_FMU}),
     "sweep": Call(SweepOptions, swept, {"stop_time": 0.004}),
 }
 WAYS: Mapping[str, Callable[[str], Any]] = {
-    "right": lambda name: RIGHT[name],
     "numpy": lambda _: np.float64(0.5),
     "text": lambda _: "x",
     "None": lambda _: None,
     "list": lambda _: [1],
 }
-CASES = [(call, option) for call, (options, _, _) in CALLS.items() for option in option_fields(options)]
+CASES = [(call, option) for call, own in CALLS.items() for option in option_fields(own.options)]
 NOT_TRIED = {("executor", "right"), ("executor", "None")}
 """The executor is always given, and None starts processes."""
 
 
 @pytest.mark.parametrize(("call", "option"), CASES)
 def test_an_option_works_or_is_named(call: str, option: str, folder: Path) -> None:
-    mesh, (_, make, base) = fmu_mesh.load(write_config(folder, stop_time=0.01)), CALLS[call]
+    mesh, (_, make, base, right) = fmu_mesh.load(write_config(folder, stop_time=0.01)), CALLS[call]
 
-    for way, value_of in WAYS.items():
+    for way, value_of in {"right": right.__getitem__, **WAYS}.items():
         if (option, way) in NOT_TRIED:
             continue
         refused = None

@@ -1,4 +1,4 @@
-"""Five complete programs, as a user writes them, each as a process of its own."""
+"""Six complete programs, as a user writes them, each as a process of its own."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ def run(place: Place, program: str) -> Launched:
     assert not done.errors
     place.assert_nothing_left(10.0)
     return done
+
+
+def test_one_fmu_is_simulated_in_one_call_that_writes_nothing(clone: Place) -> None:
+    assert run(clone, "one_call").output == "1.3 10.0\n"
+    assert {path.name for path in clone.folder.iterdir()} == {"configs", "fmus", "one_call.py", "run", "tmp"}
 
 
 def test_a_file_is_run_and_its_results_are_arrays(clone: Place) -> None:

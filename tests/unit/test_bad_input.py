@@ -386,8 +386,11 @@ def test_a_wrong_option_is_told_as_it_was_written(
     [
         (["lunch", "mesh.yaml"], "there is no command 'lunch'. Did you mean 'launch'?"),
         (["mesh.yaml"], "Did you mean `fmu-mesh launch mesh.yaml`?"),
-        (["Gain.fmu"], "Did you mean `fmu-mesh run Gain.fmu`?"),
-        (["launch", "Gain.fmu"], "expected a configuration file; `fmu-mesh run Gain.fmu` runs one FMU"),
+        (["Gain.fmu"], "Did you mean `fmu-mesh simulate Gain.fmu`?"),
+        (
+            ["launch", "Gain.fmu"],
+            "expected a configuration file; `fmu-mesh simulate Gain.fmu` (`fmu_mesh.simulate`) simulates one FMU",
+        ),
         (["run", "mesh.yaml"], "A configuration is run by `fmu-mesh launch mesh.yaml`."),
         (["inspect", "mesh.yaml"], "A configuration is run by `fmu-mesh launch mesh.yaml`."),
         (["run", "Gian.fmu"], "'Gian.fmu' does not exist. Did you mean 'Gain.fmu'?"),

@@ -11,18 +11,21 @@ __all__ = ["in_flags"]
 _FLAGS = {name: field.flag for name, field in option_fields(RunOptions).items() if field.flag} | {
     name: f"--{name.replace('_', '-')}"
     for name in (
-        "folder",
-        "force",
-        "max_instances",
-        "port",
-        "resume",
-        "ssd",
-        "ssv",
-        "start",
-        "timeout",
-        "vary",
-        "version",
-        "workers",
+        *(
+            "folder",
+            "force",
+            "max_instances",
+            "port",
+            "resume",
+            "ssd",
+            "ssv",
+            "start",
+            "timeout",
+            "vary",
+            "version",
+            "workers",
+        ),
+        *("inputs", "kind", "output_interval", "record", "start_time", "tolerance"),  # of `simulate`
     )
 }
 _OPTION = re.compile(r"`(\w+)(?:=([^`]*))?`")

@@ -11,7 +11,9 @@ from types import TracebackType
 from typing import Literal, Self
 
 import msgspec
+from msgspec.structs import replace
 
+from ...api.plan_options import memory_of
 from ...errors import ErrorReport, FmuMeshError
 from ...run.events import Event, Restarted
 from ...run.outcome import Outcome
@@ -108,6 +110,8 @@ class RunReporter:
         if isinstance(error, FmuMeshError) and error.result is not None:  # it knows more than the master
             outcome = error.result.outcome
         outcome = outcome or Outcome("failed", 0, 0.0, 0.0, 0, None)
+        if self._run is not None and memory_of(self._run) is not None:  # and gone by now
+            outcome = replace(outcome, file=None, files=())
         return RunReport(
             mesh=self._run.mesh if self._run is not None else None,
             state="failed" if failure is not None else outcome.state,
