@@ -346,7 +346,8 @@ def _output_layouts(system: ResolvedSystem, connections: Iterable[Connection]) -
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
     stepped = [c for c in plan.connections if c.target_instance == instance.name and not c.initial_only]
     initial = [c for c in plan.connections if c.target_instance == instance.name and c.initial_only]
-    connected, parameters = {c.target.name for c in stepped}, {c.target.name for c in initial}
+    connected = {c.target.name for c in stepped}
+    initialized = connected | {c.target.name for c in initial}
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
     given = {variable.name for variable in instance.description.with_causality("output")}
@@ -368,7 +369,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         scenario=instance.scenario,
         row=row_of(instance.description, instance.scenario, connected),
         parameters=feeds_of(initial),
-        initial_inputs=Layout.of(v for v in instance.description.variables if v.name in connected | parameters),
+        initial_inputs=Layout.of(v for v in instance.description.variables if v.name in initialized),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),
         finite=tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
         if instance.not_finite == "stop"

@@ -33,8 +33,8 @@ def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
         findings: where the warnings go.
     """
     declared, assumed = _edges(plan.connections) if plan.cycles else ({}, {})
-    for loop in _loops(declared):
-        walk, more = _walk(loop, declared)
+    for loop, inside in _loops(declared):
+        walk, more = _walk(loop, inside)
         found = (
             f"a loop at every point: {listed([*map(str, walk)])}{more}. Each of these outputs depends directly on the "
             f"input before it. The delay of 1 at {listed([str(c) for c in walk if c.delay])} makes this a fixed-point "
@@ -42,7 +42,7 @@ def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
         )
         findings.add(walk[0].path, found, "")
     both = declared | assumed
-    members = {one for loop in _loops(both) for one in loop}
+    members = {one for loop, _ in _loops(both) for one in loop}
     silent = [end for start, end in assumed if start[1] == "any input" and end in members]
     if silent:
         walk, _ = _walk([silent[0], *members], both)
@@ -81,10 +81,15 @@ def _any_input(instance: str) -> Vertex:
     return instance, "any input", ""
 
 
-def _loops(edges: Edges) -> list[list[Vertex]]:
-    """The strongly connected components with a cycle: no vertex has an edge to itself."""
+def _loops(edges: Edges) -> list[tuple[list[Vertex], Edges]]:
+    """The strongly connected components with a cycle, and their edges: no vertex has an edge to itself."""
     vertices = dict.fromkeys(vertex for ends in edges for vertex in ends)
-    return [part for part in strongly_connected(vertices, edges) if len(part) > 1]
+    loops: list[tuple[list[Vertex], Edges]] = [(p, {}) for p in strongly_connected(vertices, edges) if len(p) > 1]
+    of = {vertex: inside for loop, inside in loops for vertex in loop}
+    for (start, end), connection in edges.items():
+        if start in of and of[start] is of.get(end):
+            of[start][start, end] = connection
+    return loops
 
 
 def _walk(loop: Sequence[Vertex], edges: Edges) -> tuple[list[Connection], str]:
@@ -92,6 +97,5 @@ def _walk(loop: Sequence[Vertex], edges: Edges) -> tuple[list[Connection], str]:
     vertices = cycle_through(loop, edges)
     walk = [c for ends in pairwise(vertices) if (c := edges[ends]) is not None]
     last = max(place for place, c in enumerate(walk, 1) if c.delay)
-    members = {*loop}
-    more = sum(c is not None and members.issuperset(ends) for ends, c in edges.items()) - len(walk)
+    more = sum(c is not None for c in edges.values()) - len(walk)
     return walk[last:] + walk[:last], f" and {more} more connections between them" if more else ""

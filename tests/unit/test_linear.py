@@ -18,6 +18,7 @@ from fmu_mesh.instances.configuration import parse
 from fmu_mesh.system.connections import Variables, resolve_connections
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import make_plan
+from fmu_mesh.system.point_loops import warn_of_point_loops
 from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 
@@ -49,7 +50,16 @@ def description(width: int) -> ModelDescription:
     variables = chain.from_iterable(
         (
             Variable(f"u{n}", n, "Float64", "input", "continuous", start=0.0),
-            Variable(f"y{n}", n, "Float64", "output", "continuous", "calculated", dependencies=(f"u{n}",)),
+            Variable(
+                f"y{n}",
+                n,
+                "Float64",
+                "output",
+                "continuous",
+                "calculated",
+                dependencies=(f"u{n}",),
+                feedthrough=(f"u{n}",),
+            ),
         )
         for n in range(width)
     )
@@ -73,7 +83,13 @@ def test_a_plan_takes_as_many_times_the_work_as_there_are_connections(system: st
             FILE,
         )
         descriptions = dict.fromkeys("abc", description(width))
-        return lambda: plan_page(make_plan(build(loaded, descriptions)))
+
+        def plan_and_warn() -> None:
+            plan = make_plan(build(loaded, descriptions))
+            warn_of_point_loops(plan, loaded.findings())
+            plan_page(plan)
+
+        return plan_and_warn
 
     few, many = lines_run(planning(FEW)), lines_run(planning(MANY))
 
