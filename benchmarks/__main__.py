@@ -6,11 +6,13 @@ import argparse
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.environment import ROOT, Peers, loads, machine
-from benchmarks.jobs import JOBS, with_checkout
-from benchmarks.report import Report, write_docs
+from benchmarks.environment import Peers
+from benchmarks.jobs import JOBS, Job, with_checkout
+from benchmarks.publishing import Figures, add_write_docs, publish
+from benchmarks.report import Report
 from benchmarks.running import Bench
 
 _QUICK_BUDGET_S = 285.0
@@ -29,9 +31,8 @@ def main() -> int:
         "--against", type=Path, metavar="FOLDER", help="also run fmu_mesh of another checkout, which has a .venv"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the measurements to this file")
-    parser.add_argument("--write-docs", action="store_true", help="put the tables into docs/performance.md")
+    add_write_docs(parser)
     options = parser.parse_args()
-    repeat = options.repeat or (2 if options.quick else 5)
     if options.write_docs and (options.only or options.jobs != names):
         parser.error("--write-docs needs all jobs and all contestants")
     if options.against is not None and not (options.against / ".venv" / "bin" / "python").exists():
@@ -42,30 +43,26 @@ def main() -> int:
     jobs = [job for job in JOBS if job.name in options.jobs]
     if options.against is not None:
         jobs = with_checkout(jobs, options.against)
-    before, began = loads(), time.monotonic()
+    return publish("jobs", lambda: _measured(jobs, peers, options), write=options.write_docs)
+
+
+def _measured(jobs: Sequence[Job], peers: Peers, options: argparse.Namespace) -> Figures:
+    """The tables of all jobs; our own results that are not the reference's are problems."""
+    began, repeat = time.monotonic(), options.repeat or (2 if options.quick else 5)
     with (
         tempfile.TemporaryDirectory(prefix="bench-") as folder,
         Bench(jobs, peers, Path(folder), quick=options.quick, only=options.only or "") as bench,
     ):
         rounds = bench.run(repeat, _QUICK_BUDGET_S if options.quick else _FULL_BUDGET_S)
     versions = ", ".join(f"{name} {number}" for name, number in sorted(bench.versions.items()))
-    report = Report(
-        jobs,
-        bench.results,
-        [
-            f"{'quick run, ' if options.quick else ''}median of {rounds} interleaved rounds; {machine()}",
-            f"{(time.monotonic() - began) / 60:.0f} minutes; load average before {before}, after {loads()}",
-            f"versions: {versions}",
-        ],
-    )
-    print(f"\n{report.text()}")
+    report = Report(jobs, bench.results, [f"Versions: {versions}."])
     if options.json is not None:
         options.json.write_text(report.json() + "\n")
-    if options.write_docs:
-        write_docs(ROOT / "docs" / "performance.md", report)
-    for broken in bench.broken:
-        print(f"error: {broken}", file=sys.stderr)
-    return 1 if bench.broken else 0
+    minutes = (time.monotonic() - began) / 60
+    about = (
+        f"{'Quick run, medians' if options.quick else 'Medians'} of {rounds} interleaved rounds, {minutes:.0f} minutes"
+    )
+    return Figures(about, report.markdown(), report.text(), bench.broken)
 
 
 if __name__ == "__main__":

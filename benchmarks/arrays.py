@@ -15,13 +15,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import fmu_mesh
-from benchmarks.environment import loads, machine
 from benchmarks.models.fields import SIZES, numpy_alone
+from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 
 __all__ = ["configuration", "main"]
 
@@ -34,7 +34,7 @@ _WAYS: dict[str, tuple[str, ...]] = {
 _STEP_SIZE_S = 0.03125
 _MOST_POINTS = 20_000
 _DEADLINE_S = 600
-_HEADER = "| numbers | way | points | us per point | ratio |"
+_HEADER = ("way", "numbers", "points", "us per point", "ratio")
 
 
 def configuration(size: int, points: int) -> dict[str, Any]:
@@ -84,28 +84,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sizes", nargs="+", type=int, choices=SIZES, default=SIZES, metavar="N", help=f"{SIZES}")
     parser.add_argument("--megabytes", type=int, default=4000, metavar="N", help="what a run moves (4000)")
     parser.add_argument("--repeat", type=int, default=5, metavar="N", help="interleaved rounds (5)")
+    add_write_docs(parser)
     options = parser.parse_args(arguments)
     points = {size: min(_MOST_POINTS, max(10, options.megabytes * 1_000_000 // (8 * size))) for size in options.sizes}
+    return publish("arrays", lambda: _all(points, options.repeat), write=options.write_docs)
+
+
+def _all(points: Mapping[int, int], rounds: int) -> Figures:
+    """Medians of every way; ``points`` by the size of the field."""
     figures: dict[tuple[int, str], list[float]] = {}
-    before = loads()
+    problems: dict[str, None] = {}
     with tempfile.TemporaryDirectory(prefix="arrays-") as folder:
-        for _, size in itertools.product(range(options.repeat), options.sizes):
+        for _, size in itertools.product(range(rounds), points):
             expected: list[float] = []
             for way in (_PEER, *_WAYS):
                 cost, sums = _measured(way, size, points[size], Path(folder))
                 figures.setdefault((size, way), []).append(cost)
                 if sums != (expected := expected or sums):
-                    print(f"error: {way} has other sums than numpy alone", file=sys.stderr)
-                    return 1
-    print(
-        f"Median of {options.repeat} interleaved rounds; {machine()}; load average before {before}, after {loads()}\n"
-    )
-    print(_HEADER)
-    print("|---:|---|" + "---:|" * (_HEADER.count("|") - 3))
+                    problems[f"{way} has other sums than numpy alone for {size} numbers"] = None
+    rows = []
     for (size, way), costs in figures.items():
         cost, least = statistics.median(costs), statistics.median(figures[size, _PEER])
-        print(f"| {size:,} | {way} | {points[size]:,} | {cost:,.1f} | {cost / least:.2f} |")
-    return 0
+        rows.append((way, f"{size:,}", f"{points[size]:,}", f"{cost:,.1f}", f"{cost / least:.2f}"))
+    return Figures(f"Medians of {rounds} interleaved rounds", markdown_table(_HEADER, rows), problems=[*problems])
 
 
 if __name__ == "__main__":

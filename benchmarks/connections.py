@@ -9,17 +9,19 @@ from __future__ import annotations
 import json
 import statistics
 import sys
+import tempfile
 import time
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.contestants.entry import FMUS
+from benchmarks.publishing import Figures, markdown_table
 from fmu_mesh.run.preparing import prepare
 
 __all__ = ["measured"]
 
-_HEADER = "| connections | inputs and outputs of each FMU | to a plan, s | us per connection | ratio |"
+_HEADER = ("connections", "inputs and outputs of each FMU", "to a plan, s", "us per connection", "ratio")
 _DECLARED = (
     '<ScalarVariable name="u{0}" valueReference="0" causality="input"><Real start="0"/></ScalarVariable>'
     '<ScalarVariable name="y{0}" valueReference="1" causality="output" initial="calculated"><Real/></ScalarVariable>'
@@ -39,22 +41,28 @@ class Width:
         return 1e6 * statistics.median(self.seconds) / self.connections
 
 
-def measured(rounds: int, folder: Path) -> str:
-    """The table, of medians of interleaved rounds; ``folder`` is for files."""
+def measured(rounds: int) -> Figures:
+    """The table, of medians of interleaved rounds."""
     widths = [Width(2_000), Width(20_000)]
-    files = [_written(width.connections // 2, folder) for width in widths]
-    for number in range(rounds):
-        for width, file in zip(widths, files, strict=True):
-            print(f"round {number + 1}: {width.connections} connections", file=sys.stderr)
-            started = time.perf_counter()
-            prepare(file)
-            width.seconds.append(time.perf_counter() - started)
+    with tempfile.TemporaryDirectory(prefix="connections-") as folder:
+        files = [_written(width.connections // 2, Path(folder)) for width in widths]
+        for number in range(rounds):
+            for width, file in zip(widths, files, strict=True):
+                print(f"round {number + 1}: {width.connections} connections", file=sys.stderr)
+                started = time.perf_counter()
+                prepare(file)
+                width.seconds.append(time.perf_counter() - started)
     rows = [
-        f"| {width.connections:,} | {width.connections // 2:,} | {statistics.median(width.seconds):.2f} "
-        f"| {width.each_us:.0f} | {width.each_us / widths[0].each_us:.2f} |"
+        (
+            f"{width.connections:,}",
+            f"{width.connections // 2:,}",
+            f"{statistics.median(width.seconds):.2f}",
+            f"{width.each_us:.0f}",
+            f"{width.each_us / widths[0].each_us:.2f}",
+        )
         for width in widths
     ]
-    return "\n".join([_HEADER, "|" + "---:|" * (_HEADER.count("|") - 1), *rows])
+    return Figures(f"Medians of {rounds} interleaved rounds", markdown_table(_HEADER, rows, texts=0))
 
 
 def _written(count: int, folder: Path) -> Path:

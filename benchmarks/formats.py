@@ -1,18 +1,19 @@
 """Result formats with a large table: size, time to write, memory, and the time to open one column and all of it.
 
-python -m benchmarks.formats                                       1,000 variables, 1,000,000 points; takes an hour
-python -m benchmarks.formats --variables 100 --points 100000       a small one
+python -m benchmarks.formats                                       1,000 variables, 100,000 points
+python -m benchmarks.formats --points 1000000                      a large one; takes an hour
 python -m benchmarks.formats --formats csv parquet --cpu 1         only these, on one processor
 
 Every number is measured in a process of its own, which may take nine tenths of the memory that is free. Only the calls
-of the writer count, not the making of the values. HDF5 is not a format of fmu_mesh; it is written with h5py, one
-dataset per variable in chunks of 16384 values. An MCAP has a message for each value, so it gets fewer points; its line
-says how many, and is not scaled.
+of the writer count, not the making of the values. HDF5 is not a format of fmu_mesh; it is written with h5py, which
+has to be installed, one dataset per variable in chunks of 16384 values. An MCAP has a message for each value, so it
+gets fewer points; its row says how many, and is not scaled.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import resource
@@ -27,7 +28,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.environment import ROOT, loads, machine
+from benchmarks.environment import ROOT
+from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 
 _BLOCK: Final = 4096
 """Rows of one call: as many as the recorder writes at once."""
@@ -44,7 +46,18 @@ _FORMATS: Final = {
     "hdf5-lzf": ".h5",
     "hdf5-gzip": ".h5",
 }
-_READS: Final = ("pandas, one column", "pandas, all", "xarray, one column", "xarray, all")
+_READS: Final = ("pandas, one column", "pandas, all")
+_HEADER: Final = (
+    "format",
+    "points",
+    "size",
+    "bytes per value",
+    "write",
+    "million values/s",
+    "of it the end",
+    "memory",
+    *_READS,
+)
 
 
 class _Writer(Protocol):
@@ -138,8 +151,6 @@ def _write(format_: str, path: Path, variables: int, points: int) -> dict[str, f
 def _read(format_: str, path: Path, what: str) -> dict[str, float]:
     import pandas as pd  # noqa: PLC0415  only here
 
-    if what.startswith("xarray"):
-        import xarray as xr  # noqa: F401, PLC0415  imported before the clock starts
     import fmu_mesh  # noqa: PLC0415  only here
 
     one = what.endswith("one column")
@@ -151,9 +162,7 @@ def _read(format_: str, path: Path, what: str) -> dict[str, float]:
     before = _peak_mb()
     begin = time.perf_counter()
     frame = frame_of[format_]() if format_ in frame_of else _frame_of_hdf5(path, one=one)
-    if what.startswith("xarray"):
-        frame = frame.set_index("time").to_xarray()
-        assert "model.y1" in frame
+    assert "model.y1" in frame
     return {"seconds": time.perf_counter() - begin, "memory": _peak_mb() - before}
 
 
@@ -190,7 +199,7 @@ def _child(what: str, format_: str, path: str, variables: str, points: str) -> d
     return _read(format_, Path(path), what)
 
 
-def _line(format_: str, folder: Path, variables: int, points: int) -> str:
+def _row(format_: str, folder: Path, variables: int, points: int) -> tuple[str, ...]:
     points = min(points, _MCAP_VALUES // variables) if format_ == "mcap" else points
     path = folder / f"table{_FORMATS[format_]}"
     arguments = (format_, str(path), str(variables), str(points))
@@ -200,8 +209,9 @@ def _line(format_: str, folder: Path, variables: int, points: int) -> str:
     for file in folder.iterdir():
         file.unlink()
     values = variables * points
-    cells = [
-        f"{format_} ({points} points)" if format_ == "mcap" else format_,
+    return (
+        format_,
+        f"{points:,}",
         f"{written['size'] / 1e6:.0f} MB",
         f"{written['size'] / values:.2f}",
         f"{written['write']:.1f} s",
@@ -209,34 +219,41 @@ def _line(format_: str, folder: Path, variables: int, points: int) -> str:
         f"{written['end']:.2f} s",
         f"{written['memory']:.0f} MB",
         *(f"{read['seconds']:.2f} s, {read['memory']:.0f} MB" if read else "out of memory" for read in reads),
-    ]
-    return f"| {' | '.join(cells)} |"
+    )
 
 
-def main() -> None:
+def main() -> int:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variables", type=int, default=1000)
-    parser.add_argument("--points", type=int, default=1_000_000)
+    parser.add_argument("--points", type=int, default=100_000)
     parser.add_argument("--formats", nargs="+", choices=_FORMATS, default=[*_FORMATS])
     parser.add_argument("--folder", type=Path, help="where the files go; default: a temporary folder")
     parser.add_argument("--cpu", type=int, help="run on this processor only")
     parser.add_argument("--child", nargs=5, help=argparse.SUPPRESS)
+    add_write_docs(parser)
     options = parser.parse_args()
     if options.child is not None:
         print(json.dumps(_child(*options.child)))
-        return
+        return 0
     if options.cpu is not None:
         os.sched_setaffinity(0, {options.cpu})
-    print(machine(), f"{options.variables} variables, {options.points} points", sep="\n")
-    print(f"load before: {loads()}")
-    heads = ["format", "size", "bytes per value", "write", "million values/s", "of it the end", "memory", *_READS]
-    print(f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}", sep="\n", flush=True)
+    return publish("formats", lambda: _measured(options), write=options.write_docs)
+
+
+def _measured(options: argparse.Namespace) -> Figures:
+    """The table of all formats that can be written here."""
+    problems = []
+    if any(name.startswith("hdf5") for name in options.formats) and importlib.util.find_spec("h5py") is None:
+        problems.append("h5py is not installed; without HDF5: --formats csv parquet mcap")
+        options.formats = [name for name in options.formats if not name.startswith("hdf5")]
+    rows = []
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        for format_ in options.formats:
-            print(_line(format_, Path(folder), options.variables, options.points), flush=True)
-    print(f"load after: {loads()}")
+        for name in options.formats:
+            print(f"writing and reading {name}", file=sys.stderr)
+            rows.append(_row(name, Path(folder), options.variables, options.points))
+    return Figures(f"{options.variables:,} variables, one round", markdown_table(_HEADER, rows), problems=problems)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.environment import machine
+from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 
 _WITH_NAMES = "import fmu_mesh; [getattr(fmu_mesh, name) for name in fmu_mesh.__all__]"
 _COMMAND = str(Path(sys.executable).with_name("fmu-mesh"))
@@ -28,11 +28,17 @@ PROGRAMS = {
 BASE = 'python -c "import msgspec"'
 
 
-def main() -> None:
+def main() -> int:
     """Measure, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.imports", description=__doc__)
     parser.add_argument("--rounds", type=int, default=21, help="how often each program is started (21)")
-    rounds = max(1, parser.parse_args().rounds)
+    add_write_docs(parser)
+    options = parser.parse_args()
+    return publish("imports", lambda: _measured(max(1, options.rounds)), write=options.write_docs)
+
+
+def _measured(rounds: int) -> Figures:
+    """The table of all programs."""
     seconds: dict[str, list[float]] = {name: [] for name in PROGRAMS}
     for name, command in PROGRAMS.items():
         _time_of(command)  # the files are in the cache from here on
@@ -40,12 +46,9 @@ def main() -> None:
     for _ in range(rounds):
         for name, command in PROGRAMS.items():
             seconds[name].append(_time_of(command))
-    base = statistics.median(seconds[BASE])
-    print(machine())
-    print("| program | ms | times as long |\n|---|---|---|")
-    for name, measured in seconds.items():
-        median = statistics.median(measured)
-        print(f"| `{name}` | {median * 1e3:.0f} | {median / base:.2f} |")
+    medians = {name: statistics.median(measured) for name, measured in seconds.items()}
+    rows = [(f"`{name}`", f"{median * 1e3:.0f}", f"{median / medians[BASE]:.2f}") for name, median in medians.items()]
+    return Figures(f"Medians of {rounds} interleaved rounds", markdown_table(("program", "ms", "times as long"), rows))
 
 
 def _time_of(command: list[str]) -> float:
@@ -56,4 +59,4 @@ def _time_of(command: list[str]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -6,16 +6,13 @@ import dataclasses
 import json
 import statistics
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from benchmarks.jobs import OTHER, Entry, Job
 from benchmarks.running import Measured
 from benchmarks.targets import TARGETS, Target
 
-__all__ = ["Report", "replace_between", "write_docs"]
+__all__ = ["Report"]
 
-_BEGIN = "<!-- measured: begin (written by `python -m benchmarks --write-docs`) -->"
-_END = "<!-- measured: end -->"
 _STEPS = ("contestant", "points", "points/s", "us/point", "spread", "ratio", "values")
 _COMMANDS = ("contestant", "s", "spread", "ratio", "values")
 _WATCHED = (
@@ -69,7 +66,7 @@ class Report:
 
     def markdown(self) -> str:
         """For the documentation."""
-        lines = [f"* {line}" for line in self._about]
+        lines = [*self._about]
         for title, (header, *rows) in self._tables():
             lines += ["", f"### {title[0].upper()}{title[1:]}", ""]
             lines += [_markdown_row(header), _markdown_row(["---", *["---:"] * (len(header) - 2), "---"])]
@@ -157,29 +154,6 @@ class Report:
         base = entry.label.removesuffix(OTHER) if entry.label.endswith(OTHER) else own
         compared = self._results[job.name][base].cost
         return "" if base == entry.label or compared is None else f"{cost / compared:.2f}"
-
-
-def write_docs(path: Path, report: Report) -> None:
-    """Replace what stands between the markers of the documentation page.
-
-    Raises:
-        ValueError: the page has no markers.
-    """
-    replace_between(path, _BEGIN, _END, report.markdown())
-
-
-def replace_between(path: Path, first: str, last: str, new: str) -> None:
-    """Replace what stands between two markers of a documentation page.
-
-    Raises:
-        ValueError: the page has no such markers.
-    """
-    before, begin, rest = path.read_text().partition(first)
-    _, end, after = rest.partition(last)
-    if not begin or not end:
-        msg = f"{path.name} has no markers for the measured part"
-        raise ValueError(msg)
-    path.write_text(f"{before}{first}\n\n{new}\n\n{last}{after}")
 
 
 def _header(job: Job) -> Row:

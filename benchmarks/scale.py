@@ -2,8 +2,8 @@
 
 A chain `Integrator -> Gain -> Gain -> …`, each instance in a process of its own, or in groups; recorded is the last
 output. Sizes are interleaved, figures are medians. Every result is compared with that of `launch --local`, row by row.
-A second table tells what a connection costs before the run (`benchmarks.connections`); `--connections` is that alone.
-`--variables` is what an FMU with very many variables costs (`benchmarks.variables`), in a table of its own.
+`--connections` is what a connection costs before the run (`benchmarks.connections`), `--variables` what an FMU with
+very many variables costs (`benchmarks.variables`), each in a table of its own.
 """
 
 from __future__ import annotations
@@ -16,19 +16,16 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.connections import measured
+from benchmarks import connections, variables
 from benchmarks.contestants.entry import FMUS
-from benchmarks.environment import ROOT, loads, machine
-from benchmarks.variables import measured as measured_variables
-from benchmarks.variables import write_docs
+from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 
-_SUMMARY = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
-_HEADER = "| instances | nodes | points | points/s | us per point and instance | start and end, s |"
+_SUMMARY = re.compile(r"^\d+ points in [0-9.]+ s: (\d+) points/s", re.MULTILINE)
+_HEADER = ("instances", "nodes", "points", "points/s", "us per point and instance")
 
 
 @dataclass
@@ -43,15 +40,12 @@ class Size:
     nodes: int
     points: int
     rates: list[float] = field(default_factory=list)
-    around_s: list[float] = field(default_factory=list)
 
-    def row(self) -> str:
+    def row(self) -> tuple[str, ...]:
         """The medians."""
         rate = statistics.median(self.rates)
         cost = 1e6 / rate / self.instances
-        around = statistics.median(self.around_s)
-        figures = (self.instances, self.nodes, self.points, f"{rate:,.0f}", f"{cost:.2f}", f"{around:.1f}")
-        return "| " + " | ".join(map(str, figures)) + " |"
+        return (str(self.instances), str(self.nodes), f"{self.points:,}", f"{rate:,.0f}", f"{cost:.2f}")
 
 
 SIZES = (
@@ -95,9 +89,7 @@ def measure(size: Size, folder: Path) -> None:
     config, result, local = folder / "scale.yaml", folder / "distributed.csv", folder / "local.csv"
     config.write_text(json.dumps(configuration(size, result)))  # JSON is YAML
     command = [sys.executable, "-m", "fmu_mesh", "launch", str(config), "--no-progress"]
-    started = time.perf_counter()
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=170)
-    wall = time.perf_counter() - started
     found = _SUMMARY.search(done.stdout)
     if done.returncode or found is None:
         msg = f"{size.instances} instances: exit code {done.returncode}: {done.stderr.strip()[-400:]}"
@@ -106,42 +98,32 @@ def measure(size: Size, folder: Path) -> None:
     if result.read_bytes() != local.read_bytes():
         msg = f"{size.instances} instances in {size.nodes} nodes: the result is not that of one process"
         raise RuntimeError(msg)
-    size.rates.append(int(found[3]))
-    size.around_s.append(wall - float(found[2]))
+    size.rates.append(int(found[1]))
 
 
 def main() -> int:
     """Measure all sizes."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__)
     parser.add_argument("--repeat", type=int, default=3, metavar="N", help="interleaved rounds (3)")
-    parser.add_argument("--connections", action="store_true", help="only what a connection costs before the run")
-    parser.add_argument("--variables", action="store_true", help="only what an FMU with very many variables costs")
-    parser.add_argument("--write-docs", action="store_true", help="put the table of variables into docs/performance.md")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--connections", action="store_true", help="only what a connection costs before the run")
+    what.add_argument("--variables", action="store_true", help="only what an FMU with very many variables costs")
+    add_write_docs(parser)
     options = parser.parse_args()
-    if options.variables:
-        table = measured_variables(options.repeat)
-        print(table)
-        if options.write_docs:
-            write_docs(ROOT / "docs" / "performance.md", table)
-        return 0
-    before = loads()
+    measured = {"connections": connections.measured, "variables": variables.measured, "scale": _measured}
+    block = "connections" if options.connections else "variables" if options.variables else "scale"
+    return publish(block, lambda: measured[block](options.repeat), write=options.write_docs)
+
+
+def _measured(rounds: int) -> Figures:
+    """The table of all sizes."""
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
-        for number in range(0 if options.connections else options.repeat):
+        for number in range(rounds):
             for size in SIZES:
                 print(f"round {number + 1}: {size.instances} instances, {size.nodes} nodes", file=sys.stderr)
                 measure(size, Path(folder))
-        connections = measured(options.repeat, Path(folder))
-    print(
-        f"median of {options.repeat} interleaved rounds; {machine()}; load average before {before}, after {loads()}\n"
-    )
-    if not options.connections:
-        print(_HEADER)
-        print("|" + "---:|" * (_HEADER.count("|") - 1))
-        for size in SIZES:
-            print(size.row())
-        print()
-    print(connections)
-    return 0
+    table = markdown_table(_HEADER, [size.row() for size in SIZES], texts=0)
+    return Figures(f"Medians of {rounds} interleaved rounds", table)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ from pathlib import Path
 import psutil
 
 from benchmarks.commands import Command, run_command
-from benchmarks.environment import ROOT, loads, machine
+from benchmarks.environment import ROOT
+from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 
 _CONFIG = ROOT / "configs" / "pendulum_delay.yaml"
 _TIMEOUT_S = 300.0
@@ -64,8 +65,8 @@ def _repeated() -> float:
     return _VARIANTS / run_command(Command([sys.executable, "-c", _REPEATED], ROOT), _TIMEOUT_S).seconds
 
 
-def _rates(rounds: int) -> None:
-    """Print the rate of each way, and its ratio to the loop."""
+def _rates(rounds: int) -> Figures:
+    """The rate of each way, and its ratio to the loop."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         ways: dict[str, Callable[[], float]] = {
@@ -84,13 +85,13 @@ def _rates(rounds: int) -> None:
                 found[name].append(way())
     medians = {name: statistics.median(rates) for name, rates in found.items()}
     base = next(iter(medians.values()))
-    print("| way | runs per second | ratio |\n|---|---|---|")
-    for name, rate in medians.items():
-        print(f"| {name} | {rate:.1f} | {rate / base:.1f} |")
+    rows = [(name, f"{rate:.1f}", f"{1e3 / rate:,.0f}", f"{rate / base:.1f}") for name, rate in medians.items()]
+    header = ("way", "runs per second", "ms per run", "ratio")
+    return Figures(f"Medians of {rounds} interleaved rounds", markdown_table(header, rows))
 
 
-def _memory() -> None:
-    """Print the memory of a sweep with many variants while it runs, and how long pandas takes to open its table."""
+def _memory() -> Figures:
+    """The memory of a sweep with many variants while it runs, and how long pandas takes to open its table."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "sweep"
         vary = ("--vary", "pendulum.d=0.05:0.8:100", "--vary", "delay.d=0.5:3:100")
@@ -98,14 +99,18 @@ def _memory() -> None:
         command = _fmu_mesh("sweep", str(_CONFIG), *vary, *options, "--folder", str(folder), "--quiet")
         begin = time.perf_counter()
         with subprocess.Popen(command, cwd=ROOT) as process:
-            _watch(process, folder)
-        print(f"{_MANY} runs in {time.perf_counter() - begin:.1f} s")
-        _opened(folder / "table.csv")
+            rows = _watched(process, folder)
+        seconds = time.perf_counter() - begin
+        opened = _opened(folder / "table.csv")
+    about = f"{_MANY:,} variants in {seconds:.1f} s; pandas opens {opened}"
+    return Figures(
+        about, markdown_table(("rows", "memory of the command, MB", "of the largest worker, MB"), rows, texts=0)
+    )
 
 
-def _watch(process: subprocess.Popen[bytes], folder: Path) -> None:
-    """Print the resident memory of the command and of its largest worker at each thousand rows."""
-    never, told = threading.Event(), 0
+def _watched(process: subprocess.Popen[bytes], folder: Path) -> list[tuple[str, str, str]]:
+    """The resident memory of the command and of its largest worker at each thousand rows."""
+    never, told, found = threading.Event(), 0, []
     rows = folder / "rows.jsonl"
     while process.poll() is None:
         never.wait(_LOOK_S)
@@ -114,31 +119,29 @@ def _watch(process: subprocess.Popen[bytes], folder: Path) -> None:
             told = done // 1000
             own = psutil.Process(process.pid)
             workers = [child.memory_info().rss for child in own.children(recursive=True) if child.is_running()]
-            print(
-                f"{done} rows: command {own.memory_info().rss / 1e6:.0f} MB, largest worker {max(workers) / 1e6:.0f} MB"
-            )
+            found.append((f"{done:,}", f"{own.memory_info().rss / 1e6:.0f}", f"{max(workers) / 1e6:.0f}"))
+    return found
 
 
-def _opened(table: Path) -> None:
+def _opened(table: Path) -> str:
     import pandas as pd  # noqa: PLC0415  only this needs it
 
     begin = time.perf_counter()
     rows = len(pd.read_csv(table))
-    print(f"pandas opens {rows} rows, {table.stat().st_size / 1e6:.1f} MB, in {time.perf_counter() - begin:.3f} s")
+    return f"the table of {rows:,} rows, {table.stat().st_size / 1e6:.1f} MB, in {time.perf_counter() - begin:.3f} s"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Measure."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sweeps", description=__doc__.partition("\n")[0])
     parser.add_argument("--memory", action="store_true", help="10,000 variants: memory, and the table")
     parser.add_argument("--rounds", type=int, default=3, metavar="N", help="repetitions of each way (3)")
+    add_write_docs(parser)
     options = parser.parse_args(arguments)
-    print(f"{machine()}; {loads()}")
     if options.memory:
-        _memory()
-    else:
-        _rates(options.rounds)
+        return publish("many variants", _memory, write=options.write_docs)
+    return publish("sweeps", lambda: _rates(options.rounds), write=options.write_docs)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

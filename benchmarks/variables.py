@@ -19,10 +19,9 @@ from pathlib import Path
 
 import fmu_mesh
 from benchmarks.contestants.entry import FMUS
-from benchmarks.environment import loads, machine
-from benchmarks.report import replace_between
+from benchmarks.publishing import Figures, markdown_table
 
-__all__ = ["COUNTS", "measured", "write_docs"]
+__all__ = ["COUNTS", "measured"]
 
 COUNTS = (10, 1_000, 10_000, 60_000)
 _DECLARED = '<ScalarVariable name="net[{0}].x" valueReference="1" causality="local"><Real/></ScalarVariable>'
@@ -40,8 +39,6 @@ _FIGURES = (
     ("`sweep` of 4 runs, s", "sweep"),
     ("`watch` of 1,000 variables until the first value, s", "watch"),
 )
-_BEGIN = "<!-- variables: begin (written by `python -m benchmarks.scale --variables --write-docs`) -->"
-_END = "<!-- variables: end -->"
 
 
 @dataclass
@@ -107,9 +104,8 @@ class Width:
             self.note("watch", time.perf_counter() - started)
 
 
-def measured(rounds: int) -> str:
+def measured(rounds: int) -> Figures:
     """The table of medians of interleaved rounds."""
-    before = loads()
     with tempfile.TemporaryDirectory(prefix="variables-") as folder:
         widths = [Width(count, Path(folder) / str(count)) for count in COUNTS]
         for width in widths:
@@ -121,19 +117,8 @@ def measured(rounds: int) -> str:
     rows = [
         [text, *(_figure(what, statistics.median(width.seen[what])) for width in widths)] for text, what in _FIGURES
     ]
-    lines = ["| " + " | ".join(["local variables", *(f"{count:,}" for count in COUNTS)]) + " |"]
-    lines += ["|---|" + "---:|" * len(COUNTS), *("| " + " | ".join(row) + " |" for row in rows)]
-    about = f"Medians of {rounds} interleaved rounds; {machine()}; load average before {before}, after {loads()}."
-    return "\n".join([about, "", *lines])
-
-
-def write_docs(path: Path, table: str) -> None:
-    """Replace what stands between the markers of the documentation page.
-
-    Raises:
-        ValueError: the page has no markers.
-    """
-    replace_between(path, _BEGIN, _END, table)
+    header = ("local variables", *(f"{count:,}" for count in COUNTS))
+    return Figures(f"Medians of {rounds} interleaved rounds", markdown_table(header, rows))
 
 
 def _figure(what: str, figure: float) -> str:

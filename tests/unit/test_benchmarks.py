@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,8 +13,9 @@ import pytest
 from benchmarks.comparing import Reference, compare
 from benchmarks.first_step import Started
 from benchmarks.jobs import JOBS, OTHER, Entry, Job, with_checkout
+from benchmarks.publishing import BLOCKS, PAGE, PATIENCE_S, Figures, Host, markers, publish
 from benchmarks.recording import main as measure_recording
-from benchmarks.report import Report, write_docs
+from benchmarks.report import Report
 from benchmarks.running import Measured
 from benchmarks.targets import TARGETS, Figure, Target
 from benchmarks.task import Member, Outcome, System
@@ -137,22 +140,133 @@ def test_the_table_of_start_up_has_times_and_memory() -> None:
     assert "all points equal" in report.text()
 
 
-def test_the_tables_replace_those_of_the_page_and_nothing_else(tmp_path: Path) -> None:
+def host(*loads: float) -> Host:
+    """A machine with these loads, one after another and the last for ever, on which waiting takes no time."""
+    left, now = list(loads), [0.0]
+
+    def pause(seconds: float) -> None:
+        now[0] += seconds
+
+    return Host(lambda: left.pop(0) if len(left) > 1 else left[0], lambda: now[0], pause)
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_a_table_replaces_that_of_the_page_and_nothing_else(block: str, tmp_path: Path) -> None:
     page = tmp_path / "performance.md"
-    before = (ROOT / "docs" / "performance.md").read_text()
-    page.write_text(before)
-    report, _ = reported(Target("speed", "pair", "ours", "points/s", 2, 3), {"ours": Measured(2, 4, [1e-6])})
+    before = PAGE.read_text(encoding="utf-8")
+    page.write_text(before, encoding="utf-8")
+    begin, end = markers(block)
 
-    write_docs(page, report)
+    code = publish(block, lambda: Figures("one round", "| a table |"), write=True, host=host(0.5), page=page)
 
-    begin, end = "<!-- measured: begin", "<!-- measured: end -->"
-    after = page.read_text()
-    assert report.markdown() in after
+    after = page.read_text(encoding="utf-8")
+    assert code == 0
     assert after.partition(begin)[0] == before.partition(begin)[0]
     assert after.partition(end)[2] == before.partition(end)[2]
+    about, table = after.partition(begin)[2].partition(end)[0].strip().split("\n\n")
+    assert re.fullmatch(r"one round; .+; \d{4}-\d\d-\d\d, commit .+; load average before .+, after .+\.", about)
+    assert table == "| a table |"
+
+
+def test_a_page_without_the_markers_is_refused(tmp_path: Path) -> None:
+    page = tmp_path / "performance.md"
     page.write_text("no markers")
-    with pytest.raises(ValueError, match="no markers"):
-        write_docs(page, report)
+
+    with pytest.raises(ValueError, match="no markers of the block 'scale'"):
+        publish("scale", lambda: Figures("one round", "new"), write=True, host=host(0.5), page=page)
+
+
+def test_the_docs_wait_for_a_quiet_machine_before_the_first_round(tmp_path: Path) -> None:
+    page = tmp_path / "performance.md"
+    page.write_text("\n".join(markers("scale")))
+    busy = host(4.0, 2.0, 1.0, 0.99)
+    seen: list[float] = []
+
+    code = publish("scale", lambda: Figures(f"{seen.append(busy.load())}", "new"), write=True, host=busy, page=page)
+
+    assert code == 0
+    assert seen == [0.99]
+    assert "new" in page.read_text()
+
+
+def test_a_machine_that_stays_busy_writes_nothing_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "performance.md"
+    page.write_text("\n".join(markers("scale")))
+    busy = host(1.0)
+    before, rounds = page.read_text(), 0
+
+    def measure() -> Figures:
+        nonlocal rounds
+        rounds += 1
+        return Figures("one round", "new")
+
+    code = publish("scale", measure, write=True, host=busy, page=page)
+
+    assert (code, rounds, busy.clock()) == (1, 0, PATIENCE_S)
+    assert page.read_text() == before
+    assert "error: the load average is 1.00 after 5 minutes, and has to be below 1." in capsys.readouterr().err
+
+
+def test_without_a_page_to_write_nobody_waits(capsys: pytest.CaptureFixture[str]) -> None:
+    busy = host(20.0)
+
+    code = publish("scale", lambda: Figures("one round", "| a table |"), write=False, host=busy)
+
+    assert (code, busy.clock()) == (0, 0.0)
+    assert "| a table |" in capsys.readouterr().out
+
+
+def test_figures_with_a_problem_do_not_get_into_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "performance.md"
+    page.write_text("\n".join(markers("arrays")))
+    before = page.read_text()
+
+    code = publish("arrays", lambda: Figures("", "new", problems=["DIFFERS"]), write=True, host=host(0.5), page=page)
+
+    assert code == 1
+    assert page.read_text() == before
+    assert "error: DIFFERS" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", BLOCKS.values())
+def test_the_program_of_each_block_takes_the_option(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module, *options = command.split()
+    program = importlib.import_module(f"{module}.__main__" if module == "benchmarks" else module)
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
+
+    with pytest.raises(SystemExit, match="0"):
+        program.main()
+
+    shown = capsys.readouterr().out
+    assert [option for option in ("--write-docs", *options) if option not in shown] == []
+
+
+UNSEEN = re.compile(
+    r"<!-- ([\w ]+): begin .*?<!-- \1: end -->|<!--.*?-->|^```.*?^```|^ {4}.*?$", re.DOTALL | re.MULTILINE
+)
+"""The measured tables, comments and listings of a page; what is left is prose."""
+
+FIGURE = re.compile(r"\d[\d.,]* ?(?:ns|us|µs|ms|s|minutes|points/s|kB|MB|GB|%)(?![\w/])|\d[\d.,]* times (?:as|the)\b")
+COST = re.compile(
+    r"\b(?:takes?|took|costs?)\s(?:about |around |only |less than |some )?\d[\d.,]* (?:to \d+ )?(?:ns|us|µs|ms)\b"
+    r"|\d[\d.,]* (?:to \d+ )?times (?:as (?:fast|slow|long)|faster|slower)"
+)
+
+
+def test_the_page_of_figures_has_none_outside_its_tables() -> None:
+    assert FIGURE.findall(UNSEEN.sub("", PAGE.read_text(encoding="utf-8"))) == []
+
+
+def test_no_page_says_in_prose_how_fast_something_is() -> None:
+    pages = {*(ROOT / "docs").glob("*.md")} - {ROOT / "docs" / "upgrading.md"}  # what older versions took
+
+    found = {page.name: COST.findall(UNSEEN.sub("", page.read_text(encoding="utf-8"))) for page in pages}
+
+    assert {name: figures for name, figures in found.items() if figures} == {}
 
 
 def test_the_cost_of_recording_is_measured_for_each_format(capsys: pytest.CaptureFixture[str]) -> None:
@@ -161,4 +275,4 @@ def test_the_cost_of_recording_is_measured_for_each_format(capsys: pytest.Captur
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[-2:]]
     assert code == 0
     assert [row[0] for row in rows] == ["| none", "| csv"]
-    assert rows[0][2] == "100 %"
+    assert rows[0][3] == "100 %"
