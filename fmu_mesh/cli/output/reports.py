@@ -1,6 +1,6 @@
 """What `launch` and `run` print with `--json`: one object at their end, also when they fail.
 
-`docs/commands.md` documents the fields.
+`docs/reference/json.md` documents the fields.
 """
 
 from __future__ import annotations
