@@ -17,7 +17,7 @@ from benchmarks.first_step import FirstStep, Started
 __all__ = ["Command", "Ended", "RunFailed", "run_command"]
 
 
-class RunFailed(Exception):
+class RunFailed(RuntimeError):
     """A contestant did not get to its end; the message is why."""
 
 

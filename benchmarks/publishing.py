@@ -119,7 +119,7 @@ def publish(
         page: the page with the block.
 
     Returns:
-        The exit code: 1 if the machine did not become quiet, or if something is wrong with what was measured.
+        The exit code: 1 if the machine did not become quiet, if a run failed, or if something is wrong with the figures.
     """
     host = host or Host()
     if write and not host.becomes_quiet():
@@ -130,7 +130,11 @@ def publish(
         )
         return 1
     before = loads()
-    figures = measure()
+    try:
+        figures = measure()
+    except RuntimeError as error:
+        print(f"error: {error}. {page.name} is as it was.", file=sys.stderr)
+        return 1
     about = (
         f"{figures.about}; {machine()}; {dt.datetime.now(dt.UTC):%Y-%m-%d}, commit {_commit()}; "
         f"load average before {before}, after {loads()}."
