@@ -7,6 +7,7 @@ pages are committed, and `tests/unit/test_reference_pages.py` compares them with
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,12 +19,26 @@ import msgspec
 import yaml
 from msgspec import NODEFAULT, inspect
 
+from fmu_mesh.cli.main import COMMANDS, command_parser
 from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import config_type
 from fmu_mesh.config.structure import describe
 from fmu_mesh.instances.registry import KINDS
+from fmu_mesh.run.options import option_fields
 
-__all__ = ["REFERENCE", "Key", "Section", "configuration_page", "keys_of", "known", "reference_pages", "sections"]
+__all__ = [
+    "REFERENCE",
+    "Key",
+    "Section",
+    "command_options",
+    "configuration_page",
+    "keys_of",
+    "known",
+    "options_page",
+    "reference_pages",
+    "sections",
+    "since",
+]
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
 _COMMON = ("start_values", "step_size", "group", "host", "not_finite")
@@ -39,6 +54,22 @@ Every key of a configuration file, version 1. [Your own FMUs](../../README.md#yo
 is the version that is not released yet. Any key can also be given by
 [`--set-config`](../commands.md#options-instead-of-keys).
 """
+
+
+_OPTIONS = f"""\
+# Options
+{_WRITTEN}
+
+Every option of every command. `--help` and `--debug` (show a traceback) are those of all. *next* is the version that is
+not released yet. What one does with the commands is on [their page](../commands.md).
+
+## Options of a run
+
+These are chosen beside the configuration: on the command line, and by the same name in Python, as in
+`mesh.run(stop_time=10.0)` ([runs](runs.md)). One with a key replaces what the [configuration](configuration.md) says.
+"""
+
+_OF_ALL = ("--help", "--debug")
 
 
 class Key(NamedTuple):
@@ -74,9 +105,9 @@ class Section(NamedTuple):
 
 
 @cache
-def known() -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
-    """What `keys.yaml` says, by kind of entry, class and key."""
-    found: dict[str, dict[str, dict[str, dict[str, Any]]]] = yaml.safe_load((REFERENCE / "keys.yaml").read_text())
+def known() -> dict[str, Any]:
+    """What `keys.yaml` says: `keys` by class and key, `options` by version and command, `examples` by option."""
+    found: dict[str, Any] = yaml.safe_load((REFERENCE / "keys.yaml").read_text())
     return found
 
 
@@ -103,9 +134,56 @@ def configuration_page() -> str:
     return "\n".join([_CONFIGURATION, *(_shown(section, links) for section in found)]).rstrip() + "\n"
 
 
+def options_page() -> str:
+    """The page of all options: those of a run once, and the others of each command."""
+    shared = {field.flag.name: field for field in option_fields().values()}
+    rows = [
+        (
+            f"`{field.flag.name}{f' {field.flag.metavar}' if field.flag.metavar else ''}`",
+            f"`{field.name}`",
+            f"`{field.flag.key}`" if field.flag.key else "",
+            f"`{known()['examples'].get(field.name, '')}`",
+            min(since(command, field.flag.name) for command in COMMANDS if field.flag.name in command_options(command)),
+            field.help,
+        )
+        for field in option_fields().values()
+    ]
+    parts = [_OPTIONS, _table(("option", "in Python", "key", "example", "since", "meaning"), rows)]
+    for command, (_, about) in COMMANDS.items():
+        options = command_options(command)
+        own = [option for option in options if option not in shared]
+        parts += ["", f"## `{command}`", "", f"{about[0].upper()}{about[1:]}."]
+        if common := [f"`{option}`" for option in options if option in shared]:
+            parts += ["", f"Of the options of a run: {', '.join(common)}."]
+        if own:
+            table = [(*options[option], since(command, option)) for option in own]
+            parts += ["", _table(("option", "meaning", "since"), table)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+@cache
+def command_options(command: str) -> dict[str, tuple[str, str]]:
+    """How each option of a command is written, and its help; by its long form. Those of every command are left out."""
+    found = {}
+    for action in command_parser([command])[1][command]._actions:  # noqa: SLF001  argparse has no other way
+        long = next((option for option in action.option_strings if option.startswith("--")), None)
+        if long is None or long in _OF_ALL or action.help == argparse.SUPPRESS:
+            continue
+        value = argparse.HelpFormatter("")._format_args(action, str(action.dest).upper())  # noqa: SLF001  as above
+        written = ", ".join(f"`{option}{f' {value}' if value else ''}`" for option in reversed(action.option_strings))
+        found[long] = written, (action.help or "") % {"default": action.default}
+    return found
+
+
+def since(command: str, option: str) -> str:
+    """The version since when a command has an option; empty if `keys.yaml` does not say."""
+    table = known()["options"]
+    return next((version for version, commands in table.items() if option in commands.get(command, ())), "")
+
+
 def reference_pages() -> dict[str, str]:
     """The text of each page by its name."""
-    return {"configuration.md": configuration_page()}
+    return {"configuration.md": configuration_page(), "options.md": options_page()}
 
 
 def _sections(kind: inspect.StructType, path: str, seen: dict[type, str]) -> Iterator[Section]:

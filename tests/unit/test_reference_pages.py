@@ -10,8 +10,10 @@ from types import ModuleType
 
 import pytest
 
+from fmu_mesh.cli.main import COMMANDS, command_parser
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import check
+from fmu_mesh.run.options import option_fields
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT_FORMS = {"connections"}
@@ -76,3 +78,35 @@ def test_every_section_has_a_heading_of_its_own(pages: ModuleType) -> None:
     titles = [section.title for section in pages.sections()]
 
     assert len({*titles}) == len(titles)
+
+
+def test_every_option_says_since_when_it_is_there(pages: ModuleType) -> None:
+    options = [(command, option) for command in COMMANDS for option in pages.command_options(command)]
+
+    assert len(options) > 200
+    assert [" ".join(pair) for pair in options if not pages.since(*pair)] == [], "see keys.yaml"
+
+
+def test_every_option_of_a_run_has_an_example_that_its_command_takes(pages: ModuleType) -> None:
+    examples = pages.known()["examples"]
+
+    assert {*examples} == {*option_fields()}
+    for name, example in examples.items():
+        flag = option_fields()[name].flag.name
+        command = next(command for command in COMMANDS if flag in pages.command_options(command))
+        model = "fmus/Gain.fmu" if command == "run" else "configs/pendulum_delay.yaml"
+        options = command_parser([command])[0].parse_args([command, model, *example.split()])
+        assert getattr(options, name), example
+
+
+def test_nothing_is_said_of_options_that_are_gone(pages: ModuleType) -> None:
+    said = {
+        (command, option)
+        for commands in pages.known()["options"].values()
+        for command, options in commands.items()
+        for option in options
+    }
+
+    gone = [pair for pair in sorted(said) if pair[1] not in pages.command_options(pair[0])]
+
+    assert gone == []
