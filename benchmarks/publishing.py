@@ -119,7 +119,7 @@ def publish(
         page: the page with the block.
 
     Returns:
-        The exit code: 1 if the machine did not become quiet, if a run failed, or if something is wrong with the figures.
+        The exit code: 1 if the machine did not become quiet, if a run failed, or if a figure is wrong.
     """
     host = host or Host()
     if write and not host.becomes_quiet():
