@@ -24,12 +24,14 @@ from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import config_type
 from fmu_mesh.config.structure import describe
 from fmu_mesh.instances.registry import KINDS
-from fmu_mesh.run.options import option_fields
+from fmu_mesh.run.options import CallOptions, OptionField, RunOptions, VariantOptions, option_fields
+from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 __all__ = [
     "REFERENCE",
     "Key",
     "Section",
+    "call_options",
     "command_options",
     "configuration_page",
     "keys_of",
@@ -65,8 +67,15 @@ not released yet. What one does with the commands is on [their page](../commands
 
 ## Options of a run
 
-These are chosen beside the configuration: on the command line, and by the same name in Python, as in
-`mesh.run(stop_time=10.0)` ([runs](runs.md)). One with a key replaces what the [configuration](configuration.md) says.
+`Mesh.run` and `Mesh.start` take all of these by name, as in `mesh.run(window=16)`; `plan`, `check`, `open`, `sweep` and
+`rerun` those that make sense for them ([meshes](meshes.md), [runs](runs.md)). The column *option* has the spelling of
+the command line. One with a key replaces what the [configuration](configuration.md) says; `None` leaves it.
+"""
+
+_SWEEP = """\
+## Options of a sweep
+
+`fmu_mesh.sweep` and the command take them beside those of a run that any variant has ([sweeps](../sweeps.md)).
 """
 
 _OF_ALL = ("--help", "--debug")
@@ -106,7 +115,7 @@ class Section(NamedTuple):
 
 @cache
 def known() -> dict[str, Any]:
-    """What `keys.yaml` says: `keys` by class and key, `options` by version and command, `examples` by option."""
+    """What `keys.yaml` says: `keys` by class and key, `options` by version and command, `calls` by Struct."""
     found: dict[str, Any] = yaml.safe_load((REFERENCE / "keys.yaml").read_text())
     return found
 
@@ -135,20 +144,10 @@ def configuration_page() -> str:
 
 
 def options_page() -> str:
-    """The page of all options: those of a run once, and the others of each command."""
-    shared = {field.flag.name: field for field in option_fields().values()}
-    rows = [
-        (
-            f"`{field.flag.name}{f' {field.flag.metavar}' if field.flag.metavar else ''}`",
-            f"`{field.name}`",
-            f"`{field.flag.key}`" if field.flag.key else "",
-            f"`{known()['examples'].get(field.name, '')}`",
-            min(since(command, field.flag.name) for command in COMMANDS if field.flag.name in command_options(command)),
-            field.help,
-        )
-        for field in option_fields().values()
-    ]
-    parts = [_OPTIONS, _table(("option", "in Python", "key", "example", "since", "meaning"), rows)]
+    """The page of all options: those of a run once, those of a sweep, and the others of each command."""
+    of_run, of_sweep = option_fields(RunOptions), call_options(SweepOptions)
+    shared = {field.option.flag for field in of_run.values()} - {None}
+    parts = [_OPTIONS, _calls(RunOptions, of_run), "", _SWEEP, _calls(SweepOptions, of_sweep)]
     for command, (_, about) in COMMANDS.items():
         options = command_options(command)
         own = [option for option in options if option not in shared]
@@ -159,6 +158,30 @@ def options_page() -> str:
             table = [(*options[option], since(command, option)) for option in own]
             parts += ["", _table(("option", "meaning", "since"), table)]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def call_options(options: type[CallOptions]) -> dict[str, OptionField]:
+    """The options of a Struct that are not those of any run."""
+    inherited = {} if options is RunOptions else option_fields(VariantOptions)
+    return {name: field for name, field in option_fields(options).items() if name not in inherited}
+
+
+def _calls(options: type[CallOptions], fields: Mapping[str, OptionField]) -> str:
+    said = known()["calls"][options.__name__]
+    rows = [
+        (
+            f"`{name}`",
+            f"`{field.parameter.annotation}`",
+            f"`{field.default!r}`",
+            f"`{said[name]['example']!r}`" if "example" in said[name] else "",
+            f"`{field.option.flag}`" if field.option.flag else "",
+            f"`{field.option.key}`" if field.option.key else "",
+            said[name]["since"],
+            field.text,
+        )
+        for name, field in fields.items()
+    ]
+    return _table(("in Python", "type", "default", "example", "option", "instead of the key", "since", "meaning"), rows)
 
 
 @cache

@@ -10,10 +10,11 @@ from types import ModuleType
 
 import pytest
 
-from fmu_mesh.cli.main import COMMANDS, command_parser
+from fmu_mesh.cli.main import COMMANDS
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import check
-from fmu_mesh.run.options import option_fields
+from fmu_mesh.run.options import CallOptions, RunOptions
+from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT_FORMS = {"connections"}
@@ -87,16 +88,16 @@ def test_every_option_says_since_when_it_is_there(pages: ModuleType) -> None:
     assert [" ".join(pair) for pair in options if not pages.since(*pair)] == [], "see keys.yaml"
 
 
-def test_every_option_of_a_run_has_an_example_that_its_command_takes(pages: ModuleType) -> None:
-    examples = pages.known()["examples"]
+@pytest.mark.parametrize("options", [RunOptions, SweepOptions])
+def test_every_option_in_python_has_an_example_that_is_taken(pages: ModuleType, options: type[CallOptions]) -> None:
+    said, fields = pages.known()["calls"][options.__name__], pages.call_options(options)
 
-    assert {*examples} == {*option_fields()}
-    for name, example in examples.items():
-        flag = option_fields()[name].flag.name
-        command = next(command for command in COMMANDS if flag in pages.command_options(command))
-        model = "fmus/Gain.fmu" if command == "run" else "configs/pendulum_delay.yaml"
-        options = command_parser([command])[0].parse_args([command, model, *example.split()])
-        assert getattr(options, name), example
+    assert {*said} == {*fields}
+    assert [name for name in said if "since" not in said[name]] == []
+    without = {name for name, one in said.items() if "example" not in one}
+    assert without <= {"on_progress", "on_event", "on_notice", "executor"}  # objects of a program
+    for name in {*said} - without:
+        options(**{name: said[name]["example"]})
 
 
 def test_nothing_is_said_of_options_that_are_gone(pages: ModuleType) -> None:
