@@ -19,12 +19,13 @@ import msgspec
 import yaml
 from msgspec import NODEFAULT, inspect
 
+from fmu_mesh.api.simulating import SimulateOptions
 from fmu_mesh.cli.main import COMMANDS, command_parser
 from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import config_type
 from fmu_mesh.config.structure import describe
 from fmu_mesh.instances.registry import KINDS
-from fmu_mesh.run.options import CallOptions, OptionField, RunOptions, VariantOptions, option_fields
+from fmu_mesh.run.options import CallOptions, Option, RunOptions, option_fields
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "known",
     "options_page",
     "reference_pages",
+    "said",
     "sections",
     "since",
 ]
@@ -72,10 +74,16 @@ not released yet. What one does with the commands is on [their page](../commands
 the command line. One with a key replaces what the [configuration](configuration.md) says; `None` leaves it.
 """
 
+_SIMULATION = """\
+## Options of a simulation
+
+`fmu_mesh.simulate` and the command take these for one FMU, and some of a run ([from FMPy](../from-fmpy.md)).
+"""
+
 _SWEEP = """\
 ## Options of a sweep
 
-`fmu_mesh.sweep` and the command take them beside those of a run that any variant has ([sweeps](../sweeps.md)).
+`fmu_mesh.sweep` and the command take these beside those of a run that any variant has ([sweeps](../sweeps.md)).
 """
 
 _OF_ALL = ("--help", "--debug")
@@ -145,9 +153,8 @@ def configuration_page() -> str:
 
 def options_page() -> str:
     """The page of all options: those of a run once, those of a sweep, and the others of each command."""
-    of_run, of_sweep = option_fields(RunOptions), call_options(SweepOptions)
-    shared = {field.option.flag for field in of_run.values()} - {None}
-    parts = [_OPTIONS, _calls(RunOptions, of_run), "", _SWEEP, _calls(SweepOptions, of_sweep)]
+    shared = {option.flag for option in option_fields(RunOptions).values()} - {None}
+    parts = [_OPTIONS, _calls(RunOptions), "", _SIMULATION, _calls(SimulateOptions), "", _SWEEP, _calls(SweepOptions)]
     for command, (_, about) in COMMANDS.items():
         options = command_options(command)
         own = [option for option in options if option not in shared]
@@ -160,26 +167,32 @@ def options_page() -> str:
     return "\n".join(parts).rstrip() + "\n"
 
 
-def call_options(options: type[CallOptions]) -> dict[str, OptionField]:
-    """The options of a Struct that are not those of any run."""
-    inherited = {} if options is RunOptions else option_fields(VariantOptions)
-    return {name: field for name, field in option_fields(options).items() if name not in inherited}
+def call_options(options: type[CallOptions]) -> dict[str, Option]:
+    """The options of a Struct; of any but `RunOptions` those that are not the same there."""
+    of_run = {} if options is RunOptions else option_fields(RunOptions)
+    return {name: option for name, option in option_fields(options).items() if option != of_run.get(name)}
 
 
-def _calls(options: type[CallOptions], fields: Mapping[str, OptionField]) -> str:
-    said = known()["calls"][options.__name__]
+def said(options: type[CallOptions], name: str) -> dict[str, Any]:
+    """What `keys.yaml` says of an option of a call: of this one, or of a run."""
+    calls = known()["calls"]
+    found: dict[str, Any] = calls[options.__name__].get(name) or calls["RunOptions"].get(name, {})
+    return found
+
+
+def _calls(options: type[CallOptions]) -> str:
     rows = [
         (
             f"`{name}`",
             f"`{field.parameter.annotation}`",
-            f"`{field.default!r}`",
-            f"`{said[name]['example']!r}`" if "example" in said[name] else "",
-            f"`{field.option.flag}`" if field.option.flag else "",
-            f"`{field.option.key}`" if field.option.key else "",
-            said[name]["since"],
-            field.text,
+            f"`{field.parameter.default!r}`",
+            f"`{said(options, name)['example']!r}`" if "example" in said(options, name) else "",
+            f"`{field.flag}`" if field.flag else "",
+            f"`{field.key}`" if field.key else "",
+            said(options, name).get("since", ""),
+            field.line,
         )
-        for name, field in fields.items()
+        for name, field in call_options(options).items()
     ]
     return _table(("in Python", "type", "default", "example", "option", "instead of the key", "since", "meaning"), rows)
 
