@@ -19,7 +19,7 @@ import msgspec
 import yaml
 from msgspec import NODEFAULT, inspect
 
-from fmu_mesh.api.simulating import SimulateOptions
+from fmu_mesh.api.simulate_options import SimulateOptions
 from fmu_mesh.cli.main import COMMANDS, command_parser
 from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import config_type

@@ -6,10 +6,13 @@ This module owns the arithmetic between points and seconds. No other module adds
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["ENDLESS", "TimeGrid", "step_within", "steps_between"]
 
@@ -40,6 +43,8 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def times(self, first: int, end: int) -> NDArray[np.float64]:
         """The times of the points ``first .. end - 1`` in s, bit for bit those of `time`; shape `(end - first,)`."""
+        import numpy as np  # noqa: PLC0415 many commands need no array, and it takes as long as all the rest
+
         times: NDArray[np.float64] = self.start_time + np.arange(first, end, dtype=np.float64) * self.step_size
         return times
 

@@ -18,7 +18,7 @@ from ..config.mesh import LimitsConfig
 from ..config.plain_values import plain
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
-from ..instances.python.importing import being_imported, component_section
+from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, checked, takes
 from ..run.preparing import KnownModels, planned
@@ -39,7 +39,6 @@ from .mesh_editing import (
 )
 from .plan_options import memory_file, memory_of, with_record
 from .rebasing import rebased
-from .run_handle import Run
 from .tables import html_table, shortened
 
 if TYPE_CHECKING:
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from .open_system import System
     from .repeated_mesh import RepeatedMesh
     from .result import Result
+    from .run_handle import Run
     from .system_graph import SystemGraph
 
 __all__ = ["Mesh", "load"]
@@ -256,7 +256,11 @@ class Mesh:
         if name in self.instances and not replace:
             hint = "Call it with `replace=True`, or `remove` the other one."
             raise CallRefused(f"mesh '{self.name}' has an instance '{name}' already", hint=hint)
-        own = component_section(component)[0] if component is not None else {}
+        own: Mapping[str, Any] = {}
+        if component is not None:
+            from ..instances.python.importing import component_section  # noqa: PLC0415 a file names no class
+
+            own = component_section(component)[0]
         keys = {"fmu": fmu, **own, **section, "start_values": start_values, "step_size": step_size, "group": group}
         given = {key: value for key, value in keys.items() if value is not None}
         if not given.keys() & {*KINDS.names()}:
@@ -499,7 +503,7 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
-        if (place := being_imported()) is not None:
+        if (place := importing.get()) is not None:
             hint = 'Write `if __name__ == "__main__":` before what the program does.'
             raise ConfigurationError(f"mesh '{self.name}' would run while '{place}' is imported", hint=hint)
         if options.record is not None and options.output is None:
@@ -553,12 +557,7 @@ class Mesh:
             FmuMeshError: the run ended early; names instance, variable and point, and its `result` has what was
                 recorded up to then.
         """
-        from .run_thread import check_memory  # noqa: PLC0415  not for those who only build a mesh
-
-        plan, how = self._planned(options)
-        if memory_of(plan) is not None and "memory_limit" not in how:  # a chosen limit is an end
-            check_memory(plan, options.memory_limit, to_its_end=True)
-        with Run.start(plan, **how) as run:
+        with self._started(options, to_its_end=True) as run:
             return run.wait()
 
     @takes(RunOptions)
@@ -574,14 +573,18 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
-        plan, how = self._planned(options)
-        return Run.start(plan, **how)
+        return self._started(options)
 
-    def _planned(self, options: RunOptions) -> tuple[RunPlan, dict[str, Any]]:
-        """The plan of a run, and how it is started."""
+    def _started(self, options: RunOptions, *, to_its_end: bool = False) -> Run:
+        from .run_handle import Run  # noqa: PLC0415  `check` starts nothing
+        from .run_thread import check_memory  # noqa: PLC0415  as above
+
         given = options.given()
         how = {name: given.pop(name) for name in StartOptions.__struct_fields__ if name in given}
-        return self.plan(**given), how
+        plan = self.plan(**given)
+        if to_its_end and memory_of(plan) is not None and "memory_limit" not in how:  # a chosen limit is an end
+            check_memory(plan, options.memory_limit, to_its_end=True)
+        return Run.start(plan, **how)
 
     @takes(OpenOptions)
     def open(self, options: OpenOptions) -> System:

@@ -18,6 +18,7 @@ from ..text import listed, nearest
 __all__ = [
     "CommandParser",
     "Parsers",
+    "Runs",
     "add_json",
     "add_package",
     "add_quiet",
@@ -87,7 +88,9 @@ class CommandParser(argparse.ArgumentParser):
 
 
 Parsers = Mapping[str, Callable[[CommandParser], None]]
-"""What a module of commands offers: for each command the function that adds its arguments and its `run_command`."""
+"""What a module of arguments offers: for each command the function that adds them."""
+Runs = Mapping[str, Callable[[argparse.Namespace], int]]
+"""What a module of commands offers: for each command the function that runs it and returns the exit code."""
 
 
 def add_json(parser: argparse.ArgumentParser, text: str = "JSON, one object per line") -> None:

@@ -11,12 +11,12 @@ from ..api.plan_view import PlanView
 from ..config.structure import schema_text
 from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
-from .arguments import CommandParser, Parsers, add_json, add_quiet
+from .arguments import Runs
 from .output.flag_words import in_flags
 from .output.json_output import Failure, failure_of, print_json
-from .run_options import add_configuration, given_options, mesh_of
+from .run_options import given_options, mesh_of
 
-__all__ = ["PARSERS", "CheckReport"]
+__all__ = ["RUNS", "CheckReport"]
 
 
 class CheckReport(msgspec.Struct, frozen=True):
@@ -33,17 +33,6 @@ class CheckReport(msgspec.Struct, frozen=True):
     exit_code: int
     plan: PlanView | msgspec.Raw | None = None
     error: Failure | None = None
-
-
-def _add_check(parser: CommandParser) -> None:
-    add_configuration(parser)
-    add_quiet(parser)
-    add_json(parser, "print the plan, or all findings, as one JSON object")
-    parser.set_defaults(run_command=_check)
-
-
-def _add_schema(parser: CommandParser) -> None:
-    parser.set_defaults(run_command=_schema)
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -69,4 +58,4 @@ def _schema(_arguments: argparse.Namespace) -> int:
     return 0
 
 
-PARSERS: Parsers = {"check": _add_check, "schema": _add_schema}
+RUNS: Runs = {"check": _check, "schema": _schema}

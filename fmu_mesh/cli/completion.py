@@ -21,11 +21,10 @@ from ..errors import FmuMeshError
 from ..ssp.configuration_files import named_package, read_configuration
 from ..ssp.package import Package
 from ..wire.client.reaching import Meshes
-from .arguments import CommandParser, Parsers
+from .arguments import CommandParser, Runs
 
-__all__ = ["PARSERS", "complete"]
+__all__ = ["RUNS", "complete"]
 
-_SHELLS: Final = ("bash", "zsh", "fish")
 _PATIENCE_S: Final = 1.0
 _RESULTS: Final = ("csv", "mcap")
 _FILES: Final[Mapping[str, tuple[str, ...]]] = {
@@ -152,14 +151,9 @@ def _descriptions_in(given: argparse.Namespace) -> Iterable[str]:
         return package.descriptions
 
 
-def _add_completion(parser: CommandParser) -> None:
-    parser.add_argument("shell", choices=_SHELLS, metavar="SHELL", help=" or ".join(_SHELLS))
-    parser.set_defaults(run_command=_completion)
-
-
 def _completion(arguments: argparse.Namespace) -> int:
     print(shellcode(["fmu-mesh"], shell=arguments.shell).strip())
     return 0
 
 
-PARSERS: Parsers = {"completion": _add_completion}
+RUNS: Runs = {"completion": _completion}

@@ -12,36 +12,18 @@ from ..errors import ConfigurationError
 from ..ssp.configuration_files import named_package
 from ..ssp.package import DEFAULT, Package
 from ..ssp.system_reading import chosen_description
-from .arguments import CommandParser, Parsers, add_package, add_quiet
-from .output.display import say
-from .run_options import add_options
+from .arguments import Runs
+from .file_arguments import TIMES
+from .output.terminal import say
 
-__all__ = ["PARSERS"]
-
-_TIMES = ("algorithm", "step_size", "stop_time")
-
-
-def _add_convert(parser: CommandParser) -> None:
-    parser.add_argument("source", type=Path, metavar="SOURCE", help="a package of SSP, or a configuration file")
-    parser.add_argument("target", type=Path, metavar="TARGET", help="the new file: .yaml, or .ssp")
-    add_package(parser)
-    parser.add_argument(
-        "--version",
-        choices=("1.0", "2.0"),
-        metavar="1.0|2.0",
-        help="version of SSP; default: that of SOURCE if it is a package, otherwise 1.0",
-    )
-    add_options(parser.add_argument_group("instead of what SOURCE says"), *_TIMES)
-    parser.add_argument("--force", action="store_true", help="overwrite TARGET")
-    add_quiet(parser)
-    parser.set_defaults(run_command=_convert)
+__all__ = ["RUNS"]
 
 
 def _convert(arguments: argparse.Namespace) -> int:
     source, target = arguments.source, arguments.target
     if files.exists(target) and not arguments.force:
         raise ConfigurationError(f"'{target}' exists.", hint="--force overwrites it.")
-    given = {name: value for name in _TIMES if (value := getattr(arguments, name)) is not None}
+    given = {name: value for name in TIMES if (value := getattr(arguments, name)) is not None}
     lost = convert(source, target, ssd=arguments.ssd, ssv=arguments.ssv, version=arguments.version, simulation=given)
     if not arguments.quiet:
         for finding in lost:
@@ -63,4 +45,4 @@ def _launch(source: Path, ssd: str | None, target: Path) -> str:
     return shlex.join(words)
 
 
-PARSERS: Parsers = {"convert": _add_convert}
+RUNS: Runs = {"convert": _convert}

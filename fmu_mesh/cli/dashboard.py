@@ -16,23 +16,9 @@ from tempfile import NamedTemporaryFile
 from ..dashboard.access import is_loopback
 from ..dashboard.dashboard_server import DashboardOptions, serve
 from ..errors import Interrupted
-from .arguments import CommandParser, Parsers, add_reaching, port_number
+from .arguments import Runs
 
-__all__ = ["PARSERS"]
-
-_LOOPBACK = "127.0.0.1"
-
-
-def _add_dashboard(parser: CommandParser) -> None:
-    add_reaching(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: all that run")
-    parser.add_argument(
-        "--host", default=_LOOPBACK, metavar="ADDRESS", help=f"address where the page is served ({_LOOPBACK})"
-    )
-    parser.add_argument("--port", type=port_number, default=0, metavar="N", help="port of the page; 0: a free one (0)")
-    parser.add_argument("--read-only", action="store_true", help="show the meshes, but set and steer nothing")
-    parser.add_argument("--no-browser", action="store_true", help="print the address only")
-    parser.set_defaults(run_command=_dashboard)
+__all__ = ["RUNS"]
 
 
 def _dashboard(arguments: argparse.Namespace) -> int:
@@ -81,4 +67,4 @@ def _has_screen() -> bool:
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
 
 
-PARSERS: Parsers = {"dashboard": _add_dashboard}
+RUNS: Runs = {"dashboard": _dashboard}

@@ -6,38 +6,9 @@ import argparse
 import sys
 
 from ..installing import importing
-from .arguments import CommandParser, Parsers, add_quiet, add_reaching, port_number
+from .arguments import Runs
 
-__all__ = ["PARSERS"]
-
-_HOST = "127.0.0.1"
-_PORT = 8765
-
-
-def _add_foxglove(parser: CommandParser) -> None:
-    add_reaching(parser)
-    add_quiet(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument(
-        "--variables",
-        nargs="+",
-        default=[],
-        metavar="INSTANCE.VARIABLE",
-        help="offer only these, or patterns; default: all outputs",
-    )
-    parser.add_argument("--host", default=_HOST, metavar="ADDRESS", help=f"the address to listen at ({_HOST})")
-    parser.add_argument(
-        "--port", type=port_number, default=_PORT, metavar="N", help=f"the port, 0 for a free one ({_PORT})"
-    )
-    parser.add_argument("--steer", action="store_true", help="clients may set inputs and parameters")
-    parser.add_argument(
-        "--origin",
-        action="append",
-        default=[],
-        metavar="ORIGIN",
-        help="let pages of this origin connect, too, such as https://foxglove.example.org; may be repeated",
-    )
-    parser.set_defaults(run_command=_foxglove)
+__all__ = ["RUNS"]
 
 
 def _foxglove(arguments: argparse.Namespace) -> int:
@@ -61,4 +32,4 @@ def _foxglove(arguments: argparse.Namespace) -> int:
     return 0
 
 
-PARSERS: Parsers = {"foxglove": _add_foxglove}
+RUNS: Runs = {"foxglove": _foxglove}

@@ -7,68 +7,22 @@ from __future__ import annotations
 
 import argparse
 import re
-from pathlib import Path
 
 from msgspec.structs import replace
 
 from ..api.mesh_builder import Mesh
-from ..api.simulating import SimulateOptions, experiment_of
+from ..api.simulate_options import SimulateOptions
+from ..api.simulating import experiment_of
 from ..config.base import NAME_PATTERN
 from ..errors import CallRefused, ConfigurationError, LoadFailed
-from ..run.options import option_fields
-from .arguments import CommandParser, Parsers, add_json
-from .output.display import teller
+from .arguments import Runs
 from .output.reports import RunReporter
-from .run_options import add_options, given_options
-from .running import add_output, add_plot, run_mesh
+from .output.terminal import teller
+from .run_arguments import SIMULATION
+from .run_options import given_options
+from .running import run_mesh
 
-__all__ = ["PARSERS"]
-
-_SIMULATION = {"real_time_factor": 1.0, "update_period": 0.01, "catch_up": 1.0}
-"""The keys of `simulation` with other defaults than in a file; options replace them."""
-
-
-def _add_run(parser: CommandParser) -> None:
-    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU")
-    parser.add_argument("--name", help="name of the mesh and of its instance; default: the model identifier")
-    parser.add_argument(
-        "--interpolation",
-        choices=("hold", "linear"),
-        default="linear",
-        help="how a Real input changes between two given values; other types hold; default: linear",
-    )
-    add_options(
-        parser,
-        "step_size",
-        "stop_time",
-        *_SIMULATION,
-        "start_values",
-        "config_values",
-        "output",
-        "listen",
-        "connect",
-        defaults={
-            "step_size": "that of the FMU",
-            "stop_time": "none, it runs until it is stopped",
-            "output": "nothing is recorded",
-            **{name: f"{value:g}" for name, value in _SIMULATION.items()},
-        },
-        metavars={"start_values": "VARIABLE=VALUE"},
-    )
-    add_output(parser)
-    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
-    parser.set_defaults(run_command=_run)
-
-
-def _add_simulate(parser: CommandParser) -> None:
-    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu", help="the FMU")
-    flags = [name for name, field in option_fields(SimulateOptions).items() if field.flag]
-    of_fmu = dict.fromkeys(("start_time", "stop_time", "step_size"), "that of the FMU")
-    add_options(parser, *flags, options=SimulateOptions, defaults={**of_fmu, "output": "nothing is written"})
-    add_plot(parser)
-    add_output(parser)
-    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
-    parser.set_defaults(run_command=_simulate)
+__all__ = ["RUNS"]
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
@@ -100,7 +54,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _mesh(arguments: argparse.Namespace) -> Mesh:
     """The mesh of this one FMU."""
-    simulation = {"stop_time": None, **_SIMULATION}
+    simulation = {"stop_time": None, **SIMULATION}
     if arguments.step_size is not None:
         simulation["step_size"] = arguments.step_size
     try:
@@ -131,4 +85,4 @@ def _as_given(error: ConfigurationError, front: str) -> ConfigurationError:
     return ConfigurationError(short(error.message), findings=findings, hint=error.hint)
 
 
-PARSERS: Parsers = {"run": _add_run, "simulate": _add_simulate}
+RUNS: Runs = {"run": _run, "simulate": _simulate}

@@ -13,36 +13,13 @@ from ..errors import ConfigurationError
 from ..files import replaced
 from ..run.options import VariantOptions
 from ..ssp.configuration_files import names_package
-from .arguments import CommandParser, Parsers, add_json, add_package, add_quiet, add_reaching
+from .arguments import Runs
 from .output.json_output import print_json
-from .run_options import add_options, given_options
+from .run_options import given_options
 
-__all__ = ["PARSERS"]
+__all__ = ["RUNS"]
 
 _CONFIGURATIONS = (".yaml", ".yml")
-_OF_CONFIG = ("algorithm", "step_size", "stop_time", "start_values", "config_values", "allow_code")
-
-
-def _add_graph(parser: CommandParser) -> None:
-    parser.add_argument(
-        "of",
-        nargs="?",
-        metavar="CONFIG|MESH",
-        help="a configuration file or a package of SSP, or the name or key of a running mesh; default: the only one "
-        "that runs",
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="FILE.svg",
-        help="write it into a .svg, .png, .pdf or .txt file; default: text on the terminal",
-    )
-    add_package(parser)
-    add_options(parser, *_OF_CONFIG)
-    add_quiet(parser)
-    add_json(parser, "JSON: one object with all instances and connections")
-    add_reaching(parser)
-    parser.set_defaults(run_command=_graph)
 
 
 def _graph(arguments: argparse.Namespace) -> int:
@@ -95,4 +72,4 @@ def write(graph: SystemGraph, output: Path) -> None:
         raise ConfigurationError(f"the graph '{output}' cannot be written: {error.strerror}.") from error
 
 
-PARSERS: Parsers = {"graph": _add_graph}
+RUNS: Runs = {"graph": _graph}

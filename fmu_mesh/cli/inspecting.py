@@ -4,39 +4,21 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from ..api.inspection import SHOWN_VARIABLES, inspect
+from ..api.inspection import inspect
 from ..errors import ConfigurationError, LoadFailed
 from ..printing import write_data
 from ..ssp.configuration_files import named_package
-from .arguments import CommandParser, Parsers, add_json, add_ssd
+from .arguments import Runs
 from .output.json_output import print_failure
 
-__all__ = ["PARSERS"]
+__all__ = ["RUNS"]
 
 _NARROWEST: Final = 60
 _WIDE: Final = 120
-
-
-def _add_inspect(parser: CommandParser) -> None:
-    text = "the FMU, or the folder of an unpacked one; or a package of SSP"
-    parser.add_argument("fmu", type=Path, metavar="MODEL.fmu|PACKAGE", help=text)
-    parser.add_argument(
-        "variables",
-        nargs="*",
-        metavar="VARIABLE",
-        help="show only these variables, or patterns, such as 'x*'",
-    )
-    parser.add_argument(
-        "--all", action="store_true", help=f"show all variables instead of {SHOWN_VARIABLES} of each causality"
-    )
-    add_ssd(parser)
-    add_json(parser, "print everything as one JSON object")
-    parser.set_defaults(run_command=_inspect)
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
@@ -82,4 +64,4 @@ def _inspect_package(arguments: argparse.Namespace) -> int:
     return 0
 
 
-PARSERS: Parsers = {"inspect": _add_inspect}
+RUNS: Runs = {"inspect": _inspect}

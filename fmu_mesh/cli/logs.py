@@ -5,34 +5,16 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import Final
 
 from ..api.attaching import attach
 from ..errors import ConfigurationError, Interrupted
 from ..text import listed, nearest
 from ..wire.views import LogLine
-from .arguments import CommandParser, Parsers, add_json, add_reaching
+from .arguments import Runs
+from .mesh_arguments import LEVELS
 from .output.json_output import print_json
 
-__all__ = ["PARSERS"]
-
-_LEVELS: Final = ("ok", "warning", "discard", "error", "fatal")
-
-
-def _add_logs(parser: CommandParser) -> None:
-    add_reaching(parser)
-    add_json(parser)
-    parser.set_defaults(run_command=_logs)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument("--instance", metavar="NAME", help="only the messages of this instance")
-    parser.add_argument(
-        "--level",
-        choices=_LEVELS,
-        default="ok",
-        metavar="STATUS",
-        help=f"from this status on: {', '.join(_LEVELS)} (ok)",
-    )
-    parser.add_argument("-f", "--follow", action="store_true", help="also show new messages, until the mesh ends")
+__all__ = ["RUNS"]
 
 
 def _logs(arguments: argparse.Namespace) -> int:
@@ -61,7 +43,7 @@ def _show(line: LogLine, *, as_json: bool) -> None:
 
 def _rank(status: str) -> int:
     """How severe a status is; one that FMI does not know is the least."""
-    return _LEVELS.index(status.lower()) if status.lower() in _LEVELS else 0
+    return LEVELS.index(status.lower()) if status.lower() in LEVELS else 0
 
 
-PARSERS: Parsers = {"logs": _add_logs}
+RUNS: Runs = {"logs": _logs}

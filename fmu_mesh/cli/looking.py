@@ -22,7 +22,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Target
 from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView
-from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, count, number
+from .arguments import Runs
 from .output.json_output import print_json
 from .output.pages import (
     cells,
@@ -36,22 +36,9 @@ from .output.pages import (
     variables,
 )
 
-__all__ = ["PARSERS"]
-
-_REFERENCE = (
-    "`instance.variable` or `MESH/instance.variable`, or a pattern of them (`*` any characters, `?` one, `re:` a "
-    "regular expression); or a key (with wildcards of Zenoh)"
-)
-_WHICH = "a mesh or an instance: NAME, MESH/INSTANCE, or its key"
+__all__ = ["RUNS"]
 
 Run = Callable[[argparse.Namespace, Meshes], int]
-
-
-def _add_question(parser: CommandParser, run: Run) -> None:
-    """Add the flags of a command that asks running meshes."""
-    add_reaching(parser)
-    add_json(parser)
-    parser.set_defaults(run_command=partial(_with_meshes, run))
 
 
 def _with_meshes(run: Run, arguments: argparse.Namespace) -> int:
@@ -64,12 +51,6 @@ def _with_meshes(run: Run, arguments: argparse.Namespace) -> int:
 
 
 # --- ls, status, info
-
-
-def _add_ls(parser: CommandParser) -> None:
-    _add_question(parser, _ls)
-    parser.add_argument("name", nargs="?", metavar="NAME", help="a mesh, or an instance, whose variables are listed")
-    parser.add_argument("-l", "--long", action="store_true", help="also list the variables of every instance")
 
 
 def _ls(arguments: argparse.Namespace, meshes: Meshes) -> int:
@@ -124,11 +105,6 @@ def _statuses(client: MeshClient) -> list[InstanceStatus]:
     return [client.instance_status(name) for name in client.info().instances]
 
 
-def _add_status(parser: CommandParser) -> None:
-    _add_question(parser, _status)
-    parser.add_argument("key", nargs="?", metavar="KEY", help=f"{_WHICH}; default: every mesh")
-
-
 def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
     clients = [meshes.one(arguments.key)] if arguments.key is not None else meshes.all()
     instance = clients[0].instance_in(arguments.key) if arguments.key is not None else None
@@ -153,11 +129,6 @@ def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
     return 0
 
 
-def _add_info(parser: CommandParser) -> None:
-    _add_question(parser, _info)
-    parser.add_argument("key", metavar="KEY", help=_WHICH)
-
-
 def _info(arguments: argparse.Namespace, meshes: Meshes) -> int:
     client = meshes.one(arguments.key)
     instance = client.instance_in(arguments.key)
@@ -176,11 +147,6 @@ def _info(arguments: argparse.Namespace, meshes: Meshes) -> int:
 # --- values
 
 
-def _add_get(parser: CommandParser) -> None:
-    _add_question(parser, _get)
-    parser.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
-
-
 def _get(arguments: argparse.Namespace, meshes: Meshes) -> int:
     rows = []
     for client, targets in _selected(arguments.key, meshes):
@@ -191,14 +157,6 @@ def _get(arguments: argparse.Namespace, meshes: Meshes) -> int:
     if not arguments.json:
         _print(table(rows))
     return 0
-
-
-def _add_set(parser: CommandParser) -> None:
-    _add_question(parser, _set)
-    add_quiet(parser)
-    parser.add_argument("key", metavar="KEY", help="`instance.variable`, `MESH/instance.variable`, or a key")
-    parser.add_argument("value", metavar="VALUE", help="a number, true, false, text, or [a, list] for an array")
-    parser.add_argument("--at", type=number, metavar="T", help="simulation time in s from which on it holds")
 
 
 def _set(arguments: argparse.Namespace, meshes: Meshes) -> int:
@@ -224,12 +182,6 @@ def _value(target: Target, text: str) -> object:
         return text
     is_text = target.variable.type in ("String", "Binary") and not isinstance(value, str | list)
     return text if value is None or is_text else value
-
-
-def _add_watch(parser: CommandParser) -> None:
-    _add_question(parser, _watch)
-    parser.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
-    parser.add_argument("--count", type=count, metavar="N", help="end after N values")
 
 
 def _watch(arguments: argparse.Namespace, meshes: Meshes) -> int:
@@ -266,11 +218,7 @@ def _print(lines: list[str]) -> None:
     print(page(lines))
 
 
-PARSERS: Parsers = {
-    "ls": _add_ls,
-    "status": _add_status,
-    "info": _add_info,
-    "get": _add_get,
-    "set": _add_set,
-    "watch": _add_watch,
+RUNS: Runs = {
+    name: partial(_with_meshes, run)
+    for name, run in {"ls": _ls, "status": _status, "info": _info, "get": _get, "set": _set, "watch": _watch}.items()
 }

@@ -1,11 +1,12 @@
 """The command `fmu-mesh`: finds the module of a command, runs the command, and turns errors into text and an exit code.
 
-Only the module of the command that is asked for is imported.
+Only the arguments of the command that is asked for are imported, and what does the work only if it runs.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import io
 import os
 import sys
@@ -21,49 +22,53 @@ from ..errors import ConfigurationError, FmuMeshError
 from ..printing import guard_streams
 from ..run.limits import needed_mib
 from ..text import nearest
-from .arguments import CommandParser
+from .arguments import CommandParser, Runs
 
 __all__ = ["COMMANDS", "command_parser", "main"]
 
 
-COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
-    "launch": ("running", "run a mesh: one process per node, and the master"),
-    "simulate": ("free_running", "simulate one FMU to its end, as fast as possible; `run` keeps it live"),
-    "run": ("free_running", "run one FMU live until it is stopped; `simulate` runs it to its end"),
-    "sweep": ("sweep", "run a mesh many times with other values, into one table"),
-    "new": ("new_mesh", "write a configuration for FMUs, with suggested connections"),
-    "check": ("checking", "check a configuration and show its plan, without running it"),
-    "graph": ("graphing", "draw the graph of a configuration or of a running mesh"),
-    "convert": ("convert_command", "convert a package of SSP into a configuration file, or a mesh into a package"),
-    "inspect": ("inspecting", "show the properties of an FMU, or of a package of SSP, without running it"),
-    "schema": ("checking", "print the JSON Schema of configurations"),
-    "ls": ("looking", "list meshes, instances and variables"),
-    "status": ("looking", "show the state and progress of a mesh or an instance"),
-    "top": ("top", "show a live table of all instances of a mesh"),
-    "dashboard": ("dashboard", "show and steer running meshes on a page in a browser"),
-    "foxglove": ("foxglove_command", "show a mesh live in Foxglove"),
-    "info": ("looking", "show information about a mesh or an instance"),
-    "get": ("looking", "show current values"),
-    "set": ("looking", "set an unconnected input or a tunable parameter"),
-    "watch": ("looking", "show every value of variables until the mesh ends"),
-    "logs": ("logs", "show the log messages of a mesh"),
-    "wait": ("steering", "wait until a mesh is running, or in another state"),
-    "pause": ("steering", "pause a mesh at a point"),
-    "resume": ("steering", "resume a paused mesh"),
-    "step": ("steering", "run a mesh for some points and pause it again"),
-    "stop": ("steering", "end the run of a mesh"),
-    "rerun": ("rerun_command", "run again what a result file has recorded"),
-    "play": ("play", "play a recorded bag into the inputs of a mesh"),
-    "plot": ("plotting", "plot result files"),
-    "compare": ("comparing", "compare two result files"),
-    "recover": ("recover", "finish the result file of a run that was killed"),
-    "node": ("running", "start one node manually"),
-    "master": ("running", "start the master and the recorder manually"),
-    "gateway": ("running", "start the gateway to ROS manually"),
-    "router": ("running", "run a Zenoh router"),
-    "completion": ("completion", "print the script that completes commands in a shell"),
+COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
+    "launch": ("run", "running", "run a mesh: one process per node, and the master"),
+    "simulate": ("run", "free_running", "simulate one FMU to its end, as fast as possible; `run` keeps it live"),
+    "run": ("run", "free_running", "run one FMU live until it is stopped; `simulate` runs it to its end"),
+    "sweep": ("run", "sweep", "run a mesh many times with other values, into one table"),
+    "new": ("file", "new_mesh", "write a configuration for FMUs, with suggested connections"),
+    "check": ("run", "checking", "check a configuration and show its plan, without running it"),
+    "graph": ("file", "graphing", "draw the graph of a configuration or of a running mesh"),
+    "convert": (
+        "file",
+        "convert_command",
+        "convert a package of SSP into a configuration file, or a mesh into a package",
+    ),
+    "inspect": ("file", "inspecting", "show the properties of an FMU, or of a package of SSP, without running it"),
+    "schema": ("run", "checking", "print the JSON Schema of configurations"),
+    "ls": ("mesh", "looking", "list meshes, instances and variables"),
+    "status": ("mesh", "looking", "show the state and progress of a mesh or an instance"),
+    "top": ("mesh", "top", "show a live table of all instances of a mesh"),
+    "dashboard": ("mesh", "dashboard", "show and steer running meshes on a page in a browser"),
+    "foxglove": ("mesh", "foxglove_command", "show a mesh live in Foxglove"),
+    "info": ("mesh", "looking", "show information about a mesh or an instance"),
+    "get": ("mesh", "looking", "show current values"),
+    "set": ("mesh", "looking", "set an unconnected input or a tunable parameter"),
+    "watch": ("mesh", "looking", "show every value of variables until the mesh ends"),
+    "logs": ("mesh", "logs", "show the log messages of a mesh"),
+    "wait": ("mesh", "steering", "wait until a mesh is running, or in another state"),
+    "pause": ("mesh", "steering", "pause a mesh at a point"),
+    "resume": ("mesh", "steering", "resume a paused mesh"),
+    "step": ("mesh", "steering", "run a mesh for some points and pause it again"),
+    "stop": ("mesh", "steering", "end the run of a mesh"),
+    "rerun": ("run", "rerun_command", "run again what a result file has recorded"),
+    "play": ("mesh", "play", "play a recorded bag into the inputs of a mesh"),
+    "plot": ("file", "plotting", "plot result files"),
+    "compare": ("file", "comparing", "compare two result files"),
+    "recover": ("file", "recover", "finish the result file of a run that was killed"),
+    "node": ("run", "running", "start one node manually"),
+    "master": ("run", "running", "start the master and the recorder manually"),
+    "gateway": ("run", "running", "start the gateway to ROS manually"),
+    "router": ("run", "running", "run a Zenoh router"),
+    "completion": ("file", "completion", "print the script that completes commands in a shell"),
 }
-"""All commands in the order of the help: the module that has it in `PARSERS`, and one line about it."""
+"""All commands in the order of the help: the module that has it in `PARSERS`, that in `RUNS`, and one line about it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -95,13 +100,16 @@ def _run(options: argparse.Namespace) -> int:
     """Run the command; with `--quiet` and without `--json`, nothing of what it prints is shown but errors."""
     quiet = getattr(options, "quiet", False) and not getattr(options, "json", False)
     with redirect_stdout(io.StringIO()) if quiet else nullcontext():
+        runs: Runs = import_module(f".{COMMANDS[options.command][1]}", __package__).RUNS
+        if not gc.isenabled():
+            gc.freeze()  # what was imported stays
+            gc.enable()
         try:
-            code: int = options.run_command(options)
+            return runs[options.command](options)
         except FmuMeshError as error:
             from .output.flag_words import in_flags  # noqa: PLC0415  only then
 
             raise error.in_words(in_flags) from error.__cause__
-    return code
 
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
@@ -140,7 +148,7 @@ def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, M
     """The parser, and the parsers of all commands by name.
 
     Args:
-        needed: the commands whose arguments are needed; the modules of others are not imported.
+        needed: the commands whose arguments are needed.
     """
     parser = CommandParser(
         prog="fmu-mesh",
@@ -150,9 +158,9 @@ def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, M
     )
     parser.add_argument("--version", action="version", version=f"fmu-mesh {__version__}")
     commands: argparse._SubParsersAction[CommandParser] = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for name, (module, text) in COMMANDS.items():
+    for name, (kind, _, text) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
         if name in needed:
-            import_module(f".{module}", __package__).PARSERS[name](command)
+            import_module(f".{kind}_arguments", __package__).PARSERS[name](command)
     return parser, commands.choices

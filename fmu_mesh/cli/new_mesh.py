@@ -34,12 +34,12 @@ from ..ssp.configuration_files import names_package
 from ..system.connections import Variables, resolve_connections, unit_warnings
 from ..text import short_number, short_path, shown
 from ..variables.model_description import ModelDescription, Variable
-from .arguments import CommandParser, Parsers, add_quiet
-from .output.display import teller
+from .arguments import Runs
+from .file_arguments import CONFIGURATION
+from .output.terminal import teller
 
-__all__ = ["PARSERS", "Model", "configuration_for"]
+__all__ = ["RUNS", "Model", "configuration_for"]
 
-_FILE: Final = "mesh.yaml"
 _RESERVED: Final = "mesh"
 """A name that no instance may have."""
 _STEP_S: Final = 0.01
@@ -67,21 +67,9 @@ class Model(msgspec.Struct, frozen=True):
     problem: str = ""
 
 
-def _add_new(parser: CommandParser) -> None:
-    parser.add_argument(
-        "models", nargs="*", type=Path, metavar="FMU", help="a folder with FMUs, or FMUs; default: this folder"
-    )
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE.yaml", help=f"the configuration; default: {_FILE} beside the FMUs"
-    )
-    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
-    add_quiet(parser)
-    parser.set_defaults(run_command=_new)
-
-
 def _new(arguments: argparse.Namespace) -> int:
     paths = _fmus(arguments.models or [Path()])
-    file = arguments.output if arguments.output is not None else paths[0].parent / _FILE
+    file = arguments.output if arguments.output is not None else paths[0].parent / CONFIGURATION
     schema = file.with_suffix(".schema.json")
     if not arguments.force:
         _refuse_to_overwrite(file, schema)
@@ -284,4 +272,4 @@ def _scalar(text: str) -> str:
     return text if read(text, Findings(""), {}) == text else json.dumps(text)
 
 
-PARSERS: Parsers = {"new": _add_new}
+RUNS: Runs = {"new": _new}

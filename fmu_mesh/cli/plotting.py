@@ -19,44 +19,12 @@ from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_result import SweepResult
 from ..system.plan import Plan
 from ..text import listed
-from .arguments import CommandParser, Parsers, add_quiet
+from .arguments import Runs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["PARSERS", "check_plot", "plot_results", "plotted_where_it_ends"]
-
-
-def _add_plot(parser: CommandParser) -> None:
-    parser.add_argument(
-        "results", type=Path, nargs="+", metavar="RESULTS.csv", help="result files, or the folder of a sweep"
-    )
-    parser.add_argument(
-        "--output", type=Path, metavar="FILE.png", help="file of the picture; default: beside the result file"
-    )
-    parser.add_argument(
-        "--variables",
-        nargs="+",
-        metavar="INSTANCE.VARIABLE",
-        help="plot only these, or patterns such as 'motor.*'; default: all of the file",
-    )
-    parser.add_argument("--x", metavar="NAME", help="the variable on the horizontal axis; default: time")
-    parser.add_argument(
-        "--difference", action="store_true", help="also draw the differences of the other files to the first one"
-    )
-    parser.add_argument("--title", metavar="TEXT", help="the title; default: the names of the files")
-    sweep = parser.add_argument_group("of a sweep")
-    sweep.add_argument(
-        "--colour", metavar="NAME", help="the parameter or column that colours the curves; default: the first parameter"
-    )
-    sweep.add_argument(
-        "--heat-map", metavar="COLUMN", help="draw a column over two parameters, such as max(pendulum.a)"
-    )
-    sweep.add_argument(
-        "--axes", nargs=2, metavar="NAME", help="the two parameters of the heat map; default: the first two"
-    )
-    add_quiet(parser)
-    parser.set_defaults(run_command=_plot)
+__all__ = ["RUNS", "check_plot", "plot_results", "plotted_where_it_ends"]
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -177,4 +145,4 @@ def _state_of(result: str | None) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-PARSERS: Parsers = {"plot": _add_plot}
+RUNS: Runs = {"plot": _plot}

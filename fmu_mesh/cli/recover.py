@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from ..api.recovering import recover
-from .arguments import CommandParser, Parsers, add_quiet
+from .arguments import Runs
 
-__all__ = ["PARSERS"]
-
-
-def _add_recover(parser: CommandParser) -> None:
-    parser.add_argument("results", type=Path, metavar="FILE", help="the result file, as the run was given it")
-    add_quiet(parser)
-    parser.set_defaults(run_command=_recover)
+__all__ = ["RUNS"]
 
 
 def _recover(arguments: argparse.Namespace) -> int:
@@ -22,4 +15,4 @@ def _recover(arguments: argparse.Namespace) -> int:
     return 0
 
 
-PARSERS: Parsers = {"recover": _add_recover}
+RUNS: Runs = {"recover": _recover}

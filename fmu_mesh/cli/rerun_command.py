@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-from pathlib import Path
 
 import msgspec
 
@@ -13,21 +12,13 @@ from ..api.result import Result
 from ..api.run_handle import Run
 from ..errors import FmuMeshError
 from ..run.options import RerunOptions
-from .arguments import CommandParser, Parsers, add_json
+from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.reports import RunReporter
-from .run_options import add_options, given_options
-from .running import add_output, interrupted_by_signals, show_event
+from .run_options import given_options
+from .running import interrupted_by_signals, show_event
 
-__all__ = ["PARSERS"]
-
-
-def _add_rerun(parser: CommandParser) -> None:
-    parser.add_argument("result", type=Path, metavar="RESULT", help="the result file of a run")
-    add_options(parser, "output", "allow_code", defaults={"output": "RESULT with .rerun in its name"})
-    add_output(parser)
-    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
-    parser.set_defaults(run_command=_rerun)
+__all__ = ["RUNS"]
 
 
 def _rerun(arguments: argparse.Namespace) -> int:
@@ -59,4 +50,4 @@ def _rerun(arguments: argparse.Namespace) -> int:
     return 0
 
 
-PARSERS: Parsers = {"rerun": _add_rerun}
+RUNS: Runs = {"rerun": _rerun}

@@ -6,15 +6,17 @@ import argparse
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from ..api.mesh_builder import Mesh, load
 from ..config.mesh import MAX_WINDOW
-from ..config.yaml_text import Plain, read_value
 from ..errors import ConfigurationError
 from ..run.options import CallOptions, PlanOptions, RunOptions, option_fields
 from .arguments import add_package, count, endpoint, number, whole
-from .output.display import teller
+from .output.terminal import teller
+
+if TYPE_CHECKING:
+    from ..api.mesh_builder import Mesh
+    from ..config.yaml_text import Plain
 
 __all__ = ["add_configuration", "add_options", "given_options", "mesh_of"]
 
@@ -42,6 +44,8 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
 
 def mesh_of(arguments: argparse.Namespace) -> Mesh:
     """The mesh of CONFIG, in the variant that the flags of `add_configuration` choose."""
+    from ..api.mesh_builder import load  # noqa: PLC0415 the help needs no mesh
+
     return load(arguments.config, ssd=arguments.ssd, ssv=arguments.ssv)
 
 
@@ -114,6 +118,8 @@ def _window(text: str) -> int | Literal["auto"]:
 
 
 def _value(text: str, *, expected: str | None) -> tuple[str, Plain]:
+    from ..config.yaml_text import read_value  # noqa: PLC0415 the help reads no YAML
+
     try:
         return read_value(text)
     except ValueError as error:

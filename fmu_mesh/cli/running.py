@@ -24,71 +24,18 @@ from ..run.roles import run_master, run_node
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..wire.session import run_router
-from .arguments import CommandParser, Parsers, add_json, add_quiet, endpoint
-from .output.display import Display, stdout_as_stderr, summary, warn
+from .arguments import Runs
+from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
+from .output.terminal import stdout_as_stderr
 from .plotting import check_plot, plot_results, plotted_where_it_ends
-from .run_options import add_configuration, add_options, given_options, mesh_of
+from .run_options import given_options, mesh_of
 
 if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
-__all__ = ["PARSERS", "add_output", "add_plot", "interrupted_by_signals", "run_mesh", "show_event"]
-
-
-def _add_launch(parser: CommandParser) -> None:
-    add_configuration(parser)
-    add_options(parser, "paused", "view", "video", "profile")
-    add_options(parser, "processes", "restarts")
-    add_plot(parser)
-    add_output(parser)
-    add_json(parser, "print the outcome as one JSON object, and nothing else on standard output")
-    parser.set_defaults(run_command=_launch)
-
-
-def _add_node(parser: CommandParser) -> None:
-    add_configuration(parser)
-    add_options(parser, "view", "video")
-    parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
-    parser.set_defaults(run_command=_node)
-
-
-def _add_master(parser: CommandParser) -> None:
-    add_configuration(parser)
-    add_options(parser, "paused", "profile")
-    add_plot(parser)
-    add_output(parser)
-    parser.set_defaults(run_command=_master)
-
-
-def _add_gateway(parser: CommandParser) -> None:
-    add_configuration(parser)
-    add_quiet(parser)
-    parser.set_defaults(run_command=_gateway)
-
-
-def _add_router(parser: CommandParser) -> None:
-    parser.add_argument(
-        "--listen",
-        type=endpoint,
-        action="append",
-        metavar="ENDPOINT",
-        help="endpoint where others can connect; repeatable; default: tcp/127.0.0.1:7447",
-    )
-    add_quiet(parser)
-    parser.set_defaults(run_command=_router)
-
-
-def add_plot(parser: CommandParser) -> None:
-    """Add the flag for a picture of the result."""
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="plot the result at the end")
-
-
-def add_output(parser: CommandParser) -> None:
-    """Add the flags for what a run prints."""
-    parser.add_argument("--no-progress", action="store_true", help="no progress line")
-    add_quiet(parser)
+__all__ = ["RUNS", "interrupted_by_signals", "run_mesh", "show_event"]
 
 
 def _launch(arguments: argparse.Namespace) -> int:
@@ -220,10 +167,4 @@ def _router(arguments: argparse.Namespace) -> int:
     return 0
 
 
-PARSERS: Parsers = {
-    "launch": _add_launch,
-    "node": _add_node,
-    "master": _add_master,
-    "gateway": _add_gateway,
-    "router": _add_router,
-}
+RUNS: Runs = {"launch": _launch, "node": _node, "master": _master, "gateway": _gateway, "router": _router}

@@ -5,32 +5,17 @@ from __future__ import annotations
 import argparse
 import re
 import time
-from typing import Final, get_args
+from typing import Final
 
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import ConfigurationError
-from ..wire.views import MeshState
-from .arguments import CommandParser, Parsers, add_json, add_quiet, add_reaching, whole
+from .arguments import Runs, whole
 from .output.json_output import print_json
 
-__all__ = ["PARSERS"]
+__all__ = ["RUNS"]
 
 _TIMEOUT_S = 5.0
-_WAIT_S = 60.0
-
-
-def _add_command(parser: CommandParser) -> None:
-    add_reaching(parser)
-    add_json(parser)
-    add_quiet(parser)
-    parser.set_defaults(run_command=_command)
-    _add_mesh(parser)
-
-
-def _add_step(parser: CommandParser) -> None:
-    _add_command(parser)
-    parser.add_argument("points", nargs="?", metavar="N", help="points (1)")
 
 
 def _command(arguments: argparse.Namespace) -> int:
@@ -55,21 +40,6 @@ _COMMANDS: Final = {"pause": Run.pause, "resume": Run.resume, "stop": Run.stop}
 _NUMBER: Final = re.compile(r"[-+]?[0-9.].*")
 
 
-def _add_wait(parser: CommandParser) -> None:
-    add_reaching(parser, _WAIT_S)
-    add_json(parser, "JSON, as `status` prints it")
-    add_quiet(parser)
-    _add_mesh(parser)
-    parser.add_argument(
-        "--state",
-        choices=get_args(MeshState),
-        default="running",
-        metavar="STATE",
-        help=f"{', '.join(get_args(MeshState))} (running)",
-    )
-    parser.set_defaults(run_command=_wait)
-
-
 def _wait(arguments: argparse.Namespace) -> int:
     # A mesh with a note is running or about to end; an endpoint may appear later.
     patience_s = arguments.timeout if arguments.connect else min(arguments.timeout, _TIMEOUT_S)
@@ -83,14 +53,4 @@ def _wait(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _add_mesh(parser: CommandParser) -> None:
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-
-
-PARSERS: Parsers = {
-    "wait": _add_wait,
-    "pause": _add_command,
-    "resume": _add_command,
-    "step": _add_step,
-    "stop": _add_command,
-}
+RUNS: Runs = {"wait": _wait, **dict.fromkeys(("pause", "resume", "step", "stop"), _command)}

@@ -6,33 +6,31 @@ import argparse
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from pathlib import Path
 from typing import Literal
 
 import msgspec
 
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..sweeps.dask_cluster import dask_executor
-from ..sweeps.planned_sweep import PlannedSweep, SweepOptions, continued_sweep, planned_sweep
+from ..sweeps.planned_sweep import PlannedSweep, continued_sweep, planned_sweep
 from ..sweeps.slurm_sweep import SlurmOptions, SlurmSweep
 from ..sweeps.sweep_folder import is_sweep
+from ..sweeps.sweep_options import SweepOptions
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
 from ..sweeps.variants import Values, read_values
 from ..text import short_path, shown
-from .arguments import CommandParser, Parsers, add_json, add_package, count, whole
-from .output.display import say, stdout_as_stderr
+from .arguments import Runs
 from .output.json_output import Failure, failure_of, print_json
 from .output.progress import SweepProgressLine
-from .output.terminal import error_console
-from .run_options import add_options, given_options, mesh_of
-from .running import add_output, interrupted_by_signals
+from .output.terminal import error_console, say, stdout_as_stderr
+from .run_arguments import HERE
+from .run_options import given_options, mesh_of
+from .running import interrupted_by_signals
 
-__all__ = ["PARSERS", "SweepReport"]
+__all__ = ["RUNS", "SweepReport"]
 
 _LOOK_S = 0.1
 _SHOWN_FAILURES = 5
-_HERE = "here"
-"""`--dask` without an address."""
 _OF_FOLDER = {"allow_code", "on_notice", "resume", "workers"}
 """The options that go with the folder of a sweep, which says all others."""
 
@@ -63,60 +61,6 @@ class SweepReport(msgspec.Struct, frozen=True):
     folder: str | None = None
     table: str | None = None
     error: Failure | None = None
-
-
-def _add_sweep(parser: CommandParser) -> None:
-    parser.add_argument(
-        "config",
-        type=Path,
-        metavar="CONFIG",
-        help="the configuration file or package; or the folder of a sweep, to continue it",
-    )
-    add_package(parser)
-    what = parser.add_argument_group("what varies")
-    what.add_argument(
-        "--vary",
-        action="append",
-        default=[],
-        metavar="NAME=VALUES",
-        help="values of instance.variable or of a key of CONFIG: LOW:HIGH:COUNT, LOW:HIGH:COUNT:log, LOW:HIGH for a "
-        "sampler, or VALUE,VALUE; repeatable: all combinations run",
-    )
-    add_options(what, "sampler", "seed", options=SweepOptions)
-    add_options(parser.add_argument_group("what is kept"), "reduce", "folder", "curves", options=SweepOptions)
-    how = parser.add_argument_group("how it runs")
-    add_options(how, "resume", "force", "workers", "max_instances", "processes", "reset", options=SweepOptions)
-    how.add_argument(
-        "--dask",
-        nargs="?",
-        const=_HERE,
-        metavar="ADDRESS",
-        help="run on the Dask cluster at this address; without one, on a Dask cluster of this host",
-    )
-    how.add_argument("--part", type=_part, metavar="K/N", help="run the K-th of N parts of FOLDER, without a table")
-    slurm = parser.add_argument_group("on a Slurm cluster; FOLDER is on a file system that its hosts share")
-    slurm.add_argument("--slurm", action="store_true", help="submit an array of jobs, and follow it")
-    slurm.add_argument("--tasks", type=count, default=16, metavar="N", help="tasks of the array, at most (16)")
-    slurm.add_argument(
-        "--slurm-option",
-        action="append",
-        default=[],
-        metavar="OPTION",
-        help="an option of sbatch, as in --slurm-option=--partition=short; repeatable",
-    )
-    slurm.add_argument("--no-wait", action="store_true", help="submit only; the same command follows it later")
-    add_options(
-        parser.add_argument_group("instead of what CONFIG says, for all runs"),
-        "algorithm",
-        "step_size",
-        "stop_time",
-        "start_values",
-        "config_values",
-    )
-    add_options(parser, "allow_code")
-    add_output(parser)
-    add_json(parser, "print what came out as one JSON object, and nothing else on standard output")
-    parser.set_defaults(run_command=_sweep)
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
@@ -174,12 +118,13 @@ def _started(planned: PlannedSweep, arguments: argparse.Namespace) -> Iterator[S
         with SlurmSweep(planned, options) as sweep:
             yield sweep
         return
+    part = SweepPart(*arguments.part) if arguments.part is not None else None
     dask: AbstractContextManager[Executor | None] = nullcontext()
     if arguments.dask is not None:
-        dask = dask_executor(None if arguments.dask == _HERE else arguments.dask, arguments.workers)
+        dask = dask_executor(None if arguments.dask == HERE else arguments.dask, arguments.workers)
     with (
         dask as executor,
-        ExecutorSweep(planned, executor=executor, workers=arguments.workers, part=arguments.part) as sweep,
+        ExecutorSweep(planned, executor=executor, workers=arguments.workers, part=part) as sweep,
     ):
         yield sweep
 
@@ -250,11 +195,4 @@ def _show(sweep: Sweep) -> None:
     )
 
 
-def _part(text: str) -> SweepPart:
-    number, slash, of = text.partition("/")
-    if not (slash and 1 <= whole(number) <= whole(of)):
-        raise argparse.ArgumentTypeError(f"'{text}' is no part such as 1/8")
-    return SweepPart(int(number), int(of))
-
-
-PARSERS: Parsers = {"sweep": _add_sweep}
+RUNS: Runs = {"sweep": _sweep}

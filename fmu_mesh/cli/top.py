@@ -22,16 +22,15 @@ from ..api.run_handle import Run
 from ..api.tables import shortened, table, width_of
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
 from ..wire.views import InstanceStatus, MeshStatus
-from .arguments import CommandParser, Parsers, add_json, add_reaching, positive_seconds
+from .arguments import Runs
 from .output.json_output import print_json
 from .output.pages import progress, seconds
 from .output.screen import Screen
 from .output.sparklines import Histories, sparkline_signs
 from .output.terminal import may_draw
 
-__all__ = ["PARSERS", "page"]
+__all__ = ["RUNS", "page"]
 
-_INTERVAL_S = 1.0
 _VALUES_PER_LOOK: Final = 4
 """Values of a variable in the time between two looks."""
 _HEADING = ["instance", "state", "point", "time", "step time", "wait", "points/s", "factor", "restarts", "activity"]
@@ -43,24 +42,6 @@ _DISPENSABLE: Final = ("time", "factor", "restarts", "state")
 """Columns that are left out on a narrow terminal, in this order; the head line has the time and the state."""
 
 Look = tuple[MeshStatus, dict[str, InstanceStatus]]
-
-
-def _add_top(parser: CommandParser) -> None:
-    add_reaching(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument("--once", action="store_true", help="show it once and exit")
-    parser.add_argument(
-        "--interval", type=positive_seconds, default=_INTERVAL_S, metavar="S", help="time between two looks in s (1)"
-    )
-    parser.add_argument(
-        "--watch",
-        nargs="+",
-        default=[],
-        metavar="INSTANCE.VARIABLE",
-        help="also show the course of these variables (or patterns, such as 'arm*.x')",
-    )
-    add_json(parser, "JSON, one object per look")
-    parser.set_defaults(run_command=_top)
 
 
 def _top(arguments: argparse.Namespace) -> int:
@@ -258,4 +239,4 @@ def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -
     ]
 
 
-PARSERS: Parsers = {"top": _add_top}
+RUNS: Runs = {"top": _top}

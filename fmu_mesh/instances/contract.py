@@ -9,19 +9,21 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
 from ..config.instance_sections import InstanceSection
 from ..config.mesh import LimitsConfig
-from ..rings.native import NativeStep, Span
-from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
 from ..system.process_sharing import Claims
 from ..variables.model_description import ModelDescription, Value
 from .kept_models import KeptModels
+
+if TYPE_CHECKING:
+    from ..rings.native import NativeStep, Span
+    from ..rings.ring import Ring
 
 __all__ = [
     "ChangesProcess",

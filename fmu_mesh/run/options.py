@@ -341,7 +341,7 @@ def option_fields(options: type[CallOptions]) -> dict[str, Option]:
     for name, default in zip(options.__struct_fields__, options.__struct_defaults__, strict=True):
         kind, option = annotations[name].__origin__, annotations[name].__metadata__[0]
         text = " | ".join("None" if one is NoneType else inspect.formatannotation(one) for one in kinds_of(kind))
-        text = re.sub(r"\b(?:[a-z_]+\.)+(?=[A-Z])|'(?=MeshStatus|Event|\], object)", "", text)
+        text = re.sub(r"\b(?:[a-z_]+\.)+(?=[A-Z])|'(?=MeshStatus|Event|Result|\], object)", "", text)
         by = Parameter.POSITIONAL_OR_KEYWORD if name in options.__match_args__ else Parameter.KEYWORD_ONLY
         parameter = Parameter(name, by, default=default, annotation=text)
         fields[name] = replace(option, parameter=parameter, kinds=kinds_of(kind))

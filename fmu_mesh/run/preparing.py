@@ -22,8 +22,6 @@ from ..instances.configuration import examine_data
 from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, claims, content, describe, expected_model
-from ..ros.bags.scenario_bags import bag_values
-from ..ros.gateway.mapping import resolve as resolve_ros
 from ..ssp.configuration_files import read_configuration
 from ..system.plan import Plan, make_plan
 from ..system.point_loops import warn_of_point_loops
@@ -162,7 +160,10 @@ def planned(
     known = known or KnownModels()
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
-    resolve_ros(loaded, descriptions, findings)
+    if loaded.config.ros is not None:
+        from ..ros.gateway.mapping import resolve  # noqa: PLC0415 most configurations have no such section
+
+        resolve(loaded, descriptions, findings)
     scenario = _scenario(loaded, descriptions, findings)
     sections = loaded.config.instances
 
@@ -201,6 +202,8 @@ def _scenario(
         return None
     if source is None:
         return None
+    from ..ros.bags.scenario_bags import bag_values  # noqa: PLC0415 as above
+
     own = findings if source.prefix else source.findings()
     bags = bag_values(source, loaded, descriptions, own)
     if own is not findings:

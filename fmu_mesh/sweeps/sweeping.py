@@ -33,8 +33,9 @@ from ..errors import CallRefused, FmuMeshError, Interrupted, KeyboardInterrupted
 from ..run.options import takes
 from ..text import counted
 from ..wire.runtime import remove_stale_folders
-from .planned_sweep import PlannedSweep, SweepOptions, planned_sweep
+from .planned_sweep import PlannedSweep, planned_sweep
 from .sweep_folder import RowFile
+from .sweep_options import SweepOptions
 from .sweep_result import SweepResult
 from .variant_run import Row, run_variant
 from .worker_pool import WorkerLost, WorkerPool, unguarded_call

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -223,6 +222,8 @@ def versions() -> dict[str, str]:
 
     The first call imports what reads metadata of packages, which takes some milliseconds.
     """
+    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 see above
+
     found = {"fmu_mesh": __version__}
     for name, package in _PACKAGES.items():
         try:

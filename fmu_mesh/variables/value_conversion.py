@@ -9,14 +9,15 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from typing import Any, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from ctypes import c_float
+from typing import TYPE_CHECKING, Any, cast
 
 from ..text import listed, nearest
 from .model_description import Variable
 from .value_types import DTYPES, INTEGERS, PlainValue, Value, VariableType, flattened, nested
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 __all__ = [
     "FINITE",
@@ -37,7 +38,7 @@ FINITE = "a finite number, or `not_finite: record` for its instance"
 """What is expected where a value that is NaN or infinite is refused."""
 
 _NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
-_FLOAT32_MAX = float(np.finfo(np.float32).max)
+_FLOAT32_MAX = (2 - 2**-23) * 2.0**127
 
 
 class ValueRefused(ValueError):
@@ -73,10 +74,14 @@ def to_value(plain: object, variable: Variable, *, finite: bool = False) -> Valu
     Raises:
         ValueRefused: it is no value of the variable's type and shape, or out of its range.
     """
-    if isinstance(plain, np.ndarray) and _is_value(plain, variable) and not (finite and not np.isfinite(plain).all()):
-        array: list[Any] = plain.tolist()
-        return array
-    plain = plain.tolist() if isinstance(plain, np.ndarray | np.generic) else plain
+    if hasattr(plain, "tolist"):
+        import numpy as np  # noqa: PLC0415 only for whoever has given an array
+
+        array: Any = plain
+        values: list[Any] = array.tolist()
+        plain = values
+        if _is_value(array, variable) and not (finite and not np.isfinite(array).all()):
+            return values
     values = [_element(element, variable) for element in _elements(plain, variable, variable.shape)]
     if finite and not is_finite(values):
         raise ValueRefused(f"{plain!r} is not finite", expected=FINITE)
@@ -139,6 +144,8 @@ def from_plain(plain: PlainValue, type_: str, shape: tuple[int, ...] = ()) -> An
     """
     if shape:
         elements = [from_plain(element, type_) for element in flattened(plain, len(shape))]
+        import numpy as np  # noqa: PLC0415 only whoever wants arrays
+
         return np.array(elements, DTYPES[cast("VariableType", type_)]).reshape(shape)
     if type_ == "Binary" and isinstance(plain, str):
         return base64.b64decode(plain)
@@ -219,7 +226,7 @@ def _float(plain: float | str, variable: Variable) -> float | None:
         return None
     if variable.type == "Float64" or not math.isfinite(value):
         return value
-    return float(np.float32(value)) if abs(value) <= _FLOAT32_MAX else None
+    return c_float(value).value if abs(value) <= _FLOAT32_MAX else None
 
 
 def _binary(text: str) -> bytes | None:

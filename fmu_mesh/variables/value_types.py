@@ -10,9 +10,6 @@ import itertools
 import re
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-import numpy as np
-from numpy.typing import DTypeLike
-
 __all__ = [
     "DTYPES",
     "FMI2_TYPES",
@@ -59,21 +56,21 @@ else:
     Value = Any  # msgspec cannot decode a union of str and bytes, although MessagePack tells them apart
 """A value as Python has it: an array as nested lists, row by row; Binary as bytes."""
 
-DTYPES: Final[dict[VariableType, DTypeLike]] = {
-    "Float64": np.float64,
-    "Int64": np.int64,
-    "UInt64": np.uint64,
-    "Enumeration": np.int64,
-    "Float32": np.float32,
-    "Int32": np.int32,
-    "UInt32": np.uint32,
-    "Int16": np.int16,
-    "UInt16": np.uint16,
-    "Int8": np.int8,
-    "UInt8": np.uint8,
-    "Boolean": np.bool_,
-    "String": np.object_,
-    "Binary": np.object_,
+DTYPES: Final[dict[VariableType, str]] = {
+    "Float64": "float64",
+    "Int64": "int64",
+    "UInt64": "uint64",
+    "Enumeration": "int64",
+    "Float32": "float32",
+    "Int32": "int32",
+    "UInt32": "uint32",
+    "Int16": "int16",
+    "UInt16": "uint16",
+    "Int8": "int8",
+    "UInt8": "uint8",
+    "Boolean": "bool",
+    "String": "object",
+    "Binary": "object",
 }
 """The array type of each type, in the order of the parts of a row: larger elements first, so all are aligned."""
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fmu_mesh
-from fmu_mesh.api.simulating import SimulateOptions
+from fmu_mesh.api.simulate_options import SimulateOptions
 from fmu_mesh.run.options import CallOptions, OpenOptions, PlanOptions, RunOptions, option_fields
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 from tests.helpers import FMUS, write_config

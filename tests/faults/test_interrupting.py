@@ -27,7 +27,7 @@ class Finder:
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Finder())
-sys.argv = ["fmu-mesh", "launch", "--help"]
+sys.argv = ["fmu-mesh", "check", "gone.yaml"]
 runpy.run_module("fmu_mesh", run_name="__main__")
 """
 
@@ -103,7 +103,7 @@ def test_a_run_that_is_interrupted_is_plotted_up_to_there(place: Place, options:
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("module", ["fmu_mesh.cli.main", "fmu_mesh.cli.running", "fmu_mesh.node.node"])
+@pytest.mark.parametrize("module", ["fmu_mesh.cli.main", "fmu_mesh.cli.run_arguments", "fmu_mesh.cli.checking"])
 def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other(module: str) -> None:
     program = [sys.executable, "-c", _INTERRUPTED_WHILE_LOADING.replace("MODULE", module)]
 

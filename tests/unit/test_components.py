@@ -19,10 +19,10 @@ from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import CallRefused, ConfigurationError, FmuError, InitializationFailed, StepFailed
 from fmu_mesh.instances.contract import Opening
 from fmu_mesh.instances.python.component_description import description_of
-from fmu_mesh.instances.python.importing import being_imported, component_section
+from fmu_mesh.instances.python.importing import component_section
 from fmu_mesh.instances.python.python_instance import PythonInstance
 from fmu_mesh.instances.python.python_kind import KIND_OF_COMPONENTS
-from fmu_mesh.instances.python.python_section import PythonConfig, class_place_of
+from fmu_mesh.instances.python.python_section import PythonConfig, class_place_of, importing
 from fmu_mesh.instances.python.unit_names import base_unit_of
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.threads import one_thread_meanwhile
@@ -485,10 +485,10 @@ def test_only_the_thread_that_imports_a_component_is_refused_a_run(tmp_path: Pat
     """Another thread of the program may start one meanwhile."""
     (tmp_path / "slow.py").write_text(
         "import threading, fmu_mesh\n"
-        "from fmu_mesh.instances.python.importing import being_imported\n"
-        "here = being_imported()\n"
+        "from fmu_mesh.instances.python.python_section import importing\n"
+        "here = importing.get()\n"
         "there = []\n"
-        "other = threading.Thread(target=lambda: there.append(being_imported()))\n"
+        "other = threading.Thread(target=lambda: there.append(importing.get()))\n"
         "other.start()\nother.join()\n"
         "class C(fmu_mesh.Component):\n"
         "    here = fmu_mesh.Output(str(here), type='String')\n"
@@ -502,7 +502,7 @@ def test_only_the_thread_that_imports_a_component_is_refused_a_run(tmp_path: Pat
     instance = PythonInstance(Opening(name="c", path=path, section=section, description=description, folder=tmp_path))
 
     assert instance.get_values(["here", "there"]) == ["slow.py", "[None]"]
-    assert being_imported() is None
+    assert importing.get() is None
     assert threading.active_count() >= 1
     instance.close()
 

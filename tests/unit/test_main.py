@@ -30,11 +30,14 @@ def imported(*arguments: str) -> set[str]:
 
 
 def test_each_module_has_the_commands_that_the_table_names() -> None:
-    modules = {module for module, _ in COMMANDS.values()}
+    arguments = {f"{of}_arguments" for of, _, _ in COMMANDS.values()}
+    modules = {module for _, module, _ in COMMANDS.values()}
 
-    found = {(name, module) for module in modules for name in import_module(f"fmu_mesh.cli.{module}").PARSERS}
+    parsers = {(name, module) for module in arguments for name in import_module(f"fmu_mesh.cli.{module}").PARSERS}
+    runs = {(name, module) for module in modules for name in import_module(f"fmu_mesh.cli.{module}").RUNS}
 
-    assert found == {(name, module) for name, (module, _) in COMMANDS.items()}
+    assert parsers == {(name, f"{of}_arguments") for name, (of, _, _) in COMMANDS.items()}
+    assert runs == {(name, module) for name, (_, module, _) in COMMANDS.items()}
 
 
 @pytest.mark.parametrize("arguments", [("--version",), ("--help",)])
@@ -42,16 +45,29 @@ def test_the_version_and_the_list_of_commands_need_nothing_large(arguments: Sequ
     assert imported(*arguments) & HEAVY == set()
 
 
+def test_the_arguments_of_all_commands_need_nothing_large() -> None:
+    program = "import sys; from fmu_mesh.cli.main import command_parser; command_parser(); print(*sys.modules)"
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+
+    modules = set(done.stdout.split())
+    assert modules & (HEAVY - {"logging"}) == set()
+    assert not [name for name in modules if name.startswith(("fmu_mesh.api", "fmu_mesh.node", "fmu_mesh.ros."))]
+
+
 @pytest.mark.parametrize(
-    ("command", "not_needed"),
+    ("arguments", "not_needed"),
     [
-        ("ls", {"fmpy", "ruamel", "matplotlib"}),
-        ("stop", {"fmpy", "ruamel", "matplotlib"}),
-        ("inspect", {"zenoh", "matplotlib"}),
+        (("ls",), {"fmpy", "ruamel", "matplotlib", "rich"}),
+        (("inspect", "fmus/Gain.fmu"), {"zenoh", "matplotlib", "rich"}),
+        (
+            ("check", "configs/pendulum_delay.yaml"),
+            {"zenoh", "matplotlib", "rich", "importlib.metadata", "fmu_mesh.api.run_handle", "fmu_mesh.ros.bags"},
+        ),
     ],
 )
-def test_a_command_does_not_import_what_only_others_need(command: str, not_needed: set[str]) -> None:
-    assert imported(command, "--help") & not_needed == set()
+def test_a_command_does_not_import_what_only_others_need(arguments: Sequence[str], not_needed: set[str]) -> None:
+    assert imported(*arguments) & not_needed == set()
 
 
 def test_the_version_imports_this_much_of_the_package_and_little_else() -> None:

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from fmu_mesh.api.simulating import SimulateOptions
+from fmu_mesh.api.simulate_options import SimulateOptions
 from fmu_mesh.cli.main import COMMANDS
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import check

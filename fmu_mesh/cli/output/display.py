@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
-import os
-import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Final, Self
 
@@ -23,11 +20,10 @@ from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
-from .flag_words import in_flags
 from .progress import RunProgressLine
-from .terminal import error_console
+from .terminal import error_console, say
 
-__all__ = ["Display", "say", "stdout_as_stderr", "summary", "teller", "warn"]
+__all__ = ["Display", "summary", "warn"]
 
 _SHOWN_TIMES: Final = 5
 _WARNINGS: Final = 5
@@ -186,16 +182,6 @@ class Display:
             self._release(lambda line: status.progress[self._plan.node_of(line.instance)] > line.point)
 
 
-def say(text: str) -> None:
-    """Print one line on standard error before a run."""
-    print(f"fmu-mesh: {paragraph(in_flags(text))}", file=sys.stderr, flush=True)
-
-
-def teller(*, quiet: bool) -> Callable[[str], None]:
-    """`say`, or nothing if ``quiet``."""
-    return (lambda _text: None) if quiet else say
-
-
 def warn(plan: Plan) -> None:
     """Print the first five warnings about a system on standard error before it runs, and that it could be faster."""
     if (slower := slower_than_it_could_be()) is not None:
@@ -204,21 +190,6 @@ def warn(plan: Plan) -> None:
         say(f"warning: {warning}")
     if (rest := len(plan.system.warnings) - _WARNINGS) > 0:
         say(f"warning: and {rest} more, which `fmu-mesh check` shows")
-
-
-@contextmanager
-def stdout_as_stderr() -> Iterator[None]:
-    """In the block, output of an FMU in this process goes to standard error: standard output is for results."""
-    sys.stdout.flush()
-    stdout = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        ctypes.CDLL(None).fflush(None)  # output of the FMU may still be in the buffer of the C library
-        os.dup2(stdout, 1)
-        os.close(stdout)
 
 
 def summary(plan: Plan, outcome: Outcome) -> list[str]:

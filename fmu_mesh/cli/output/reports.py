@@ -18,8 +18,8 @@ from ...errors import ErrorReport, FmuMeshError
 from ...run.events import Event, Restarted
 from ...run.outcome import Outcome
 from ...run.run_plan import RunPlan
-from .display import stdout_as_stderr
 from .json_output import Failure, failure_of, print_json
+from .terminal import stdout_as_stderr
 
 __all__ = ["RunReport", "RunReporter"]
 

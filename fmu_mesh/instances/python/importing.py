@@ -14,9 +14,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from importlib.abc import FileLoader
-from importlib.metadata import packages_distributions
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeGuard
@@ -27,22 +25,12 @@ from ...variables.model_description import ModelDescription
 from .component import Component
 from .component_description import description_of
 from .own_modules import OwnModules
-from .python_section import ClassPlace
+from .python_section import ClassPlace, importing
 
-__all__ = ["ImportedComponent", "being_imported", "component_section"]
+__all__ = ["ImportedComponent", "component_section"]
 
 _OWN = Path(__file__).resolve().parents[2]
 _TEXT_CHARACTERS = 500
-_importing: ContextVar[str | None] = ContextVar("importing", default=None)
-
-
-def being_imported() -> str | None:
-    """The file or module that this thread imports as a component just now; None if it imports none.
-
-    Whoever starts a run asks this first. A program that starts a run at its top, without `if __name__ == "__main__":`,
-    would otherwise start it again in each process that imports a component of that program.
-    """
-    return _importing.get()
 
 
 class ImportedComponent:
@@ -154,11 +142,11 @@ class _SourceFile(FileLoader):
 
 @contextmanager
 def _marked(place: str) -> Iterator[None]:
-    token = _importing.set(place)
+    token = importing.set(place)
     try:
         yield
     finally:
-        _importing.reset(token)
+        importing.reset(token)
 
 
 def _is_component(value: object) -> TypeGuard[type[Component]]:
@@ -187,6 +175,8 @@ def component_section(cls: object) -> tuple[dict[str, str], ModelDescription]:
         raise _cannot_import(cls, reason, "Write it to a file and import it from there.")
     spec = module.__spec__
     name = spec.name if spec is not None else cls.__module__
+    from importlib.metadata import packages_distributions  # noqa: PLC0415 slow, and only this needs it
+
     package = name.partition(".")[0]
     place = name if package != name and package in packages_distributions() else str(file)
     description = description_of(cls, hashlib.sha256(file.read_bytes()).hexdigest())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -14,7 +15,14 @@ from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotF
 from ...variables.model_description import ModelDescription
 from ...variables.value_types import PlainValue
 
-__all__ = ["ClassPlace", "PythonConfig", "class_place_of"]
+__all__ = ["ClassPlace", "PythonConfig", "class_place_of", "importing"]
+
+importing: ContextVar[str | None] = ContextVar("importing", default=None)
+"""The file or module that this thread imports as a component just now. Whoever starts a run looks here first.
+
+A program that starts a run at its top, without `if __name__ == "__main__":`, would otherwise start it again in each
+process that imports a component of that program.
+"""
 
 
 class ClassPlace(NamedTuple):
