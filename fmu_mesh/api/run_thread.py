@@ -12,6 +12,7 @@ import threading
 from concurrent.futures import Future
 from pathlib import Path
 from shutil import rmtree
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
@@ -19,7 +20,6 @@ from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted,
 from ..printing import paragraph
 from ..recorder.arrays_file import bytes_of_a_row, read_arrays
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
-from ..run.in_process import InProcessRun
 from ..run.launcher import Launcher
 from ..run.options import StartOptions
 from ..run.outcome import Outcome
@@ -29,6 +29,9 @@ from ..wire.views import MeshStatus
 from .plan_options import memory_of
 from .result import Result, result_of, types_of
 from .result_reading import Columns
+
+if TYPE_CHECKING:
+    from ..run.in_process import InProcessRun
 
 __all__ = ["RunThread", "check_memory"]
 
@@ -145,7 +148,11 @@ class RunThread:
                 self._take(Restarted(error.report(), plan.restarts, most))
 
     def _run_once(self, plan: RunPlan) -> Outcome:
-        kind = Launcher if self._settings.processes else InProcessRun
+        kind: type[Launcher | InProcessRun] = Launcher
+        if not self._settings.processes:
+            from ..run.in_process import InProcessRun  # noqa: PLC0415 it needs all that nodes do
+
+            kind = InProcessRun
         with self._changing:
             if self._failure is not None:
                 raise self._failure

@@ -15,8 +15,6 @@ from ..api.result_reading import require_readable
 from ..errors import ConfigurationError, FmuMeshError
 from ..installing import require
 from ..run.run_plan import RunPlan
-from ..sweeps.sweep_folder import is_sweep
-from ..sweeps.sweep_result import SweepResult
 from ..system.plan import Plan
 from ..text import listed
 from .arguments import Runs
@@ -24,10 +22,15 @@ from .arguments import Runs
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ..sweeps.sweep_result import SweepResult
+
 __all__ = ["RUNS", "check_plot", "plot_results", "plotted_where_it_ends"]
 
 
 def _plot(arguments: argparse.Namespace) -> int:
+    from ..sweeps.sweep_folder import is_sweep  # noqa: PLC0415 the commands that run a mesh need none
+    from ..sweeps.sweep_result import SweepResult  # noqa: PLC0415 as above
+
     require("matplotlib", "plots")
     first, *others = arguments.results
     sweeps = [str(path) for path in arguments.results if is_sweep(path)]

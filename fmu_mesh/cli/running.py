@@ -18,9 +18,7 @@ from ..api.result import Result, result_of
 from ..api.run_handle import Run
 from ..errors import ConfigurationError
 from ..run.events import Event, Reachable
-from ..run.gateway_role import run_gateway
 from ..run.process import ended_by_signals
-from ..run.roles import run_master, run_node
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..wire.session import run_router
@@ -131,11 +129,15 @@ def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> int:
+    from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
+
     run_node(mesh_of(arguments).plan(**given_options(arguments)).node(arguments.node))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
+    from ..run.roles import run_master  # noqa: PLC0415 as above
+
     plan = _planned(mesh_of(arguments), given_options(arguments), arguments)
     with (
         plotted_where_it_ends(plan.plan, arguments.plot),
@@ -149,6 +151,8 @@ def _master(arguments: argparse.Namespace) -> int:
 
 
 def _gateway(arguments: argparse.Namespace) -> int:
+    from ..run.gateway_role import run_gateway  # noqa: PLC0415 as above
+
     def show(event: Event) -> None:
         if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)

@@ -137,7 +137,7 @@ def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:
         if arguments.no_wait:
             say(f"`{sweep.again}` follows it, and `scancel {job.id}` ends it")
             return
-    line = SweepProgressLine(sweep.mesh, error_console(), show=not (arguments.no_progress or arguments.quiet))
+    line = SweepProgressLine(sweep.mesh, error_console, show=not (arguments.no_progress or arguments.quiet))
     line.start()
     try:
         while True:

@@ -6,6 +6,7 @@ needs another Python is started by exec. The process ends with the process that 
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 from functools import partial
@@ -46,6 +47,7 @@ def _run(role: str, *arguments: str) -> int:
     from .fork_server import serve  # noqa: PLC0415 as above
     from .process import die_with_parent  # noqa: PLC0415 as above
 
+    gc.disable()  # until `serve` has imported everything: as in `fmu_mesh.__main__`
     die_with_parent(signal.SIGKILL)  # which also ends a process that is stopped
     setproctitle("fmu-mesh fork server")
     job = serve(int(arguments[0]), partial(_job, forks=True))

@@ -228,6 +228,7 @@ def serve(control: int, job: Callable[..., Job]) -> Job | None:
     versions()
     gc.collect()
     gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
+    gc.enable()
     return _Server(control, job).run()
 
 

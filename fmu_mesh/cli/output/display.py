@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cached_property
 from types import TracebackType
-from typing import Final, Self
-
-from rich.markup import escape
+from typing import TYPE_CHECKING, Final, Self
 
 from ...api.plan_page import slower_than_it_could_be
 from ...api.result import summary_of
@@ -22,6 +21,9 @@ from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
 from .progress import RunProgressLine
 from .terminal import error_console, say
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 __all__ = ["Display", "summary", "warn"]
 
@@ -49,14 +51,17 @@ class Display:
 
     def __init__(self, plan: Plan, *, show_progress: bool, quiet: bool = False, waits_for_nodes: bool = True) -> None:
         self._plan = plan
-        self._console = error_console()
         self._quiet = quiet
-        self._progress = RunProgressLine(plan, self._console, show=show_progress and not quiet)
+        self._progress = RunProgressLine(plan, lambda: self._console, show=show_progress and not quiet)
         self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()
         self._over = False
         self._endpoints: Sequence[str] = ()
+
+    @cached_property
+    def _console(self) -> Console:
+        return error_console()  # needed when the processes of a run have started
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -71,7 +76,7 @@ class Display:
         for (instance, message), times in self._times.items():
             if times > _SHOWN_TIMES:
                 more = f"{times - _SHOWN_TIMES} more {'times' if times > _SHOWN_TIMES + 1 else 'time'}"
-                self._print(f"[dim]{escape(instance)}: {escape(paragraph(message))} ({more})[/]")
+                self._print(f"{instance}: {paragraph(message)} ({more})", "dim")
 
     def event(self, event: Event) -> None:
         """Show one event of the master."""
@@ -98,7 +103,7 @@ class Display:
     def _show_address(self) -> None:
         """Show the endpoints that the user asked for, or else the socket."""
         if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
-            self._print(escape(f"mesh '{self._plan.system.config.mesh}' at {shown}"))
+            self._print(f"mesh '{self._plan.system.config.mesh}' at {shown}")
         self._endpoints = ()
 
     def _warn(self) -> None:
@@ -110,7 +115,7 @@ class Display:
             and (wide := ", ".join(filter(leaves_host, config.zenoh.listen)))
         ):
             text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
-            self._print(f"[yellow]{escape(text)}[/]")
+            self._print(text, "yellow")
 
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
@@ -121,7 +126,7 @@ class Display:
 
     def ended(self, early: FmuMeshError) -> None:
         """Show why a run ended before its last point without a failure."""
-        self._print(escape(str(early)))
+        self._print(str(early))
 
     def log(self, line: LogLine) -> None:
         """Show one log message of an FMU. After five times, the same text is only counted.
@@ -160,17 +165,19 @@ class Display:
                 return
         style = _STYLES.get(line.status, "dim")
         where = f"{line.instance} at point {line.point}"
-        self._print(f"[{style}]{escape(where)}: {escape(paragraph(line.message))}[/]")
+        self._print(f"{where}: {paragraph(line.message)}", style)
 
     def _output(self, name: str, text: str) -> None:
         """Show a line of the output of a process."""
         if text:
-            self._print(f"[dim]{escape(name)} |[/] {escape(printable(text.expandtabs()))}")
+            self._print(printable(text.expandtabs()), front=f"{name} | ")
 
-    def _print(self, text: str) -> None:
-        """Print marked-up, printable text; nobody needs it so much that a full disk ends the run."""
-        with suppress(OSError):
-            self._console.print(text, soft_wrap=True)  # a wrapped line could begin with words of a model
+    def _print(self, text: str, style: str = "", *, front: str = "") -> None:
+        """Print printable text, after a dim ``front``; nobody needs it so much that a full disk ends the run."""
+        from rich.text import Text  # noqa: PLC0415 as `_console`
+
+        with suppress(OSError):  # a wrapped line could begin with words of a model
+            self._console.print(Text.assemble((front, "dim"), (text, style)), soft_wrap=True)
 
     def _status(self, status: MeshStatus) -> None:
         self._progress.status(status)

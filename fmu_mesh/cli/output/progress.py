@@ -5,15 +5,10 @@ Owns which parts are left out on a narrow terminal. It never wraps: a wrapped li
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
-
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
 
 from ...api.tables import shortened
 from ...simtime import TimeGrid
@@ -22,6 +17,9 @@ from ...wire.views import MeshStatus
 from .terminal import may_draw
 
 if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.live import Live
+
     from ...sweeps.sweeping import SweepProgress
 
 __all__ = ["RunProgressLine", "SweepProgressLine", "progress_parts"]
@@ -38,14 +36,17 @@ class ProgressLine(ABC):
 
     Args:
         name: of what is going on.
-        console: where it is drawn, if that is a terminal.
+        console: returns where it is drawn, if standard error is a terminal: Rich is slow to import.
         show: False never draws it.
     """
 
-    def __init__(self, name: str, console: Console, *, show: bool) -> None:
+    def __init__(self, name: str, console: Callable[[], Console], *, show: bool) -> None:
         self._name = name
-        drawn = show and may_draw(console.file) and console.is_terminal and not console.is_dumb_terminal
-        self._live = Live(self, console=console, transient=True, refresh_per_second=10) if drawn else None
+        self._live: Live | None = None
+        if show and may_draw(sys.stderr) and console().is_terminal and not console().is_dumb_terminal:
+            from rich.live import Live  # noqa: PLC0415 see above
+
+            self._live = Live(self, console=console(), transient=True, refresh_per_second=10)
 
     def start(self) -> None:
         """Start to draw it."""
@@ -68,6 +69,10 @@ class ProgressLine(ABC):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The line; Rich calls this ten times a second."""
+        from rich.progress_bar import ProgressBar  # noqa: PLC0415 as above
+        from rich.table import Table  # noqa: PLC0415 as above
+        from rich.text import Text  # noqa: PLC0415 as above
+
         width = max(options.max_width - _ECHO, 1)
         name = shortened(self._name, min(_MOST_NAME, width // 4))
         parts = self._parts(width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
@@ -95,11 +100,11 @@ class RunProgressLine(ProgressLine):
 
     Args:
         plan: the plan of the run.
-        console: where it is drawn, if that is a terminal.
+        console: returns where it is drawn, if standard error is a terminal: Rich is slow to import.
         show: False never draws it.
     """
 
-    def __init__(self, plan: Plan, console: Console, *, show: bool) -> None:
+    def __init__(self, plan: Plan, console: Callable[[], Console], *, show: bool) -> None:
         super().__init__(plan.system.config.mesh, console, show=show)
         self._grid = plan.grid
         self._status: MeshStatus | None = None
@@ -122,11 +127,11 @@ class SweepProgressLine(ProgressLine):
 
     Args:
         name: name of the mesh.
-        console: where it is drawn, if that is a terminal.
+        console: returns where it is drawn, if standard error is a terminal: Rich is slow to import.
         show: False never draws it.
     """
 
-    def __init__(self, name: str, console: Console, *, show: bool) -> None:
+    def __init__(self, name: str, console: Callable[[], Console], *, show: bool) -> None:
         super().__init__(name, console, show=show)
         self._progress: SweepProgress | None = None
 
