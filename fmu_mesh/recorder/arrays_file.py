@@ -10,18 +10,16 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from ..files import Kept
 from ..system.recording import Recording
 from ..variables.value_types import DTYPES, VariableType, is_text
 from .block_file import BlockFile
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 __all__ = ["ENDING", "ArraysFile", "bytes_of_a_row", "read_arrays"]
 
@@ -33,8 +31,6 @@ _HEAD = struct.Struct("<qq")
 
 def bytes_of_a_row(types: Sequence[VariableType]) -> int:
     """The size of a row in bytes, time included; texts are not counted, as their size is not known."""
-    import numpy as np  # noqa: PLC0415 a plan needs none
-
     return 8 + sum(np.dtype(DTYPES[type_]).itemsize for type_ in types if not is_text(type_))
 
 
@@ -48,8 +44,6 @@ def read_arrays(path: Path, types: Sequence[VariableType]) -> tuple[NDArray[np.f
     Returns:
         The times in s, shape `(rows,)`, and an array of the same shape for each column.
     """
-    import numpy as np  # noqa: PLC0415 a plan needs none
-
     all_types: tuple[VariableType, ...] = ("Float64", *types)
     columns: list[list[NDArray[Any]]] = [[np.zeros(0, DTYPES[type_])] for type_ in all_types]
     for _, _, block in _blocks(path) if path.exists() else ():

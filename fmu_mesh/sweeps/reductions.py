@@ -21,7 +21,7 @@ from ..text import listed, nearest
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue, VariableType, is_text
 
-__all__ = ["Reduction", "check_reductions", "read_reduction", "reduced_value"]
+__all__ = ["FUNCTIONS", "Reduction", "check_reductions", "read_reduction", "reduced_value"]
 
 _WRITTEN = re.compile(r"(?s)(\w+)\s*\((.*)\)")
 _AT = re.compile(r"(?s)(.*),\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
@@ -68,11 +68,11 @@ def read_reduction(text: str) -> Reduction:
     """
     text = text.strip()
     found = _WRITTEN.fullmatch(text)
-    if found is None or found[1] not in _NAMES:
+    if found is None or found[1] not in FUNCTIONS:
         name = found[1] if found is not None else text.partition("(")[0].strip()
-        near = nearest(name, _NAMES) or ("last" if found is None else None)
+        near = nearest(name, FUNCTIONS) or ("last" if found is None else None)
         inner = found[2] if found is not None else text if "(" not in text else "pendulum.a"
-        hint = f"Did you mean '{near}({inner})'?" if near else f"There are: {', '.join(_NAMES)}."
+        hint = f"Did you mean '{near}({inner})'?" if near else f"There are: {', '.join(FUNCTIONS)}."
         raise ConfigurationError(f"'{text}' is no reduction.", hint=hint)
     function, variable, time = found[1], found[2].strip(), None
     if function == "at":
@@ -188,5 +188,5 @@ _FUNCTIONS: Final[dict[str, Callable[[_Values, _Times], Any]]] = {
     "time_of_min": lambda values, times: _time_at(values, times, int(values.argmin())),
     "time_of_max": lambda values, times: _time_at(values, times, int(values.argmax())),
 }
-_NAMES: Final = (*_FUNCTIONS, "at")
+FUNCTIONS: Final = (*_FUNCTIONS, "at")
 _OF_TEXTS: Final = ("first", "last", "at")

@@ -23,7 +23,7 @@ from ..installing import importing
 from ..text import listed, nearest, shown
 from ..variables.value_types import PlainValue
 
-__all__ = ["MAX_VARIANTS", "Parameters", "Range", "Values", "grid", "read_values", "sampled", "variants_of"]
+__all__ = ["MAX_VARIANTS", "SAMPLERS", "Parameters", "Range", "Values", "grid", "read_values", "sampled", "variants_of"]
 
 Parameters = dict[str, PlainValue]
 """One variant: its values by name, such as `pendulum.d` or `simulation.step_size`."""
@@ -34,7 +34,7 @@ MAX_VARIANTS = 1_000_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"\s*{_NUMBER}\s*:[^,\[\]{{}}\"'#]*")
 _SAMPLER = re.compile(r"([^:]*):([1-9][0-9]{0,6})")
-_SAMPLERS = {"lhs": "LatinHypercube", "sobol": "Sobol", "halton": "Halton", "random": ""}
+SAMPLERS = {"lhs": "LatinHypercube", "sobol": "Sobol", "halton": "Halton", "random": ""}
 """The samplers by name, each with its class in `scipy.stats.qmc`; independent numbers need none."""
 
 
@@ -253,9 +253,9 @@ def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
     """Numbers from 0 to 1, shape `(count, dimensions)`."""
     found = _SAMPLER.fullmatch(sampler)
     name, count = (found[1], int(found[2])) if found is not None else (sampler.partition(":")[0], 0)
-    if name not in _SAMPLERS:
-        near = nearest(name, _SAMPLERS)
-        hint = f"Did you mean '{near}:{count or 64}'?" if near else f"There are {listed([*_SAMPLERS])}, as in lhs:64."
+    if name not in SAMPLERS:
+        near = nearest(name, SAMPLERS)
+        hint = f"Did you mean '{near}:{count or 64}'?" if near else f"There are {listed([*SAMPLERS])}, as in lhs:64."
         raise ConfigurationError(f"there is no sampler '{sampler}'.", hint=hint)
     if not 0 < count <= MAX_VARIANTS:
         raise ConfigurationError(f"the sampler '{sampler}' has no count from 1 to {MAX_VARIANTS}, as in {name}:64.")
@@ -268,7 +268,7 @@ def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
         return generator.random((count, dimensions))
     with importing("scipy", f"samplers other than random:{count}"):
         from scipy.stats import qmc  # noqa: PLC0415  an extra, and slow to import
-    shares: NDArray[np.float64] = getattr(qmc, _SAMPLERS[name])(dimensions, seed=generator).random(count)
+    shares: NDArray[np.float64] = getattr(qmc, SAMPLERS[name])(dimensions, seed=generator).random(count)
     return shares
 
 

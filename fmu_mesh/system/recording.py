@@ -10,9 +10,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig
@@ -22,10 +24,6 @@ from fmu_mesh.plugins import plugin, plugin_names
 from fmu_mesh.text import nearest_file, printable
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import VariableType
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 __all__ = [
     "Columns",
@@ -329,8 +327,6 @@ def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
 
 def joined(pieces: Iterable[Columns]) -> Columns:
     """All rows of a result. Besides its columns, only one piece is in memory at a time."""
-    import numpy as np  # noqa: PLC0415 a plan needs none
-
     columns: dict[str, NDArray[Any]] = {}
     rows = 0
     for piece in pieces:

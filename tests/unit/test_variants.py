@@ -283,4 +283,4 @@ def test_a_sampler_does_not_choose_from_listed_variants() -> None:
 
 
 def test_every_sampler_of_the_table_is_one_of_scipy() -> None:
-    assert set(SAMPLERS) == {f"{name}:64" for name in variants._SAMPLERS}
+    assert set(SAMPLERS) == {f"{name}:64" for name in variants.SAMPLERS}
