@@ -155,7 +155,7 @@ def test_a_shell_completes_long_names_in_parts(place: Place, shell: str) -> None
 
 
 def test_a_shell_completes_the_variables_of_files(place: Place) -> None:
-    (place.folder / "r.csv").write_text("time,arm.q[1,2],arm.motor.tau,arm.motor.w\n0.0,1.0,2.0,3.0\n")
+    (place.folder / "r.csv").write_text('time,"arm.q[1,2]",arm.motor.tau,arm.motor.w\n0.0,1.0,2.0,3.0\n')
 
     assert offered(place, "bash", "plot", "r.csv", "--variables", "arm.m") == ["arm.motor."]
     assert offered(place, "bash", "plot", "r.csv", "--x", "arm.motor.") == ["arm.motor.tau", "arm.motor.w"]
