@@ -79,7 +79,7 @@ def test_a_router_that_has_no_mesh_yet_is_watched(place: Place) -> None:
     wait_until(lambda: router.output, "the router")
     wait = place.start("wait", "--connect", endpoint)
     assert place.run("wait", "--connect", endpoint, "--timeout", "0.5").message == (
-        "fmu-mesh: there is no mesh after 0.5 s. --timeout waits longer."
+        "fmu-mesh: there is no mesh after 0.5 s. A larger `--timeout` waits longer."
     )
 
     config = write_config(place.folder, stop_time=FAR_S, simulation=PACED)
@@ -156,8 +156,11 @@ def test_a_wait_in_vain_ends_at_its_deadline(place: Place) -> None:
     unknown = place.run("wait", "--state", "asleep")
 
     assert [wait.wait() for wait in (nothing, paused, unknown)] == [4, 4, 2]
-    assert nothing.message == "fmu-mesh: there is no mesh 'pair' after 0.3 s. --timeout waits longer."
-    assert paused.message == "fmu-mesh: mesh 'pair' is paused, and was not running in time. --timeout waits longer."
+    assert nothing.message == "fmu-mesh: there is no mesh 'pair' after 0.3 s. A larger `--timeout` waits longer."
+    assert (
+        paused.message
+        == "fmu-mesh: mesh 'pair' is paused, and was not running in time. A larger `--timeout` waits longer."
+    )
     assert "invalid choice: 'asleep'" in unknown.errors
 
 
@@ -245,7 +248,7 @@ def test_a_mesh_that_does_not_rest_in_time_says_where_it_is_going_to(place: Plac
     step = place.run("step", "pair", "1000", "--timeout", "0.5")  # 10 s by the wall clock
 
     assert step.wait() == 4
-    words = r"mesh 'pair' is at point (\d+), on its way to point (\d+), where it is going to rest. --timeout"
+    words = r"mesh 'pair' is at point (\d+), on its way to point (\d+), where it is going to rest. A larger `--timeout`"
     found = re.search(words, step.message)
     assert found is not None, step.message
     assert int(found[1]) < int(found[2])

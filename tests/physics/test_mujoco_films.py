@@ -145,7 +145,7 @@ def test_a_film_that_cannot_be_written_ends_the_run_with_the_reason(place: Place
 
 
 def test_a_film_of_an_unknown_format_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match=r"film.avi: a film is one of \.mp4, \.gif"):
+    with pytest.raises(ConfigurationError, match=r"film.avi'`: a film is one of \.mp4, \.gif"):
         check_film(Path("film.avi"))
 
 
@@ -161,14 +161,14 @@ def test_a_mesh_without_a_world_has_no_film(tmp_path: Path, capsys: pytest.Captu
 
     assert main(["launch", str(config), "--local", "--video", str(tmp_path / "film.gif")]) == 2
 
-    assert "--video shows the one physics engine of a mesh, and this one has none" in capsys.readouterr().err
+    assert "`--video` shows the one physics engine of a mesh, and this one has none" in capsys.readouterr().err
 
 
 def test_a_window_without_a_screen_is_refused_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
 
-    with pytest.raises(ConfigurationError, match=r"--view needs a screen.*--video FILE\.mp4"):
+    with pytest.raises(ConfigurationError, match=r"`view=True` needs a screen.*`video=\.\.\.`"):
         check_window()
 
 

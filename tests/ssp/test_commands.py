@@ -213,7 +213,7 @@ def test_a_result_that_cannot_be_written_beside_a_package_is_refused_with_the_wa
     package = packed()
     Path("results").touch()
 
-    assert "Choose another file with --output." in refused(capsys, "launch", package, "--local")
+    assert "Choose another file with `--output`." in refused(capsys, "launch", package, "--local")
     assert main(["launch", package, "--local", "--no-progress", "--output", "own/own.csv"]) == 0
 
 
@@ -221,7 +221,7 @@ def test_a_result_file_inside_a_package_is_refused_with_the_way_out(capsys: pyte
     text = refused(capsys, "launch", packed(), "--local", "--set-config", "record.file=own.csv")
 
     assert "ship.ssp/own.csv' cannot be written" in text
-    assert "ship.ssp' is a file, and no folder. Choose another file with --output." in text
+    assert "ship.ssp' is a file, and no folder. Choose another file with `--output`." in text
 
 
 @pytest.mark.parametrize(
@@ -232,8 +232,8 @@ def test_a_result_file_inside_a_package_is_refused_with_the_way_out(capsys: pyte
         (["check", "ship/resources/values.ssv"], "is a part of a package of SSP. Name the package"),
         (["launch", "ship.ssp/VarC.ssd"], "'ship.ssp' has no description 'VarC.ssd'. Did you mean 'VarB.ssd'?"),
         (["launch", "shop.ssp"], "shop.ssp: no such file. Did you mean 'ship.ssp'?"),
-        (["launch", "ship.ssp/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship.ssp', or leave --ssd out."),
-        (["inspect", "ship/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship', or leave --ssd out."),
+        (["launch", "ship.ssp/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship.ssp', or leave `--ssd` out."),
+        (["inspect", "ship/VarB.ssd", "--ssd", "VarB"], "Name the package, 'ship', or leave `--ssd` out."),
         (["graph", "DP_ship", "--ssd", "VarB"], "'DP_ship' is no package"),
         (["graph", "--ssd", "VarB"], "--ssd and --ssv choose a variant of a package of SSP, and none is named"),
         (["convert", "ship.ssp", "no/ship.ssp"], "'no/ship.ssp' cannot be written: No such file or directory"),

@@ -436,7 +436,7 @@ def test_what_needs_ssp_2_is_named_with_its_variable(tmp_path: Path) -> None:
         mesh.to_ssp(tmp_path / "system.ssp")
 
     assert found_in(caught.value) == [
-        f'{place}; SSP 2.0, as with `version="2.0"` or `--version 2.0`'
+        f'{place}; SSP 2.0, as with `version="2.0"`'
         for place in (
             "instances.a.start_values.int8_in: a start value of type Int8 for 'int8_in'",
             "instances.a.start_values.float64_array_in: a start value of type Float64[2,3] for 'float64_array_in'",

@@ -206,7 +206,7 @@ def test_another_description_of_a_package_is_copied_with_the_way_to_run_it(forei
 
     assert (lost.found, lost.expected) == (
         "'VarB.ssd' is not the default description of the package",
-        "`--ssd VarB.ssd` to run it",
+        "`ssd='VarB.ssd'` to run it",
     )
     assert annotation_of(tmp_path / "copy.ssp", "VarB.ssd")["simulation"] == {"window": 4}
     assert content_of(tmp_path / "copy.ssp")[MAIN] == content_of(foreign)[MAIN]
