@@ -1,4 +1,4 @@
-"""The variables of instances and of FMUs, to complete their names: a wrong part of a file hides no other, no code runs."""
+"""The variables of instances and FMUs, to complete names: a wrong part of a file hides no other, and no code runs."""
 
 from __future__ import annotations
 
