@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -16,7 +16,7 @@ from .plan_page import plan_page
 from .plan_view import PlanView, plan_view
 from .tables import html_table
 
-__all__ = ["Check", "check_of"]
+__all__ = ["Check", "check_of", "together"]
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -116,7 +116,12 @@ def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
                 look()
             except ConfigurationError as error:
                 errors.append(error)
-    if len(errors) > 1:
-        all_findings = tuple(finding for error in errors for finding in Check(file, error).findings)
-        errors = [ConfigurationError(f"{file}: {len(all_findings)} problems", findings=all_findings)]
-    return Check(file, errors[0] if errors else None, run)
+    return Check(file, together(file, errors) if errors else None, run)
+
+
+def together(file: str, errors: Sequence[ConfigurationError]) -> ConfigurationError:
+    """One error with the findings of several, of which there is at least one."""
+    if len(errors) == 1:
+        return errors[0]
+    findings = tuple(finding for error in errors for finding in Check(file, error).findings)
+    return ConfigurationError(f"{file}: {len(findings)} problems", findings=findings)

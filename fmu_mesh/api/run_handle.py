@@ -16,6 +16,7 @@ from ..errors import (
     FmuMeshError,
     MeshLost,
 )
+from ..installing import importing
 from ..run.options import StartOptions, checked, takes
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
@@ -257,6 +258,7 @@ class Run:
         client = self._running()
         return Watch(client, targets_of(client, *names))
 
+    @checked
     def view(self, *names: str) -> LiveView:
         """A live cell in a notebook, which draws numbers over time until the mesh ends.
 
@@ -278,13 +280,10 @@ class Run:
         Raises:
             UnknownName: there is no such variable.
             CallRefused: too many of them, or none of them, are numbers.
-            ConfigurationError: anywidget is not installed.
+            LibraryMissing: anywidget is not installed.
         """
-        try:
+        with importing("anywidget", "live cells"):
             from .live_view import live_view  # noqa: PLC0415  anywidget is an extra
-        except ModuleNotFoundError as error:
-            text, hint = "a live cell needs anywidget.", "Install it with `pip install anywidget`."
-            raise ConfigurationError(text, hint=hint) from error
         view = live_view(self._running(), names)
         with self._opening:
             self._way.callback(view.stop)

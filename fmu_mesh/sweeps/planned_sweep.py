@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from .. import __version__
 from ..api.mesh_builder import Mesh, load
+from ..api.mesh_check import together
 from ..api.result import Result, types_of
 from ..config.loading import PlainConfig
 from ..config.mesh import Config
@@ -86,9 +87,10 @@ def planned_sweep(
         raise CallRefused(
             "`resume=True` keeps the runs of the folder, and `force=True` removes them", hint="Choose one of them."
         )
+    errors = []
     if is_sweep(folder.path) and not (options.resume or options.force):
         hint = "Continue it with `resume=True`, replace it with `force=True`, or choose another folder."
-        raise ConfigurationError(f"there is a sweep in '{folder.path}' already", hint=hint)
+        errors.append(ConfigurationError(f"there is a sweep in '{folder.path}' already", hint=hint))
     wanted = Wanted(
         version=__version__,
         mesh=own.name,
@@ -103,7 +105,12 @@ def planned_sweep(
         most_instances=dict(options.max_instances),
     )
     tell = options.on_notice or log.info
-    plan = _any_plan(own, base, wanted, tell)
+    try:
+        plan = _any_plan(own, base, wanted, tell)
+    except ConfigurationError as error:
+        raise together(str(own.configuration.file), [error, *errors]) from error
+    if errors:
+        raise errors[0]
     if not wanted.processes and (why := apart(plan.plan)):
         tell(f"each run of the sweep starts processes, because {why[0]}")
         wanted = replace(wanted, processes=True)

@@ -4,29 +4,17 @@ from __future__ import annotations
 
 import re
 
+from ...api.simulate_options import SimulateOptions
 from ...run.options import RunOptions, option_fields
+from ...sweeps.sweep_options import SweepOptions
 
 __all__ = ["in_flags"]
 
-_FLAGS = {name: field.flag for name, field in option_fields(RunOptions).items() if field.flag} | {
-    name: f"--{name.replace('_', '-')}"
-    for name in (
-        *(
-            "folder",
-            "force",
-            "max_instances",
-            "port",
-            "resume",
-            "ssd",
-            "ssv",
-            "start",
-            "timeout",
-            "vary",
-            "version",
-            "workers",
-        ),
-        *("inputs", "kind", "output_interval", "record", "start_time", "tolerance"),  # of `simulate`
-    )
+_FLAGS = {name: f"--{name}" for name in ("port", "ssd", "ssv", "start", "timeout", "vary", "version")} | {
+    name: field.flag
+    for options in (SimulateOptions, SweepOptions, RunOptions)
+    for name, field in option_fields(options).items()
+    if field.flag
 }
 _OPTION = re.compile(r"`(\w+)(?:=([^`]*))?`")
 _PLACE = re.compile(r"(?:(?<=: )|(?<=  )|(?<=\")|^)`(\w+=[^`]*)`(?=: |\"|$)", re.MULTILINE)
