@@ -247,7 +247,9 @@ class ConfigurationError(FmuMeshError):
     def in_words(self, words: Callable[[str], str]) -> Self:
         """As for all errors; also the findings."""
         self.findings = tuple(
-            msgspec.structs.replace(one, path=words(one.path), found=words(one.found), expected=words(one.expected))
+            msgspec.structs.replace(
+                one, **{name: words(getattr(one, name)) for name in ("file", "path", "found", "expected")}
+            )
             for one in self.findings
         )
         return super().in_words(words)

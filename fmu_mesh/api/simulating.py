@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from ..config.plain_values import plain
-from ..errors import CallRefused
+from ..errors import CallRefused, ConfigurationError
 from ..run.options import takes
 from ..simtime import steps_between
 from ..system.series_files import SeriesRefused, columns_of
@@ -25,7 +26,7 @@ from .mesh_builder import Mesh
 from .result import Result
 from .simulate_options import SimulateOptions
 
-__all__ = ["experiment_of", "simulate"]
+__all__ = ["as_given", "experiment_of", "simulate"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -55,7 +56,26 @@ def simulate(fmu: str | Path, options: SimulateOptions) -> Result:
         FmuMeshError: the run ended early; its `result` has what was recorded up to then.
     """
     mesh, run = experiment_of(fmu, options)
-    return mesh.run(**run)
+    try:
+        return mesh.run(**run)
+    except ConfigurationError as error:
+        raise as_given(error, f"{mesh.name}.") from error
+
+
+def as_given(error: ConfigurationError, front: str) -> ConfigurationError:
+    """The error with start values and inputs as they were given: without the name of the only instance."""
+
+    def short(text: str) -> str:
+        return text.replace(f"`start_values={{'{front}", "`start_values={'", 1)
+
+    findings = tuple(
+        replace(one, file="`inputs=...`", path=one.path.removeprefix(f"scenario.values.{front}"))
+        if one.path.startswith("scenario.values.")
+        else replace(one, path=short(one.path))
+        for one in error.findings
+    )
+    message = str(findings[0]) if len(findings) == 1 else short(error.message)
+    return ConfigurationError(message, findings=findings, hint=error.hint)
 
 
 def experiment_of(fmu: str | Path, options: SimulateOptions) -> tuple[Mesh, dict[str, Any]]:

@@ -8,11 +8,9 @@ from __future__ import annotations
 import argparse
 import re
 
-from msgspec.structs import replace
-
 from ..api.mesh_builder import Mesh
 from ..api.simulate_options import SimulateOptions
-from ..api.simulating import experiment_of
+from ..api.simulating import as_given, experiment_of
 from ..config.base import NAME_PATTERN
 from ..errors import CallRefused, ConfigurationError, LoadFailed
 from .arguments import Runs
@@ -36,7 +34,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
         try:
             run_mesh(mesh, given, arguments, reporter, how)
         except ConfigurationError as error:
-            raise _as_given(error, f"{mesh.name}.") from error
+            raise as_given(error, f"{mesh.name}.") from error
     return 0
 
 
@@ -48,7 +46,7 @@ def _run(arguments: argparse.Namespace) -> int:
         try:
             run_mesh(mesh, options, arguments, reporter, {})
         except ConfigurationError as error:
-            raise _as_given(error, front) from error
+            raise as_given(error, front) from error
     return 0
 
 
@@ -73,16 +71,6 @@ def _mesh(arguments: argparse.Namespace) -> Mesh:
         what = "a name of letters, digits, _ and - that starts with a letter or _"
         raise ConfigurationError(f"'{mesh.name}' is not {what}", hint="Give the mesh such a name with --name.")
     return mesh
-
-
-def _as_given(error: ConfigurationError, front: str) -> ConfigurationError:
-    """The error with start values as they were given: without the name of the only instance."""
-
-    def short(text: str) -> str:
-        return text.replace(f"`start_values={{'{front}", "`start_values={'", 1)
-
-    findings = tuple(replace(finding, path=short(finding.path)) for finding in error.findings)
-    return ConfigurationError(short(error.message), findings=findings, hint=error.hint)
 
 
 RUNS: Runs = {"run": _run, "simulate": _simulate}
