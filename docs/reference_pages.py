@@ -155,7 +155,7 @@ def options_page() -> str:
     """The page of all options: those of a run once, those of a sweep, and the others of each command."""
     shared = {option.flag for option in option_fields(RunOptions).values()} - {None}
     parts = [_OPTIONS, _calls(RunOptions), "", _SIMULATION, _calls(SimulateOptions), "", _SWEEP, _calls(SweepOptions)]
-    for command, (_, about) in COMMANDS.items():
+    for command, (_, _, about) in COMMANDS.items():
         options = command_options(command)
         own = [option for option in options if option not in shared]
         parts += ["", f"## `{command}`", "", f"{about[0].upper()}{about[1:]}."]

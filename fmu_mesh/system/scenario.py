@@ -253,8 +253,8 @@ class _Resolving:
 
     def _over_time(self, reference: str, given: ScenarioValues, variable: Variable, path: str) -> Schedule | None:
         can_be_linear = is_float(variable.type) and variable.causality == "input"
-        is_continuous = can_be_linear and variable.variability == "continuous"
-        linear = given.interpolation == "linear" or (given.interpolation == "auto" and is_continuous)
+        automatic = "linear" if can_be_linear and variable.variability == "continuous" else "hold"
+        linear = (automatic if given.interpolation == "auto" else given.interpolation) == "linear"
         if linear and not can_be_linear:
             found = f"linear for '{reference}', {_what(variable)}"
             self._findings.add(f"{path}.interpolation", found, "hold; inputs of type Real may be linear")
@@ -264,8 +264,7 @@ class _Resolving:
             return None
         if given.file is None:
             schedule = self._listed(given, variable, change, path)
-            times = enumerate(schedule.times) if schedule is not None else ()
-            places = [(f"{path}.times[{index}]", time) for index, time in times]
+            places = [(f"{path}.times[{at}]", time) for at, time in enumerate(schedule.times if schedule else ())]
             self._tell_late(places, reference.partition(".")[0], linear=linear)
         elif is_bag(given):
             schedule = self._bag(reference, given, variable, change, path)
@@ -416,8 +415,7 @@ class _Resolving:
         late = [self._grid.step_at(time, points) * points >= last > 0 for _, time in places]
         for path, time in places[late.index(True) + linear :][:1] if any(late) else ():  # the first one may end a line
             found = f"never reached: at {time:.9g} s, stop time {time_of(last):.9g} s"
-            end = time_of((last - 1) // points * points)
-            self._late.add(path, found, f"a time up to {end:.9g} s, that of the last step")
+            self._late.add(path, found, f"a time up to {time_of((last - 1) // points * points):.9g} s: the last step")
 
     def _check_start(self, entry: _Entry) -> None:
         """A value for the start is a start value: there must be no other one, and it must be allowed."""

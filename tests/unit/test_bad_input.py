@@ -367,7 +367,7 @@ def test_the_nearest_file_is_found_whatever_its_ending(typed: str, meant: str | 
     [
         ("--set=pendulun.l=2", "Did you mean 'pendulum'?"),
         ("--set=pendulum.ll=2", "--set pendulum.ll=2"),
-        ("--set=pendulum.l", "instance.variable=value"),
+        ("--set=pendulum.l", "expected INSTANCE.VARIABLE=VALUE"),
     ],
 )
 def test_a_wrong_option_is_told_as_it_was_written(

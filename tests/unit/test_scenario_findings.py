@@ -163,9 +163,7 @@ def test_a_value_that_is_never_reached_is_a_warning(
     assert check
     [warning] = check.warnings
     assert f"scenario.{path}" in warning
-    assert warning.endswith(
-        f"never reached: at {time} s, stop time 1 s; expected a time up to 0.9 s, that of the last step"
-    )
+    assert warning.endswith(f"never reached: at {time} s, stop time 1 s; expected a time up to 0.9 s: the last step")
     assert not longer.warnings
 
 
