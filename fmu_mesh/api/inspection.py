@@ -11,12 +11,12 @@ from typing import Final
 import msgspec
 
 from .. import files
+from ..config.call_options import checked
 from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
 from ..printing import page, printable
-from ..run.options import checked
 from ..ssp.configuration_files import names_package
 from ..text import counted, listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable

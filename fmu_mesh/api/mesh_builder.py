@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import msgspec
 from msgspec.structs import replace
 
+from ..config.call_options import checked, takes
 from ..config.instance_sections import KIND
 from ..config.loading import PlainConfig, read_text
 from ..config.mesh import LimitsConfig
@@ -20,7 +21,7 @@ from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
 from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
-from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions, checked, takes
+from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration

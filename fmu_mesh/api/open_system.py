@@ -187,6 +187,8 @@ class System:
             FmuError: the FMU failed. Only `close` is allowed now.
         """
         self._demand("get", "ended")
+        if not isinstance(name, str):
+            raise UnknownName(f"{shown(name)} is no name of a variable.")
         read = self._getters.get(name) or self._getter(name)
         try:
             return read(self._local.point)

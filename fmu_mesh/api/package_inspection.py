@@ -10,10 +10,10 @@ from typing import Literal
 import msgspec
 
 from .. import files
+from ..config.call_options import checked
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError
 from ..printing import page
-from ..run.options import checked
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
 from ..ssp.problems import Problems

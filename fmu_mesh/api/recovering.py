@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..config.call_options import checked
 from ..errors import ConfigurationError
 from ..files import Kept, is_file, open_alone
-from ..run.options import checked
 from ..system.recording import reading, result_format
 from ..text import nearest_file
 

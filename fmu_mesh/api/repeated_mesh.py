@@ -15,9 +15,10 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from ..config.call_options import takes
 from ..errors import CallRefused, FmuError, FmuMeshError
 from ..files import Kept, remove_tree
-from ..run.options import PlanOptions, takes
+from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.repeated import RepeatedRuns
 from ..run.results import open_result

@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 import msgspec
 
 from .. import __version__
+from ..config.call_options import takes
 from ..config.loading import PlainConfig
 from ..errors import CallRefused, ConfigurationError, Finding, FmuMeshError, MeshLost
 from ..run.allowed_code import check_owner
-from ..run.options import RerunOptions, StartOptions, takes
+from ..run.options import RerunOptions, StartOptions
 from ..run.run_plan import RunPlan
 from ..system.run_metadata import RunMetadata, machine, machine_difference, scenario_files
 from ..text import listed

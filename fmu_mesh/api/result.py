@@ -12,13 +12,13 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from ..config.call_options import checked
 from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..files import unwritable
 from ..installing import importing
 from ..instances.python.unit_names import base_unit_of
 from ..recorder.csv_file import CsvFile
 from ..recorder.parquet_file import ParquetFile
-from ..run.options import checked
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..system.recording import ResultFile, joined
@@ -182,6 +182,7 @@ class Result(Mapping[str, NDArray[Any]]):
         frame.attrs["units"] = self.units
         return frame
 
+    @checked
     def to_csv(self, path: str | Path) -> None:
         """Write the result as `launch` writes it: a CSV, and `<path>.json` with the units and what is known of the run.
 
@@ -200,6 +201,7 @@ class Result(Mapping[str, NDArray[Any]]):
         """
         self._write(lambda types, columns: CsvFile(Path(path), [*types.items()], columns.metadata))
 
+    @checked
     def to_parquet(self, path: str | Path) -> None:
         """As `to_csv`, into one Parquet file.
 

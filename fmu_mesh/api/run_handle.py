@@ -8,8 +8,9 @@ from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import TYPE_CHECKING, Any, Self
 
+from ..config.call_options import checked, takes
 from ..errors import (
     CallRefused,
     ConfigurationError,
@@ -17,7 +18,9 @@ from ..errors import (
     MeshLost,
 )
 from ..installing import importing
-from ..run.options import StartOptions, checked, takes
+from ..ros.bags.play_options import PlayOptions
+from ..run.options import StartOptions
+from ..text import shown
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
 from ..wire.client.waiting import rest, wait_for, wait_for_start
@@ -39,7 +42,7 @@ from .samples import Sample, Watch, sample_of, target_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
     from ..ros.bags.bag import Bag
-    from ..ros.bags.playing import Played, PlayOptions
+    from ..ros.bags.playing import Played
     from ..run.run_plan import RunPlan
     from ..wire.messages import SetValue
     from .live_view import LiveView
@@ -99,8 +102,11 @@ class Run:
         Raises:
             CallRefused: its results do not fit into memory.
         """
-        from .run_thread import RunThread  # noqa: PLC0415  not for those who attach to a mesh
+        from ..run.run_plan import RunPlan  # noqa: PLC0415  not for those who attach to a mesh
+        from .run_thread import RunThread  # noqa: PLC0415  as above
 
+        if not isinstance(plan, RunPlan):
+            raise CallRefused(f"`plan` is {shown(plan)}; expected what `Mesh.plan` returns")
         return cls(plan.mesh, own=RunThread(plan, options))
 
     def __enter__(self) -> Self:
@@ -305,14 +311,15 @@ class Run:
         with self._client().logs(follow=follow) as lines:
             yield from lines
 
-    def play(self, bag: str | Path | Bag, **how: Unpack[PlayOptions]) -> Played:
+    @takes(PlayOptions)
+    def play(self, bag: str | Path | Bag, options: PlayOptions) -> Played:
         """Send the messages of a recorded bag to inputs of the mesh, each at the point of its stamp.
 
         The mesh is paused at each of these points, so the result depends on the bag alone.
 
         Args:
             bag: an MCAP file, or the folder of a `ros2 bag`; or a bag that is open.
-            how: see `PlayOptions`.
+            options: see `PlayOptions`.
 
         Returns:
             How many values were set, and from which point to which.
@@ -325,8 +332,10 @@ class Run:
         from ..ros.bags.playing import play_bag  # noqa: PLC0415  as above
 
         loaded = self._own.plan.loaded if self._own is not None else None
+        if not isinstance(bag, str | Path | Bag):
+            raise CallRefused(f"`bag` is {shown(bag)}; expected the path of a bag, or a `Bag`")
         with nullcontext(bag) if isinstance(bag, Bag) else Bag(Path(bag)) as opened:
-            return play_bag(self._running(), opened, loaded, **how)
+            return play_bag(self._running(), opened, loaded, options)
 
     def replay(self, values: Sequence[SetValue], last_point: int | None = None) -> None:
         """Set values at exact points, as the metadata of a result have them (`rerun`).

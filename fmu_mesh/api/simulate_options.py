@@ -3,19 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from ..run.options import (
-    MEMORY_LIMIT,
-    CallOptions,
-    MemoryLimit,
-    Number,
-    OnEvent,
-    OnNotice,
-    OnProgress,
-    Option,
-    Output,
-    Processes,
-    Values,
-)
+from ..config.call_options import CallOptions, Option
+from ..run.options import MEMORY_LIMIT, MemoryLimit, Number, OnEvent, OnNotice, OnProgress, Output, Processes, Values
 
 __all__ = ["SimulateOptions"]
 

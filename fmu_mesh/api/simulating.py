@@ -15,9 +15,9 @@ from typing import Any, cast
 import numpy as np
 from msgspec.structs import replace
 
+from ..config.call_options import takes
 from ..config.plain_values import plain
 from ..errors import CallRefused, ConfigurationError
-from ..run.options import takes
 from ..simtime import steps_between
 from ..system.series_files import SeriesRefused, columns_of
 from ..text import shown

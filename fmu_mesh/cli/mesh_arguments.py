@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final, get_args
 
+from ..ros.bags.play_options import PlayOptions
 from ..wire.views import MeshState
 from .arguments import (
     CommandParser,
@@ -17,6 +18,7 @@ from .arguments import (
     port_number,
     positive_seconds,
 )
+from .run_options import add_options
 
 __all__ = ["LEVELS", "PARSERS"]
 
@@ -179,25 +181,7 @@ def _add_play(parser: CommandParser) -> None:
     add_quiet(parser)
     parser.add_argument("bag", type=Path, metavar="BAG", help="an MCAP file, or the folder of a `ros2 bag`")
     parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument(
-        "--topic",
-        action="append",
-        default=[],
-        metavar="TOPIC[:FIELD]=INSTANCE.VARIABLE",
-        help="a topic and its input; repeatable; default: the topics that the mesh subscribes to",
-    )
-    parser.add_argument(
-        "--start", type=number, metavar="T", help="simulation time of the first message in s; default: its stamp"
-    )
-    parser.add_argument(
-        "--stamps",
-        choices=("header", "log"),
-        default="header",
-        help="use header stamps where messages have them, or log times (header)",
-    )
-    parser.add_argument(
-        "--config", type=Path, metavar="CONFIG", help="the configuration, if that of the mesh is not on this host"
-    )
+    add_options(parser, "topics", "start", "stamps", "config", options=PlayOptions)
 
 
 PARSERS: Parsers = {

@@ -6,7 +6,9 @@ import argparse
 
 from ..api.attaching import attach
 from ..ros.bags.bag import Bag
+from ..ros.bags.play_options import PlayOptions
 from .arguments import Runs
+from .run_options import given_options
 
 __all__ = ["RUNS"]
 
@@ -16,14 +18,7 @@ def _play(arguments: argparse.Namespace) -> int:
         Bag(arguments.bag) as bag,  # first: what is wrong with it is told before anything about meshes
         attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run,
     ):
-        played = run.play(
-            bag,
-            topics=arguments.topic,
-            start=arguments.start,
-            stamps=arguments.stamps,
-            config=arguments.config,
-            timeout=arguments.timeout,
-        )
+        played = run.play(bag, **given_options(arguments, PlayOptions))
     names = ", ".join(played.topics)
     print(f"played {played.values} values of {names} from point {played.first} to point {played.last}")
     for several, why in (

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from ..api.simulate_options import SimulateOptions
-from ..run.options import option_fields
+from ..config.call_options import option_fields
 from ..sweeps.sweep_options import SweepOptions
 from .arguments import CommandParser, Parsers, add_json, add_package, add_quiet, count, endpoint, whole
 from .run_options import add_configuration, add_options

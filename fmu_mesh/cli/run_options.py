@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from ..config.call_options import CallOptions, option_fields
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError
-from ..run.options import CallOptions, PlanOptions, RunOptions, option_fields
+from ..run.options import PlanOptions, RunOptions
 from .arguments import add_package, count, endpoint, number, whole
 from .output.terminal import teller
 
@@ -99,7 +100,9 @@ def given_options(arguments: argparse.Namespace, options: type[CallOptions] = Pl
     given = {name: value for name in option_fields(options) if (value := getattr(arguments, name, None)) is not None}
     if given.get("view") and "video" in given:
         raise ConfigurationError("--view and --video do not go together", hint="Leave one of them out.")
-    return {**given, "on_notice": teller(quiet=getattr(arguments, "quiet", False))}
+    if "on_notice" in option_fields(options):
+        given["on_notice"] = teller(quiet=getattr(arguments, "quiet", False))
+    return given
 
 
 def _trace_file(text: str) -> Path:

@@ -9,12 +9,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..config.call_options import option_fields
 from ..config.findings import Findings
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
 from ..recorder.arrays_file import ENDING
 from ..text import listed, nearest, option_text
-from .options import PlanOptions, option_fields
+from .options import PlanOptions
 
 __all__ = ["with_options"]
 

@@ -16,12 +16,13 @@ from .. import __version__
 from ..api.mesh_builder import Mesh, load
 from ..api.mesh_check import together
 from ..api.result import Result, types_of
+from ..config.call_options import takes
 from ..config.loading import PlainConfig
 from ..config.mesh import Config
 from ..errors import CallRefused, ConfigurationError, FmuError
 from ..run.allowed_code import check_owner
 from ..run.one_process import apart
-from ..run.options import VariantOptions, takes
+from ..run.options import VariantOptions
 from ..run.run_plan import RunPlan
 from ..text import listed, nearest
 from .reductions import check_reductions, read_reduction

@@ -5,7 +5,8 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ..run.options import Option, VariantOptions
+from ..config.call_options import Option
+from ..run.options import VariantOptions
 
 if TYPE_CHECKING:
     from ..api.result import Result

@@ -29,8 +29,8 @@ from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
 from ..api.notebook_progress import ShownProgress, awaited
+from ..config.call_options import takes
 from ..errors import CallRefused, FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
-from ..run.options import takes
 from ..text import counted
 from ..wire.runtime import remove_stale_folders
 from .planned_sweep import PlannedSweep, planned_sweep

@@ -203,7 +203,7 @@ def test_a_missing_package_is_told_by_check(
 
     assert main(["check", str(write_config(tmp_path, record={"file": "pair.mcap"}))]) == 2
 
-    assert "a recording into .mcap needs the package mcap" in capsys.readouterr().err
+    assert "recordings into .mcap need the library mcap" in capsys.readouterr().err
 
 
 def test_what_is_no_recording_of_a_mesh_is_not_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

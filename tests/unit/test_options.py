@@ -7,21 +7,23 @@ import ast
 import inspect
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.run_handle import Run
 from fmu_mesh.cli.main import command_parser
 from fmu_mesh.cli.output.flag_words import in_flags
 from fmu_mesh.cli.run_options import add_options, given_options
+from fmu_mesh.config.call_options import Option, option_fields, takes
 from fmu_mesh.config.loading import read_text
 from fmu_mesh.config.mesh import SimulationConfig
 from fmu_mesh.config.structure import json_schema
 from fmu_mesh.errors import CallRefused, ConfigurationError
 from fmu_mesh.instances.configuration import examine_data, installed_config
-from fmu_mesh.run.options import Option, PlanOptions, RunOptions, option_fields, takes
+from fmu_mesh.run.options import PlanOptions, RunOptions
 from fmu_mesh.run.overriding import with_options
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.text import listed
@@ -290,3 +292,12 @@ def test_messages_of_the_library_name_options_without_dashes() -> None:
 )
 def test_the_command_line_shows_options_as_flags(text: str, flags: str) -> None:
     assert in_flags(text) == flags
+
+
+def test_the_options_of_a_bag_are_checked_before_it_is_played() -> None:
+    run = cast("Run", None)  # not reached
+
+    with pytest.raises(CallRefused, match="Did you mean `topics`"):
+        Run.play(run, "bag.mcap", topic=["/a=b.c"])  # type: ignore[call-arg]
+    with pytest.raises(CallRefused, match="`stamps='sent'`: expected 'header', 'log'"):
+        Run.play(run, "bag.mcap", stamps="sent")  # type: ignore[arg-type]

@@ -106,15 +106,6 @@ def test_the_reference_describes_every_type_that_a_public_call_returns() -> None
     assert {name: place for name, place in returned_types().items() if name not in names} == {}
 
 
-def test_the_table_of_options_has_all_of_each() -> None:
-    rows = {row.name: row for row in loaded("option_table").option_rows()}
-
-    assert rows["stop_time"][1:6] == ("--stop-time S", "float | None", "s", "None", "simulation.stop_time")
-    assert rows["memory_limit"].unit == "bytes"
-    assert {"Mesh.run", "sweep"} < {call for row in rows.values() for call in row.calls}
-    assert all(row.text for row in rows.values())
-
-
 def test_a_link_to_a_file_or_a_folder_leads_to_a_page_that_shows_it(site: ModuleType) -> None:
     pages = site.site_pages()
 

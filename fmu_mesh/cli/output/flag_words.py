@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 
 from ...api.simulate_options import SimulateOptions
-from ...run.options import RunOptions, option_fields
+from ...config.call_options import option_fields
+from ...run.options import RunOptions
 from ...sweeps.sweep_options import SweepOptions
 
 __all__ = ["in_flags"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack
 
 import msgspec
 
@@ -25,28 +24,9 @@ from ...wire.client.pausing import go_on, paused_at, wait_until_at
 from ...wire.client.readings import Target
 from ...wire.views import Command, MeshInfo
 from .bag import Bag, BagSample, chosen_topics, timed
+from .play_options import PlayOptions
 
-__all__ = ["Moment", "PlayOptions", "Played", "grid_of", "play", "play_bag", "running_configuration", "schedule"]
-
-_TIMEOUT_S = 60.0
-
-
-class PlayOptions(TypedDict, total=False):
-    """How a bag is played.
-
-    Attributes:
-        topics: `TOPIC[:FIELD]=INSTANCE.VARIABLE` each; default: the topics that the mesh subscribes to.
-        start: simulation time in s of the first message; None: its stamp.
-        stamps: "header": header stamps where messages have them (the default); "log": the times of their recording.
-        config: the configuration file, if that of a mesh that was found is not on this host.
-        timeout: how long in s the mesh may stay at one point before it has reached the next message (60).
-    """
-
-    topics: Sequence[str]
-    start: float | None
-    stamps: Literal["header", "log"]
-    config: str | Path | None
-    timeout: float
+__all__ = ["Moment", "Played", "grid_of", "play", "play_bag", "running_configuration", "schedule"]
 
 
 class Played(msgspec.Struct, frozen=True):
@@ -71,14 +51,14 @@ class Played(msgspec.Struct, frozen=True):
     beyond: int
 
 
-def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, **how: Unpack[PlayOptions]) -> Played:
+def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options: PlayOptions) -> Played:
     """Play a bag to a mesh.
 
     Args:
         client: the mesh.
         bag: the bag.
         loaded: the configuration of the mesh; None: it is read from the file that the mesh names.
-        how: see `PlayOptions`; its ``config`` comes first.
+        options: its ``config`` comes first.
 
     Raises:
         ConfigurationError: the bag has no message of these topics before the end of the simulation.
@@ -86,15 +66,15 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None = None, *
     mesh = client.info()
     infos = {name: client.instance_info(name) for name in mesh.instances}
     step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
-    if loaded is None or how.get("config") is not None:
-        loaded = running_configuration(Path(how.get("config") or mesh.config))
-    topics = chosen_topics(loaded, infos, bag, how.get("topics", ()))
-    samples = bag.samples(topics, how.get("stamps", "header"))
-    moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=how.get("start"))
+    if loaded is None or options.config is not None:
+        loaded = running_configuration(Path(options.config or mesh.config))
+    topics = chosen_topics(loaded, infos, bag, options.topics)
+    samples = bag.samples(topics, options.stamps)
+    moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=options.start)
     names = [topic.name for topic in topics]
     if not moments:
         raise _nothing(bag.path, ", ".join(names), beyond)
-    count, first = play(client, moments, step_points, how.get("timeout", _TIMEOUT_S))
+    count, first = play(client, moments, step_points, options.timeout)
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)
 
