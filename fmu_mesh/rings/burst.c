@@ -888,7 +888,8 @@ PUBLIC int64_t node_run(Node *node) {
         return result;
       }
       left += unit->tick < unit->last_tick;
-      if (atomic_load_explicit(&node->attention, memory_order_relaxed) || begin - start > 2 * node->slice_ns) {
+      /* Without a step it has not begun: else many units would be looked through in vain, each time from the first. */
+      if (atomic_load_explicit(&node->attention, memory_order_relaxed) || (any && begin - start > 2 * node->slice_ns)) {
         wake_all(node);
         return ATTENTION;
       }
@@ -908,7 +909,7 @@ PUBLIC int64_t node_run(Node *node) {
       begin = now();
       if (!any) start = begin; /* the slice begins with the first step */
     }
-    if (begin - start > node->slice_ns) {
+    if (any && begin - start > node->slice_ns) {
       wake_all(node);
       return SLICE;
     }
