@@ -386,14 +386,17 @@ def _collected(
 ) -> list[zenoh.Sample]:
     """The answers of one query up to its end, which None marks, or only the first one."""
     samples: list[zenoh.Sample] = []
-    while not over():
-        with suppress(queue.Empty):
-            if (reply := replies.get(timeout=_LOOK_S)) is None:
+    while every or not samples:
+        try:
+            reply = replies.get(timeout=_LOOK_S)
+        except queue.Empty:  # only then: an answer may come just before the end, as that to `stop`
+            if over():
                 break
-            if (sample := answer_of(reply)) is not None:
-                samples.append(sample)
-                if not every:
-                    break
+            continue
+        if reply is None:
+            break
+        if (sample := answer_of(reply)) is not None:
+            samples.append(sample)
     return samples
 
 
