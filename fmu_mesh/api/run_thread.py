@@ -255,7 +255,10 @@ def _make_folder(folder: Path, plan: RunPlan) -> None:
 
 
 def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None:
-    """Check that all rows of a run fit into memory; one without an end must be stopped, not awaited ``to_its_end``.
+    """Check that all rows of a run fit into memory.
+
+    Rows without an end are refused where they are calculated as fast as possible and awaited ``to_its_end``: in real
+    time somebody can stop them.
 
     Raises:
         CallRefused: they do not.
@@ -265,7 +268,7 @@ def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None
     size = records[0].rows_before(last + 1) * bytes_of_a_row(list(types.values())) if records else 0
     if last < ENDLESS and size > limit:
         raise _too_large(plan.mesh, limit, size)
-    if last >= ENDLESS and to_its_end and size:
+    if last >= ENDLESS and to_its_end and size and not plan.plan.system.config.simulation.real_time_factor:
         text = f"the run of '{plan.mesh}' has no end, and its results would stay in memory"
         raise CallRefused(text, hint="Give a `stop_time`, or a `memory_limit` at which it ends.")
 

@@ -173,7 +173,7 @@ def _file(loaded: LoadedConfig, place: str, section: RecordConfig, findings: Fin
     if is_folder:
         findings.add(place, f"the folder '{text}'", "a file, or null to record nothing")
     elif (file := archive_on_the_way(path)) is not None:
-        findings.add(place, f"'{text}' in the file '{file}'", "a file in a folder")
+        findings.add(place, f"'{text}' in the file '{file}'", "a file in a folder; choose one with `output=...`")
     return str(path)
 
 

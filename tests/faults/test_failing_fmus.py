@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import pytest
 
+from fmu_mesh.cli.output.flag_words import in_flags
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import RETRY
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from tests.fmus import event_fmus
@@ -51,7 +52,7 @@ def with_faulty(
         (
             "discard_at",
             "discard; the last successful time is 1 s",
-            f"the step does not converge. {RETRY} ",
+            f"the step does not converge. {in_flags(RETRY)} ",
         ),
     ],
 )

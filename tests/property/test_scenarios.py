@@ -109,7 +109,7 @@ def prescribed(drawn: Drawn, name: str, begin: int) -> float | None:
     if not before:
         return None
     start, value = before[-1]
-    end, later = [pair for pair in after if pair[0] == after[0][0]][-1] if after else before[-1]  # the last one counts
+    end, later = after[0] if after else before[-1]  # of equal times a line ends at the first: a jump
     if not linear or not after or start == now or same(value, later):
         return value
     first, last = drawn.time(start), drawn.time(end)

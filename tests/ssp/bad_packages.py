@@ -521,14 +521,14 @@ EXPERIMENT = (
         (' stopTime="1.0"', ""),
         at="",
         element="simulation.stop_time",
-        words=("--stop-time",),
+        words=("`stop_time`",),
     ),
     fault(
         "no step size and no algorithm",
         ("FixedStepMaster", "VariableStepMaster"),
         at="",
         element="simulation.step_size",
-        words=("--step-size",),
+        words=("`step_size`",),
         count=2,
     ),
     fault(
@@ -536,7 +536,7 @@ EXPERIMENT = (
         ("org.openmodelica", "org.example"),
         at="",
         element="simulation.algorithm",
-        words=("--algorithm",),
+        words=("`algorithm=",),
         count=2,
     ),
     fault(
@@ -923,7 +923,7 @@ def _with_a_text_for_an_fmu(path: Path) -> None:
 
 BAD_ARCHIVES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "no description": (_without_a_description, ("has no SystemStructure.ssd at its root", "Is it a package of SSP?")),
-    "another description": (_with_another_description, ("has no SystemStructure.ssd", "VarA.ssd", "--ssd")),
+    "another description": (_with_another_description, ("has no SystemStructure.ssd", "VarA.ssd", "`ssd=...`")),
     "a folder around": (_with_a_folder_around, ("has no SystemStructure.ssd", "zip what is inside that folder")),
     "a bomb": (_with_a_bomb, ("bad.ssp", "times as large when it is unpacked; the limit is 200")),
     "encrypted": (_encrypted, ("bad.ssp", "encrypted")),

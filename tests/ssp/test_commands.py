@@ -213,15 +213,17 @@ def test_a_result_that_cannot_be_written_beside_a_package_is_refused_with_the_wa
     package = packed()
     Path("results").touch()
 
-    assert "Choose another file with `--output`." in refused(capsys, "launch", package, "--local")
+    assert "results'; expected a file in a folder; choose one with `--output`" in refused(
+        capsys, "launch", package, "--local"
+    )
     assert main(["launch", package, "--local", "--no-progress", "--output", "own/own.csv"]) == 0
 
 
 def test_a_result_file_inside_a_package_is_refused_with_the_way_out(capsys: pytest.CaptureFixture[str]) -> None:
     text = refused(capsys, "launch", packed(), "--local", "--set-config", "record.file=own.csv")
 
-    assert "ship.ssp/own.csv' cannot be written" in text
-    assert "ship.ssp' is a file, and no folder. Choose another file with `--output`." in text
+    assert "--set-config record.file=own.csv: 'own.csv' in the file" in text
+    assert "ship.ssp'; expected a file in a folder; choose one with `--output`" in text
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_a_mistake_in_a_chosen_set_is_told_with_its_line(tmp_path: Path) -> None
     [
         ("good.ssp", "resources/cool.ssv", ("there is no such file", "good.ssp", "Did you mean 'resources/cold.ssv'?")),
         ("good.ssp", ".", ("there is no such file",)),
-        ("mesh.yaml", COLD, ("--ssv chooses a variant of a package", "mesh.yaml")),
+        ("mesh.yaml", COLD, ("`ssv=...` chooses a variant of a package", "mesh.yaml")),
     ],
 )
 def test_a_set_that_is_nowhere_is_refused(source: str, ssv: str, words: tuple[str, ...], tmp_path: Path) -> None:

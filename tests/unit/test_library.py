@@ -183,7 +183,7 @@ def test_a_library_of_somebody_else_is_an_error(monkeypatch: pytest.MonkeyPatch)
 def test_a_library_of_older_sources_is_an_error_that_says_how_to_build_it(clone: Path) -> None:
     with (clone / "fmu_mesh" / "rings" / "burst.c").open("a") as source:
         source.write("/* changed */\n")
-    command = [sys.executable, "-m", "fmu_mesh", "launch", "mesh.yaml"]
+    command = [sys.executable, "-m", "fmu_mesh", "launch", str(write_config(clone))]
 
     asked = subprocess.run(command, cwd=clone, capture_output=True, text=True, check=False)
 
