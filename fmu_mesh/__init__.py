@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from .api.run_handle import Run
     from .api.samples import Sample
     from .api.simulating import simulate
-    from .api.system_graph import SystemGraph
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     )
     from .instances.python.component import Component, component
     from .instances.python.declarations import Input, Output, Parameter
+    from .pictures.system_graph import SystemGraph
     from .sweeps.sweep_result import SweepResult
     from .sweeps.sweeping import Sweep, sweep
     from .sweeps.variants import Range
@@ -120,7 +120,7 @@ _PLACES = {
     "Range": "sweeps.variants",
     "Sample": "api.samples",
     "System": "api.open_system",
-    "SystemGraph": "api.system_graph",
+    "SystemGraph": "pictures.system_graph",
     "SystemState": "api.open_system",
     "simulate": "api.simulating",
     "attach": "api.attaching",

@@ -310,7 +310,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/fmi/model_exchange/model_exchange.py: _TimedEquations._line": "inputs of the present step: state",
     },
     "small_modules_with_one_importer": {
-        "api/shown_figure.py": "it derives from a class of matplotlib, which is an extra, and slow to import",
+        "pictures/shown_figure.py": "it derives from a class of matplotlib, which is an extra, and slow to import",
         "api/offered_variables.py": "the command line reads models only through the library",
     },
     "large_modules": {

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
+from ..pictures.tables import html_table, shortened, table
 from ..printing import page
 from ..text import counted, listed, short_number
-from .tables import html_table, shortened, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,11 +16,11 @@ from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of
 from ..instances.registry import KINDS, describe
+from ..pictures.tables import html_table, pairs
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package
 from ..text import counted, listed, matching, nearest, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
-from .tables import html_table, pairs
 
 __all__ = ["SHOWN_VARIABLES", "Inspection", "inspect", "with_way_out"]
 

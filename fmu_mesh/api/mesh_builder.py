@@ -21,6 +21,7 @@ from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
 from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
+from ..pictures.tables import html_table, shortened
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
@@ -40,15 +41,14 @@ from .mesh_editing import (
 )
 from .plan_options import memory_file, memory_of, with_record
 from .rebasing import rebased
-from .tables import html_table, shortened
 
 if TYPE_CHECKING:
     from ..errors import Finding
+    from ..pictures.system_graph import SystemGraph
     from .open_system import System
     from .repeated_mesh import RepeatedMesh
     from .result import Result
     from .run_handle import Run
-    from .system_graph import SystemGraph
 
 __all__ = ["Mesh", "load"]
 
@@ -532,7 +532,7 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or an option is wrong; carries all findings.
         """
-        from .system_graph import graph_of_plan  # noqa: PLC0415  only this needs it
+        from ..pictures.system_graph import graph_of_plan  # noqa: PLC0415  only this needs it
 
         return graph_of_plan(self.plan(**options.given()).plan)
 

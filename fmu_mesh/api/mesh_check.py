@@ -9,12 +9,12 @@ import msgspec
 
 from ..errors import ConfigurationError, Finding
 from ..instances.registry import check_engines
+from ..pictures.plan_page import plan_page
+from ..pictures.plan_view import PlanView, plan_view
+from ..pictures.tables import html_table
 from ..printing import page
 from ..run.run_plan import RunPlan
 from ..text import counted
-from .plan_page import plan_page
-from .plan_view import PlanView, plan_view
-from .tables import html_table
 
 __all__ = ["Check", "check_of", "together"]
 

@@ -13,6 +13,7 @@ from .. import files
 from ..config.call_options import checked
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError
+from ..pictures.tables import pairs, table
 from ..printing import page
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
@@ -29,7 +30,6 @@ from ..ssp.system_structure import (
     components_of,
 )
 from ..text import counted, printable, short_number
-from .tables import pairs, table
 
 __all__ = ["PackageInspection", "inspect_package"]
 

@@ -17,6 +17,9 @@ from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..files import unwritable
 from ..installing import importing
 from ..instances.python.unit_names import base_unit_of
+from ..pictures.drawing import thinned
+from ..pictures.result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
+from ..pictures.tables import html_table
 from ..recorder.csv_file import CsvFile
 from ..recorder.parquet_file import ParquetFile
 from ..run.outcome import Outcome
@@ -30,10 +33,7 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import DTYPES, VariableType, is_float
 from .compared_rows import Side, compared, differences_of, values_in_unit_of
 from .comparison import Comparison
-from .drawing import thinned
-from .result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
 from .result_reading import Columns, chosen_names, of_one_instance, read_result, result_pieces
-from .tables import html_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,6 +18,7 @@ from ..errors import (
     MeshLost,
 )
 from ..installing import importing
+from ..pictures.notebook_progress import ShownProgress, awaited, progress_of
 from ..ros.bags.play_options import PlayOptions
 from ..run.options import StartOptions
 from ..text import shown
@@ -36,11 +37,11 @@ from ..wire.views import (
     SetAnswer,
     VariableView,
 )
-from .notebook_progress import ShownProgress, awaited, progress_of
 from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, target_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
+    from ..pictures.system_graph import SystemGraph
     from ..ros.bags.bag import Bag
     from ..ros.bags.playing import Played
     from ..run.run_plan import RunPlan
@@ -48,7 +49,6 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
     from .live_view import LiveView
     from .result import Result
     from .run_thread import RunThread
-    from .system_graph import SystemGraph
 
 __all__ = ["TIMEOUT_S", "Run"]
 
@@ -183,7 +183,7 @@ class Run:
             ...     print([(node.instance, node.state) for node in run.graph().nodes])
             [('pendulum', 'running'), ('delay', 'running')]
         """
-        from .system_graph import graph_of_infos, graph_of_plan  # noqa: PLC0415  only this needs it
+        from ..pictures.system_graph import graph_of_infos, graph_of_plan  # noqa: PLC0415  only this needs it
 
         if self._own is None:
             client = self._client()

@@ -7,10 +7,10 @@ import sys
 
 import msgspec
 
-from ..api.plan_view import PlanView
 from ..config.structure import schema_text
 from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
+from ..pictures.plan_view import PlanView
 from .arguments import Runs
 from .output.flag_words import in_flags
 from .output.json_output import Failure, failure_of, print_json

@@ -7,9 +7,9 @@ import argparse
 from msgspec.structs import asdict
 
 from ..api.comparison import Comparison
-from ..api.drawing import draw
 from ..api.result import Result
 from ..installing import require
+from ..pictures.drawing import draw
 from .arguments import Runs
 from .output.json_output import print_json
 

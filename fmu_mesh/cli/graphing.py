@@ -6,11 +6,11 @@ import argparse
 from pathlib import Path
 
 from ..api.attaching import attach
-from ..api.drawing import draw
 from ..api.mesh_builder import load
-from ..api.system_graph import SystemGraph
 from ..errors import ConfigurationError
 from ..files import replaced
+from ..pictures.drawing import draw
+from ..pictures.system_graph import SystemGraph
 from ..run.options import VariantOptions
 from ..ssp.configuration_files import names_package
 from .arguments import Runs

@@ -15,8 +15,8 @@ from typing import Any
 
 import msgspec
 
-from ..api.tables import table
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
+from ..pictures.tables import table
 from ..printing import page, printable
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes

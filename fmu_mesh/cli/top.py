@@ -19,8 +19,8 @@ import numpy as np
 from .. import printing
 from ..api.attaching import attach
 from ..api.run_handle import Run
-from ..api.tables import shortened, table, width_of
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
+from ..pictures.tables import shortened, table, width_of
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs
 from .output.json_output import print_json

@@ -19,8 +19,8 @@ import numpy as np
 
 from ..api.attaching import attach
 from ..api.run_handle import Run
-from ..api.system_graph import SystemGraph, graph_of_infos
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost
+from ..pictures.system_graph import SystemGraph, graph_of_infos
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
 from .curve import BoundedCurve, CurveChange, Looks

@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 
 from ..api.result import Result, imported_pandas
-from ..api.result_drawing import in_unit
 from ..api.result_reading import chosen_names
-from ..api.tables import html_table
 from ..errors import CallRefused, UnknownName
+from ..pictures.result_drawing import in_unit
+from ..pictures.sweep_drawing import VariantCurve, curves_figure, heat_map_figure
+from ..pictures.tables import html_table
 from ..system.system import ResolvedSystem
 from ..text import listed, nearest
-from .sweep_drawing import VariantCurve, curves_figure, heat_map_figure
 from .sweep_folder import SweepFolder, Wanted, cells_of
 from .variant_run import Cell, Row
 from .variants import Parameters

@@ -28,9 +28,9 @@ from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
-from ..api.notebook_progress import ShownProgress, awaited
 from ..config.call_options import takes
 from ..errors import CallRefused, FmuMeshError, Interrupted, KeyboardInterrupted, MeshLost
+from ..pictures.notebook_progress import ShownProgress, awaited
 from ..text import counted
 from ..wire.runtime import remove_stale_folders
 from .planned_sweep import PlannedSweep, planned_sweep

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.instances.configuration import parse
+from fmu_mesh.pictures.plan_page import plan_page
 from fmu_mesh.system.connections import Variables, resolve_connections
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import make_plan

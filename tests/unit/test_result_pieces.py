@@ -15,9 +15,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 import fmu_mesh
-from fmu_mesh.api import drawing, result_reading
+from fmu_mesh.api import result_reading
 from fmu_mesh.api.result import Result
 from fmu_mesh.api.result_reading import Columns
+from fmu_mesh.pictures import drawing
 from fmu_mesh.recorder.csv_file import NativeLines, python_lines
 
 TEXTS = ["one, two", 'a "b"', "line\nbreak", "", "plain", "é"]

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.api.plan_page import plan_page
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.pictures.plan_page import plan_page
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan

@@ -15,9 +15,9 @@ from matplotlib.collections import LineCollection, PathCollection, QuadMesh
 from matplotlib.colors import LogNorm, Normalize, to_hex
 from matplotlib.figure import Figure
 
-from fmu_mesh.api.drawing import draw
 from fmu_mesh.errors import CallRefused, ConfigurationError
-from fmu_mesh.sweeps.sweep_drawing import VariantCurve, _paths, curves_figure, heat_map_figure
+from fmu_mesh.pictures.drawing import draw
+from fmu_mesh.pictures.sweep_drawing import VariantCurve, _paths, curves_figure, heat_map_figure
 
 TIMES = np.linspace(0.0, 10.0, 501)
 

@@ -9,9 +9,9 @@ from functools import cached_property
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from ...api.plan_page import slower_than_it_could_be
 from ...api.result import summary_of
 from ...errors import FmuMeshError, from_report
+from ...pictures.plan_page import slower_than_it_could_be
 from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ...run.outcome import Outcome

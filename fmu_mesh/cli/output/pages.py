@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from ...api.tables import pairs, table
+from ...pictures.tables import pairs, table
 from ...simtime import ENDLESS
 from ...text import short_number
 from ...wire.client.readings import Reading

@@ -12,9 +12,9 @@ from typing import Any
 
 import msgspec
 
-from ...api.tables import table
 from ...errors import ConfigurationError
 from ...files import replaced
+from ...pictures.tables import table
 from ...printing import page
 from ...system.plan import RECORDER, Plan
 from ...wire.time_profile import GRANT, MeshProfile, NodeProfile

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
 
-from ...api.tables import shortened
+from ...pictures.tables import shortened
 from ...simtime import TimeGrid
 from ...system.plan import Plan
 from ...wire.views import MeshStatus

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...api.samples import Sample
-from ...api.tables import shortened
+from ...pictures.tables import shortened
 
 __all__ = ["BLOCKS", "KEPT", "PLAIN", "Histories", "sparkline", "sparkline_signs"]
 

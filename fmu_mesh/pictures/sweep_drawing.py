@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..api.drawing import COLOURS, DASHES, MAX_POINTS, add_legend, empty_figure, reduced, short
 from ..errors import CallRefused
 from ..printing import printable
 from ..text import shown
 from ..variables.value_types import PlainValue
+from .drawing import COLOURS, DASHES, MAX_POINTS, add_legend, empty_figure, reduced, short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,1 @@
+"""What people look at: graphs, plots, pages and tables."""
