@@ -26,6 +26,7 @@ __all__ = [
     "importers_of_kinds",
     "large_modules",
     "names_of_sections",
+    "one_use_helpers",
     "private_names_of_others",
     "rebound_calls",
     "small_modules_with_one_importer",
@@ -38,6 +39,9 @@ SMALL = 60
 
 LARGE = 450
 """A module with more lines needs a reason."""
+
+SHORT = 3
+"""The lines of a body that a reader finds sooner where it is used."""
 
 Node = TypeVar("Node", bound=ast.AST)
 
@@ -206,6 +210,22 @@ def importers_of_kinds(package: Package) -> set[str]:
     }
 
 
+def one_use_helpers(package: Package) -> set[str]:
+    """Private functions of at most three lines that are used in one place: a reader has to jump for them."""
+    names = Counter(
+        node.id if isinstance(node, ast.Name) else node.attr
+        for source in package.sources
+        for node in ast.walk(source.tree)
+        if isinstance(node, ast.Name | ast.Attribute)
+    )
+    return {
+        f"{source.path}: {function.name}"
+        for source in package.sources
+        for function in _all(source.tree, ast.FunctionDef)
+        if re.match(r"_(?!_)", function.name) and names[function.name] == 1 and _lines_of_body(function) <= SHORT
+    }
+
+
 def names_of_sections(package: Package) -> set[str]:
     """Modules that speak of the section of a kind without being of that kind, as ``path: class``.
 
@@ -352,6 +372,12 @@ def _with_bases(node: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> list[as
         names = [ast.unparse(base).partition("[")[0].rpartition(".")[2] for base in one.bases]
         found += [classes[name] for name in names if name in classes and classes[name] not in found]
     return found
+
+
+def _lines_of_body(function: ast.FunctionDef) -> int:
+    """The lines of a function below its docstring."""
+    body = function.body[1:] if ast.get_docstring(function) is not None else function.body
+    return 0 if not body else (body[-1].end_lineno or 0) - body[0].lineno + 1
 
 
 def _methods(node: ast.ClassDef) -> set[str]:
