@@ -19,7 +19,7 @@ import numpy as np
 from .. import printing
 from ..api.attaching import attach
 from ..api.run_handle import Run
-from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
+from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost
 from ..pictures.tables import shortened, table, width_of
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs
@@ -140,6 +140,8 @@ def _follow(run: Run, courses: _Courses, *, as_json: bool) -> int:
         while not ended.is_set():
             try:
                 look = run.all_status()
+            except MeshLost:
+                break
             except DeadlineExceeded:
                 if ended.is_set():
                     break

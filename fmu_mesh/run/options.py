@@ -64,7 +64,7 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
     record: Annotated[
         Literal["memory"] | Sequence[str] | None,
         Option(
-            'variables that are recorded, or "memory" for those of the configuration: as arrays, unless `output` is'
+            'variables to record, or "memory" for those of the configuration: as arrays, unless `output` names a file'
         ),
     ] = None
     output: Output = None
