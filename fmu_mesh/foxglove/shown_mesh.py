@@ -26,7 +26,8 @@ from .mesh_topics import message_of, schema_of, status_message, topic_of, topics
 __all__ = ["ShownMesh"]
 
 _WAITING_VALUES: Final = 1 << 14
-_LOOK_S: Final = 0.05
+# How long to wait for values, before readers that came or went are looked for; less than an eye notices.
+_TAKE_S: Final = 0.05
 _LAST_LOOKS: Final = 5
 """Looks without a value after the end of the mesh, as in `latecomers`."""
 _ASK_S: Final = 0.5
@@ -97,7 +98,7 @@ class ShownMesh:
                 self._over.set()
                 self._questions.put(None)
             for thread in threads:
-                thread.join(_LOOK_S * _LAST_LOOKS)  # they may be waiting for an answer
+                thread.join(_TAKE_S * _LAST_LOOKS)  # they may be waiting for an answer
             self._server.end()
         return self._last
 
@@ -107,7 +108,7 @@ class ShownMesh:
         looks = 0
         while looks < _LAST_LOOKS:
             self._follow_readers()
-            taken = self._stream.take(_LOOK_S)
+            taken = self._stream.take(_TAKE_S)
             for target, reading in taken:
                 self._without.pop(target.key, None)
                 self._send(target, reading)

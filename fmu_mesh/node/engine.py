@@ -30,7 +30,7 @@ __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
 _SLICE_S: Final = 0.001
 """A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""
 
-_LOOK_S: Final = 0.05
+_STATE_CHECK_S: Final = 0.05
 """How often in s, at the end of a burst, a changed state of the process is looked for, which takes 10 us. Models that
 are known to change it are looked after in each step."""
 
@@ -84,7 +84,7 @@ class Engine(ABC):
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
-                self._look_at = perf_counter() + _LOOK_S
+                self._look_at = perf_counter() + _STATE_CHECK_S
                 if self._looked_after.restore():
                     for runner in self.runners:
                         runner.take_care()

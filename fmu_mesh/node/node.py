@@ -71,7 +71,10 @@ __all__ = ["Node"]
 
 log = logging.getLogger(__name__)
 
-_LOOK_S = 0.5
+# Whatever a node sleeps for, after this time it looks at everything again: a wake-up that a killed process has lost
+# costs this much once (docs/rings.md), silence of the master is noticed in steps of it, and `AwakeClock` is read often
+# enough.
+_LONGEST_SLEEP_S = 0.5
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
 _NO_MASTER_S = 1.0
@@ -260,7 +263,7 @@ class Node:
         all_sent = True
         while not self.finished:
             try:  # it waits only when everything is sent: the grant may depend on it
-                stepped = engine.run(_LOOK_S if all_sent or not eager else 0.0, eager=eager)
+                stepped = engine.run(_LONGEST_SLEEP_S if all_sent or not eager else 0.0, eager=eager)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(asked)

@@ -36,7 +36,9 @@ __all__ = ["NodeServer"]
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25
-_LOOK_S = 0.05
+# A stream whose subscriber Zenoh does not announce (it reports only the first of an instance) begins within about this
+# time; shorter would take the main thread's time for nothing.
+_SEARCH_S = 0.05
 _LOOK_SHARE = 20
 """Looking for new subscribers takes one part in so many of the time. For one subscriber it takes about 1 ms."""
 _LAST_ROWS_S = 1.0
@@ -159,7 +161,7 @@ class NodeServer:
         published = 0.0
         while True:
             with suppress(queue.Empty):
-                if (job := self._jobs.get(timeout=_LOOK_S if self._searches else _TICK_S)) is None:
+                if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
                     return
                 with self._inbox.refusals.guard("a query or a value"):
                     job()
@@ -241,10 +243,10 @@ class NodeServer:
     def _search(self) -> None:
         """Go on looking for new subscribers: Zenoh reports only the first one of an instance, and when all are gone."""
         for streams in self._streams:
-            if streams.look(_LOOK_S / _LOOK_SHARE):
+            if streams.look(_SEARCH_S / _LOOK_SHARE):
                 self._inbox.post(partial(self._update, streams))
         self._searches = any(streams.is_followed for streams in self._streams)
-        self._next_search = time.monotonic() + _LOOK_S
+        self._next_search = time.monotonic() + _SEARCH_S
 
     def _look(self, name: str, names: bytes | None) -> None:
         """Find what a program has subscribed to before it asked: the variables that it names, or any."""

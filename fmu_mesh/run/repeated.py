@@ -51,7 +51,8 @@ log = logging.getLogger(__name__)
 _NODE = "instances"
 _SCRATCH = "scratch"
 _WRITE_ROWS = 2048
-_LOOK_S = 0.5
+# After this time without a step, the deadline of a step is looked at.
+_LONGEST_SLEEP_S = 0.5
 
 
 class RepeatedRuns:
@@ -328,7 +329,7 @@ class _Run:
             granted, pause_s = pacer.limit(min(self._last, writer.written - 1 + window), point)
             memory.grant.raise_to(granted)
             try:
-                stepped = engine.run(min(pause_s, _LOOK_S), eager=True)
+                stepped = engine.run(min(pause_s, _LONGEST_SLEEP_S), eager=True)
             except (FmuError, TerminationRequested) as event:
                 self._end_at(event, engine, memory)
                 continue

@@ -73,16 +73,19 @@ _ADMIN_SPACE_IS_OURS: Final = {
 }
 """A session whose admin space others ask for its subscribers, while one comes or goes, stands for ever (zenoh 1.10)."""
 
-_CLOSE_S = 1.0
+# Zenoh closes a session within milliseconds, unless an endpoint does not answer: then it would take ten seconds.
+_SESSION_END_S = 1.0
 _OWN_S = 5.0
-_LOOK_S = 0.05
+# How late a question notices that its answer is not needed any more, or that the process it asks is gone: neither is
+# an event here.
+_OVER_CHECK_S = 0.05
 _TIMEOUT = "Timeout"
 """The reply of Zenoh itself if a queryable did not answer in time."""
 _TOKENS_S = 2.0
 _TOKENS_TRIES = 10
 _LINK_S = 1.0
 _UNLINK_S = 0.2
-_LINK_LOOK_S = 0.01
+_LINK_CHECK_S = 0.01
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -212,7 +215,7 @@ def close_session(session: zenoh.Session) -> None:
     """
     closing = threading.Thread(target=session.close, name="close", daemon=True)
     closing.start()
-    closing.join(_CLOSE_S)
+    closing.join(_SESSION_END_S)
 
 
 def own_endpoints(session: zenoh.Session, wiring: Wiring) -> tuple[str, ...]:
@@ -291,7 +294,7 @@ class RouterLink:
         while self.look() != there:
             if time.monotonic() > end:
                 return False
-            never.wait(_LINK_LOOK_S)
+            never.wait(_LINK_CHECK_S)
         return True
 
 
@@ -361,7 +364,7 @@ def answers(
                         return samples
                 if over():
                     raise MeshLost(f"{question.whom} has not answered yet, and this process does not wait any more")
-                changed.wait(min(left, _LOOK_S))
+                changed.wait(min(left, _OVER_CHECK_S))
         finally:
             listener.undeclare()
     raise DeadlineExceeded(f"{question.whom} did not answer within {question.deadline_s:g} s")
@@ -388,7 +391,7 @@ def _collected(
     samples: list[zenoh.Sample] = []
     while every or not samples:
         try:
-            reply = replies.get(timeout=_LOOK_S)
+            reply = replies.get(timeout=_OVER_CHECK_S)
         except queue.Empty:  # only then: an answer may come just before the end, as that to `stop`
             if over():
                 break

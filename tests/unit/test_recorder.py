@@ -169,7 +169,7 @@ def test_a_recorder_takes_rows_that_come_after_the_end_of_the_run(mesh: Mesh, mo
 
 def test_a_recorder_writes_before_its_window_is_full(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the nodes, which may not be further ahead, wait until it looks."""
-    monkeypatch.setattr(module, "_LOOK_S", 2 * DEADLINE_S)
+    monkeypatch.setattr(module, "_LONGEST_SLEEP_S", 2 * DEADLINE_S)
     memory, mesh.shared = HostMemory.create(mesh.plan.memory, MASTER), ("n",)
     plan = msgspec.structs.replace(mesh.plan, window=64)
 

@@ -48,7 +48,8 @@ __all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
 
-_LOOK_S = 0.05
+# How often a wait for the mesh asks whether it has ended meanwhile; there is no event for both.
+_END_CHECK_S = 0.05
 
 
 class MeshClient:
@@ -302,7 +303,7 @@ class MeshClient:
     def _is_there(self, follower: Follower[Any], timeout_s: float) -> bool:
         """Whether a follower finds the mesh in time."""
         end = time.monotonic() + timeout_s
-        while not follower.there.wait(_LOOK_S):
+        while not follower.there.wait(_END_CHECK_S):
             if self._is_over() or time.monotonic() >= end:
                 return False
         return True

@@ -11,8 +11,9 @@ from .mesh_client import MeshClient
 
 __all__ = ["go_on", "paused_at", "wait_until_at"]
 
-_LOOK_S = 0.001
-_LONGEST_LOOK_S = 0.05
+# A short step ends within a millisecond; a question costs the node about as much, so each wait is twice the last one.
+_FIRST_ASK_S = 0.001
+_LONGEST_ASK_S = 0.05
 
 
 def paused_at(client: MeshClient, command: Command) -> int:
@@ -46,14 +47,14 @@ def wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: floa
         DeadlineExceeded: it stays at another point for ``timeout_s`` seconds.
     """
     never = threading.Event()
-    look, reached, moved = _LOOK_S, -1, time.monotonic()
+    look, reached, moved = _FIRST_ASK_S, -1, time.monotonic()
     while (status := client.instance_status(instance)).point != point:
         now = time.monotonic()
         if status.point != reached:
-            look, reached, moved = _LOOK_S, status.point, now
+            look, reached, moved = _FIRST_ASK_S, status.point, now
         if now - moved > timeout_s:
             raise DeadlineExceeded(
                 f"it does not reach point {point}: {status.activity}.", instance=instance, point=reached
             )
         never.wait(look)
-        look = min(2 * look, _LONGEST_LOOK_S)
+        look = min(2 * look, _LONGEST_ASK_S)

@@ -28,7 +28,8 @@ __all__ = ["Meshes"]
 Answer = TypeVar("Answer")
 
 _GRACE_S = 1.0
-_LOOK_S = 0.05
+# A new note in the runtime folder makes no event, and a look at the folder costs less than a millisecond.
+_NOTE_CHECK_S = 0.05
 _AGAIN_S = 1.0
 _TOKENS = "**/mesh"
 _NOBODY = "nobody answered"
@@ -94,7 +95,7 @@ class Meshes:
 
         def wait(left_s: float) -> None:
             # There is no event for a new note. There is one for a token, but a query for it may still have been empty.
-            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _LOOK_S))
+            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _NOTE_CHECK_S))
             changed.clear()
 
         with ExitStack() as stack:

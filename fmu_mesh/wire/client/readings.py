@@ -18,7 +18,9 @@ from ..views import VariableView
 __all__ = ["Reading", "Target", "latecomers", "reading_of"]
 
 _LOOKS = 5
-_LOOK_S = 0.05
+# Five times this without a sample is the end. Each is a turn of this process, so one that had no processor for a while
+# does not take its own pause for the end.
+_LATE_SAMPLE_S = 0.05
 
 Item = TypeVar("Item")
 
@@ -71,7 +73,7 @@ def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
     looks = 0
     while looks < _LOOKS:
         try:
-            item = arrived.get(timeout=_LOOK_S)
+            item = arrived.get(timeout=_LATE_SAMPLE_S)
         except queue.Empty:
             looks += 1
         else:
