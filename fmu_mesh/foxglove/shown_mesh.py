@@ -15,9 +15,9 @@ from typing import Final
 from ..errors import FmuMeshError
 from ..ros.messages.stamp import nanoseconds
 from ..simtime import ENDLESS, TimeGrid
+from ..wire.client.following import ValueStream
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Reading, Target
-from ..wire.client.value_stream import ValueStream
 from ..wire.views import MeshInfo, MeshStatus
 from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
@@ -66,7 +66,7 @@ class ShownMesh:
         has_field = {one.name: one for one in everything if one.variable.type != "Binary"}  # Foxglove has none for it
         settable = {name: target for name, target in has_field.items() if target.variable.settable}
         self._parameters = MeshParameters(client, settable, self._refused, read_only=read_only)
-        self._stream = ValueStream(client, _WAITING_VALUES)
+        self._stream = ValueStream(client.session, _WAITING_VALUES)
         self._without: dict[str, Target] = {}
         self._asking = False
         self._questions: queue.SimpleQueue[list[Target] | None] = queue.SimpleQueue()

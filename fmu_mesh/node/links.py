@@ -12,8 +12,8 @@ from ..rings.transfer import Index, elements_at
 from ..system.layout import Layout
 from ..system.plan import RECORDER, Link
 from ..variables.value_types import Value
+from ..wire.frames import encode_frames, encode_rows
 from ..wire.messages import FRAME, HEADER, INITIAL, LAST
-from ..wire.rows import encode_frames, encode_rows
 
 __all__ = ["OutLink"]
 

@@ -1,7 +1,7 @@
 """The messages of the synchronization, as bytes.
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
-four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.rows`), in an ABORT an `ErrorReport` as
+four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), in an ABORT an `ErrorReport` as
 JSON, in a SET a `SetValue` as JSON, for the recorder. LAST says that no more rows of a link come, because the run has
 ended early. Every decoder checks sizes before it reads anything, and raises only `MessageRefused`.
 """

@@ -27,10 +27,9 @@ from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import Link
 from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, is_text, nested
-from fmu_mesh.wire.frames import FrameReceiver
+from fmu_mesh.wire.frames import FrameReceiver, decode_rows, encode_frames, encode_rows
 from fmu_mesh.wire.keys import Keys, escape, unescape
 from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, decode_json, encode_abort
-from fmu_mesh.wire.rows import decode_rows, encode_frames, encode_rows
 from fmu_mesh.wire.values import Stamp, ValueRefused, attachment, decode_value, encode_value
 
 columns = st.tuples(st.sampled_from(TYPES), st.lists(st.integers(1, 3), max_size=2).map(tuple))
@@ -124,7 +123,7 @@ def test_a_frame_that_is_cut_off_or_too_long_is_refused(
 
 
 def test_rows_too_large_for_one_message_go_in_several(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fmu_mesh.wire.rows.MAX_MESSAGE_SIZE", 100)
+    monkeypatch.setattr("fmu_mesh.wire.frames.MAX_MESSAGE_SIZE", 100)
     layout = Layout.of([("b", "Binary"), ("n", "UInt8")])
     rows = (np.arange(7, dtype=np.uint8)[:, None], np.array([[b"x" * 30]] * 7, dtype=np.object_))
 

@@ -16,9 +16,8 @@ from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import RECORDER, Link
-from fmu_mesh.wire.frames import FrameReceiver, initial_values, rows_of
+from fmu_mesh.wire.frames import FrameReceiver, encode_rows, initial_values, rows_of
 from fmu_mesh.wire.messages import FRAME, HEADER, INITIAL
-from fmu_mesh.wire.rows import encode_rows
 
 LAYOUT = Layout.of([("a", "Float64"), ("n", "Int32"), ("b", "Float64")])
 LINK = Link(3, "source", "left", "right", 2, LAYOUT, (0, 2, -1))

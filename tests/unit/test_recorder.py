@@ -20,10 +20,10 @@ from fmu_mesh.recorder.recorder import Recorder
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan
+from fmu_mesh.wire.frames import encode_rows
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, LAST, encode_abort
-from fmu_mesh.wire.rows import encode_rows
 from fmu_mesh.wire.session import Wiring, close_session, open_session
 from tests.helpers import DEADLINE_S, wait_until
 from tests.scenarios.scenario import Scenario
