@@ -31,7 +31,7 @@ from ..node.connecting import connect
 from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
-from ..node.stepping import Position, Runner
+from ..node.stepping import Runner
 from ..recorder.growth import GrowthWatch
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -386,7 +386,7 @@ class _Run:
     def _forget(self) -> None:
         """The memory of the run is freed now: it is in no cycle of objects any more."""
         for runner in self._runners.values():
-            runner.follow(Position())
+            runner.follow(native.MemberTable())
         self._runners.clear()
         self._engine = None
 
