@@ -75,7 +75,6 @@ class FrameReceiver:
 
     Args:
         ring: the mirror of the ring of the source, with the columns of the frames: gets the rows.
-        counter: the number of rows of this mirror.
         fits: whether rows before this own step of the source overwrite no row that is still needed.
     """
 

@@ -39,6 +39,20 @@ __all__ = [
     "undeclare_all",
 ]
 
+# Threads: a session has its own. Each callback of zenoh-python has a thread in addition, unless it is
+# `indirect=False`; that one runs on the thread that reads the link, and must return at once. No function here may be
+# called in a callback: those that ask would wait for the thread that they are on. `close_session` closes on a thread
+# of its own, which may be left behind. Where Zenoh has no event (a queryable whose process is gone), a wait looks
+# every `_OVER_CHECK_S`.
+#
+# What may go wrong: a receiver is stopped, and a sender blocks on it. Then `stuck_s` closes the link; the lease does
+# not expire meanwhile (measured, ADR 4). A slow reader loses samples and answers, which have queues of their own
+# behind all other messages. A process that ends while a thread of Zenoh calls Python may abort: `last_exit`.
+#
+# Tried and given up: gossip and scouting on one host (slower than endpoints, and open to others), a loopback port
+# (every user of the host can connect), the lease as it is by default (4 s ended runs whose host was suspended; ADR
+# 67).
+
 LEASE_S = 30.0
 """After so long in s without a sign of life a link counts as lost; a dead process is noticed within milliseconds."""
 
@@ -93,10 +107,8 @@ class Wiring(msgspec.Struct, frozen=True):
 
     Attributes:
         mode: `peer` or `client`.
-        listen: endpoints to listen on.
         connect: endpoints to connect to; repeated until they answer.
         gossip: whether peers find each other through other peers (meshes over several hosts).
-        config: a Zenoh configuration file to start from.
         patience_s: how long a client tries to connect, in s.
         lease_s: how long a process at the other end waits for a sign of life of this one, in s.
         stuck_s: how long a sender may be blocked before its link is closed, in s; the lease does not expire meanwhile.
@@ -308,7 +320,6 @@ class Question(msgspec.Struct, frozen=True):
     """A query that waits for its answer.
 
     Attributes:
-        key: key expression of the queryable.
         whom: the receiver, for the error.
         deadline_s: how long to wait for an answer, in s.
         payload: JSON of the query, if there is any.

@@ -207,9 +207,9 @@ def test_an_enumeration_has_the_names_of_the_header_in_their_order(known: type[I
 
 
 def test_fields_of_a_table_are_those_of_the_header_with_their_types() -> None:
-    assert dict(native.UnitTable._fields_)["members"] == ctypes.POINTER(native.MemberTable)
-    assert dict(native.MemberTable._fields_)["outputs"] == native.OutputTable * 2
-    assert dict(native.MemberTable._fields_)["said"] == ctypes.c_void_p
+    assert ("members", ctypes.POINTER(native.MemberTable)) in native.UnitTable._fields_
+    assert ("outputs", native.OutputTable * 2) in native.MemberTable._fields_
+    assert ("said", ctypes.c_void_p) in native.MemberTable._fields_
     assert [name for name, *_ in native.Entry._fields_] == ["from_", "to", "from_large", "to_large"]
 
 

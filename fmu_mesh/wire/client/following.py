@@ -25,6 +25,12 @@ from .readings import Reading, Target, latecomers, reading_of
 
 __all__ = ["Follower", "ValueStream"]
 
+# Threads: those of Zenoh put samples (`take`, `arrived`) and the loss of the token; any other thread takes them.
+# Callbacks are `indirect=False`: a thread for each of 1,000 keys would be too many, so they only store, and never
+# wait; of what is stored there is a limit. The token may be reported as gone before samples that were sent earlier
+# have arrived (another priority, another thread), so the end is only the end after `latecomers`. And Zenoh may report
+# one token twice: a mesh that has ended does not begin again for the same follower (ADR 67 on lost tokens).
+
 Item = TypeVar("Item")
 
 _WAITING_SAMPLES = 1 << 16
@@ -34,13 +40,10 @@ class Follower(Generic[Item]):
     """Follows a mesh as long as the `with` block lasts.
 
     Args:
-        session: a session that reaches the mesh.
-        keys: the keys of the mesh.
         on_end: called on a thread of Zenoh when the mesh ends.
 
     Attributes:
         arrived: what subscribers have received, in order; None marks the end of the mesh.
-        there: set when the mesh was found.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, on_end: Callable[[], None] = lambda: None) -> None:

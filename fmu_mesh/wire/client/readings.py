@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 import msgspec
@@ -15,7 +15,7 @@ from ..messages import decode_json
 from ..values import Stamp
 from ..views import VariableView
 
-__all__ = ["Reading", "Target", "latecomers", "reading_of"]
+__all__ = ["Reading", "Target", "latecomers", "reading_among", "reading_of"]
 
 _LOOKS = 5
 # Five times this without a sample is the end. Each is a turn of this process, so one that had no processor for a while
@@ -61,6 +61,12 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
         return None
     view = target.variable
     return Reading(target.key, target.instance, view.name, value, stamp.point, stamp.time, view.unit)
+
+
+def reading_among(targets: Mapping[str, Target], sample: zenoh.Sample) -> Reading | None:
+    """As `reading_of`, for the target with the key of the sample; None if there is none."""
+    target = targets.get(str(sample.key_expr))
+    return reading_of(target, sample) if target is not None else None
 
 
 def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:

@@ -152,18 +152,14 @@ def wait_for(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStat
             for last in statuses:
                 if last.state == state:
                     return last
-                if not _can_become(last.state, state):
+                before, then = _RANKS[last.state], _RANKS[state]
+                if not (before < then or before == then == _GOES_AND_RESTS):
                     raise _ended(last, f"become {state}")
         except DeadlineExceeded:
             now = last.state if last is not None else "silent"
             text = f"mesh '{mesh}' is {now}, and was not {state} in time."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
     raise _gone(mesh, f"become {state}")
-
-
-def _can_become(state: MeshState, wanted: MeshState) -> bool:
-    """Whether a mesh can change from one state to another."""
-    return _RANKS[wanted] > _RANKS[state] or _RANKS[wanted] == _RANKS[state] == _GOES_AND_RESTS
 
 
 def _ended(status: MeshStatus, what: str) -> FmuMeshError:
