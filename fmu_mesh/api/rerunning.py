@@ -26,9 +26,8 @@ from ..system.run_metadata import RunMetadata, machine, machine_difference, scen
 from ..text import listed
 from ..variables.value_types import PlainValue
 from ..wire.client.mesh_client import MeshClient
-from ..wire.client.pausing import go_on, paused_at, wait_until_at
 from ..wire.client.readings import Target
-from ..wire.client.waiting import rest
+from ..wire.client.waiting import go_on, paused_at, rest, wait_until_at
 from ..wire.messages import SetValue
 from ..wire.views import Command
 from .mesh_builder import Mesh

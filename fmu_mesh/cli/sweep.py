@@ -29,7 +29,8 @@ from .running import interrupted_by_signals
 
 __all__ = ["RUNS", "SweepReport"]
 
-_LOOK_S = 0.1
+# Ten times a second, so that Ctrl-C and the line with the progress feel immediate.
+_REDRAW_S = 0.1
 _SHOWN_FAILURES = 5
 _OF_FOLDER = {"allow_code", "on_notice", "resume", "workers"}
 """The options that go with the folder of a sweep, which says all others."""
@@ -143,7 +144,7 @@ def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:
         while True:
             line.update(sweep.progress)
             try:
-                sweep.wait(_LOOK_S)
+                sweep.wait(_REDRAW_S)
             except DeadlineExceeded:
                 continue
             return

@@ -17,7 +17,8 @@ from .mesh_page import MeshPage
 
 __all__ = ["LivePage"]
 
-_LOOK_S: Final = 0.25
+# A status comes four times a second, so a shorter time shows nothing new.
+_REDRAW_S: Final = 0.25
 _BUSY_S: Final = 60.0
 """On a busy machine, a page may take this long to be made."""
 
@@ -47,7 +48,7 @@ class LivePage:
         content = _Content(self._directory, wanted, _grouped(chosen), read_only=self._read_only)
         await ui.context.client.connected()
         content.look()
-        ui.timer(_LOOK_S, content.look)
+        ui.timer(_REDRAW_S, content.look)
 
 
 class _Content:

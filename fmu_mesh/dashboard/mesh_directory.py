@@ -14,7 +14,8 @@ from .mesh_follower import MeshFollower
 
 __all__ = ["MeshDirectory"]
 
-_LOOK_S: Final = 1.0
+# A mesh that starts is in the list within a second, as fast as a person looks for it.
+_MESHES_S: Final = 1.0
 _MOST_MESHES: Final = 32
 """Meshes that are followed; of those that have ended, the ones that ended first are left out beyond it."""
 
@@ -69,10 +70,10 @@ class MeshDirectory:
     def _live(self) -> None:
         while not self._closing.is_set():
             with suppress(FmuMeshError), Meshes(self._connect, self._timeout) as found:
-                while not self._closing.wait(_LOOK_S):
+                while not self._closing.wait(_MESHES_S):
                     found.look()
                     self._add(found.roots)
-            self._closing.wait(_LOOK_S)
+            self._closing.wait(_MESHES_S)
 
     def _add(self, keys: Sequence[str]) -> None:
         """Follow what is new. The mapping is replaced and not changed, since pages read it meanwhile."""

@@ -30,7 +30,8 @@ __all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshVie
 
 MOST_CURVES: Final = 64
 """Variables whose history is kept for one mesh; beyond it, that of the one that no page has asked for longest goes."""
-_LOOK_S: Final = 0.25
+# A status is published four times a second, so a shorter time shows nothing new.
+_STATUS_S: Final = 0.25
 _SAMPLE_S: Final = 0.05
 _AGAIN_S: Final = 1.0
 _ASKED_S: Final = 10.0
@@ -230,7 +231,7 @@ class MeshFollower:
             try:
                 while not (ended.is_set() or self._closing.is_set()):
                     self._look(run)
-                    ended.wait(_LOOK_S)
+                    ended.wait(_STATUS_S)
             finally:
                 if not self._closing.is_set():
                     failure, last = _failure(run), {n: _at_its_end(own) for n, own in self._view.instances.items()}
@@ -286,7 +287,7 @@ class MeshFollower:
                 else:
                     source.read(self._held, self._forget)
                     self._ask_for_values(run, source.names, looks)
-                self._wake.wait(_LOOK_S if over else _SAMPLE_S)
+                self._wake.wait(_STATUS_S if over else _SAMPLE_S)
                 self._wake.clear()
         finally:
             source.close()

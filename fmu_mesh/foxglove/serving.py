@@ -19,7 +19,8 @@ from .shown_mesh import ShownMesh
 
 __all__ = ["Serving", "serve"]
 
-_LOOK_S: Final = 1.0
+# While no mesh is there, one attempt a second costs nothing; whoever starts a mesh sees it a second later.
+_NEXT_ATTEMPT_S: Final = 1.0
 
 
 class Serving(msgspec.Struct, frozen=True):
@@ -80,12 +81,12 @@ def _once(
     while not stop.is_set():
         try:
             with Meshes(serving.connect, serving.timeout_s) as meshes:
-                client = appearance(meshes, mesh, _LOOK_S)
+                client = appearance(meshes, mesh, _NEXT_ATTEMPT_S)
                 with _unless_ended(client):
                     _show(serving, client, server, say)
                 return client.keys.root
         except DeadlineExceeded:
-            stop.wait(_LOOK_S)
+            stop.wait(_NEXT_ATTEMPT_S)
     return mesh
 
 

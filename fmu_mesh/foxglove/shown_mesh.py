@@ -15,9 +15,9 @@ from typing import Final
 from ..errors import FmuMeshError
 from ..ros.messages.stamp import nanoseconds
 from ..simtime import ENDLESS, TimeGrid
+from ..wire.client.following import ValueStream
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Reading, Target
-from ..wire.client.value_stream import ValueStream
 from ..wire.views import MeshInfo, MeshStatus
 from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
@@ -26,7 +26,8 @@ from .mesh_topics import message_of, schema_of, status_message, topic_of, topics
 __all__ = ["ShownMesh"]
 
 _WAITING_VALUES: Final = 1 << 14
-_LOOK_S: Final = 0.05
+# How long to wait for values, before readers that came or went are looked for; less than an eye notices.
+_TAKE_S: Final = 0.05
 _LAST_LOOKS: Final = 5
 """Looks without a value after the end of the mesh, as in `latecomers`."""
 _ASK_S: Final = 0.5
@@ -65,7 +66,7 @@ class ShownMesh:
         has_field = {one.name: one for one in everything if one.variable.type != "Binary"}  # Foxglove has none for it
         settable = {name: target for name, target in has_field.items() if target.variable.settable}
         self._parameters = MeshParameters(client, settable, self._refused, read_only=read_only)
-        self._stream = ValueStream(client, _WAITING_VALUES)
+        self._stream = ValueStream(client.session, _WAITING_VALUES)
         self._without: dict[str, Target] = {}
         self._asking = False
         self._questions: queue.SimpleQueue[list[Target] | None] = queue.SimpleQueue()
@@ -97,7 +98,7 @@ class ShownMesh:
                 self._over.set()
                 self._questions.put(None)
             for thread in threads:
-                thread.join(_LOOK_S * _LAST_LOOKS)  # they may be waiting for an answer
+                thread.join(_TAKE_S * _LAST_LOOKS)  # they may be waiting for an answer
             self._server.end()
         return self._last
 
@@ -107,7 +108,7 @@ class ShownMesh:
         looks = 0
         while looks < _LAST_LOOKS:
             self._follow_readers()
-            taken = self._stream.take(_LOOK_S)
+            taken = self._stream.take(_TAKE_S)
             for target, reading in taken:
                 self._without.pop(target.key, None)
                 self._send(target, reading)

@@ -45,7 +45,9 @@ __all__ = [
 
 Result = TypeVar("Result")
 
-_LOOK_S: Final = 0.25
+# How late a call beyond its limit may be noticed: limits are seconds, and this thread should wake up rarely, but as
+# often as `AwakeClock` has to be read.
+_WATCH_S: Final = 0.25
 _DO_STEP: Final = "doStep"
 
 _functions: dict[int, str] = {}
@@ -151,9 +153,9 @@ class CallWatch:
                     return
                 call, position = self._call, self._position
                 if call is None:
-                    self._changed.wait(_LOOK_S if position is not None else None)
+                    self._changed.wait(_WATCH_S if position is not None else None)
                 elif call == watched:
-                    self._changed.wait(min(_LOOK_S, max(0.0, since + call.limit_s - clock())))
+                    self._changed.wait(min(_WATCH_S, max(0.0, since + call.limit_s - clock())))
                 if call is not self._call or position is not self._position:
                     continue
             place: object = call

@@ -1,7 +1,4 @@
-"""What a node is doing right now: the source of `status`, and the check for steps that do not return.
-
-The main thread only writes a few attributes; the server thread reads them and the points of the instances.
-"""
+"""What a node is doing right now: the source of `status`, and the check for steps that do not return."""
 
 from __future__ import annotations
 
@@ -21,6 +18,11 @@ from .stepping import Runner
 
 __all__ = ["Activity"]
 
+# Threads: the main thread writes `state`, `runners` and the engine, each in one assignment; the server thread reads
+# them, and the tables of the engine, while a step is under way. Nothing here takes a lock but `engine.sending`: a
+# thread that answers `status` must never wait for one that is inside an FMU (ADR 12). So an answer takes the step of
+# a runner once and derives all else from it: the main thread goes on meanwhile.
+
 log = logging.getLogger(__name__)
 
 
@@ -30,9 +32,6 @@ class Activity:
     Attributes:
         state: in one or two words, for `status`.
         runners: the instances, once all are loaded.
-
-    Args:
-        refusals: counts the messages that its process refused.
     """
 
     def __init__(self, plan: NodePlan, refusals: Refusals) -> None:

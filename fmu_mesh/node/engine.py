@@ -11,6 +11,7 @@ import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 from threading import Lock
 from time import perf_counter
 from typing import Final, cast
@@ -23,14 +24,34 @@ from ..rings.host_memory import HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..system.plan import NodePlan
 from .inputs import TimedInputs
-from .stepping import Position, PositionInTable, Runner
+from .stepping import Runner
 
 __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
+
+# Threads: `run` belongs to the main thread, because an FMU is called from one thread only (ADR 12). From other
+# threads come: `ring_bell` (threads of Zenoh with a message, the server with a query), `current` and `spent_s` (the
+# server, for `status`), and `sending`, which the server takes to send rows while a step lasts long. The burst in C
+# runs without the interpreter's lock: so whatever another thread reads of a table is one number that the burst writes
+# once.
+#
+# What may go wrong:
+# * A step never returns. Then `run` does not either; `Activity` sees it, and `status` still answers.
+# * A row is not what its writer wrote (a forged counter, a broken window): the burst looks at its stamp after it has
+#   copied it, and ends with FORGED. The outputs of that step are not counted.
+# * A wake-up is lost, because its sender was killed: each sleep has a limit, then everything is looked at anew.
+# * An FMU changes the floating-point mode or a signal handler of the process: the mode is looked at after each step,
+#   as that is two additions; all else every 50 ms (`_STATE_CHECK_S`), as that is 10 us.
+# * Python writes a table while the burst uses it: it cannot, because `_fill` and `_follow` run on the main thread,
+#   between two calls of `node_run`, or for a member whose step the burst has just given to Python.
+#
+# Tried and given up: one call from Python for each step (as much time as a small FMU takes), loops that llvmlite
+# compiled (170 MB, up to 20 ms for each node, and no faster; ADR 57), a grant that is asked for at each window (ADR
+# 58).
 
 _SLICE_S: Final = 0.001
 """A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""
 
-_LOOK_S: Final = 0.05
+_STATE_CHECK_S: Final = 0.05
 """How often in s, at the end of a burst, a changed state of the process is looked for, which takes 10 us. Models that
 are known to change it are looked after in each step."""
 
@@ -41,13 +62,11 @@ class Engine(ABC):
     """Steps the units of a node.
 
     Args:
-        plan: the plan of the node.
         units: the runners of each unit, in the order of the plan.
         memory: with the grant and the progress of all nodes.
         shared: whether the other nodes of the run write their progress there, so that the windows are kept here.
 
     Attributes:
-        waited_s: time that it has waited in s.
         sending: held by whoever sends rows: the main thread between bursts, or another one during a long step.
     """
 
@@ -63,6 +82,20 @@ class Engine(ABC):
         self._last_point = plan.grid.last_point
         self._looked_after: ProcessState | None = None
         self._look_at = 0.0
+        members = [(native.MemberTable * len(unit))() for unit in units]
+        self._units = table(native.UnitTable, list(map(self._unit, units, members)))
+        for unit, tables in zip(units, members, strict=True):
+            for runner, member in zip(unit, tables, strict=True):
+                runner.follow(member, partial(self._fill, unit, runner))
+
+    def _unit(self, unit: Sequence[Runner], members: object) -> native.UnitTable:
+        last_tick = unit[0].last_step if len(unit) == 1 else self._last_point
+        points = self.tick_points(unit)
+        return native.UnitTable(members=members, n_members=len(unit), tick_points=points, last_tick=last_tick, burst=1)
+
+    @abstractmethod
+    def _fill(self, unit: Sequence[Runner], runner: Runner) -> None:
+        """Note in the table of a runner how it is stepped, which has changed."""
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
@@ -84,7 +117,7 @@ class Engine(ABC):
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
-                self._look_at = perf_counter() + _LOOK_S
+                self._look_at = perf_counter() + _STATE_CHECK_S
                 if self._looked_after.restore():
                     for runner in self.runners:
                         runner.take_care()
@@ -109,9 +142,9 @@ class Engine(ABC):
         return next((own for own in self.runners if own.stage in _BUSY and own.step < own.last_step), None)
 
     @property
-    @abstractmethod
     def spent_s(self) -> list[float]:
         """How long each unit was stepped, in s."""
+        return [unit.spent_ns / 1e9 for unit, _ in zip(self._units, self.units, strict=False)]
 
     @property
     def awaited(self) -> str | None:
@@ -143,10 +176,8 @@ class BurstEngine(Engine):
         super().__init__(plan, units, memory, shared=shared)
         assert native.library is not None
         self._library = native.library
-        self._kept: dict[tuple[int, int], list[object]] = {}
-        self._tracks: dict[tuple[int, int], list[object]] = {}
-        self._members = [(native.MemberTable * len(unit))() for unit in units]
-        self._units = table(native.UnitTable, [self._unit(number) for number in range(len(units))])
+        self._kept: dict[str, list[object]] = {}
+        self._tracks: dict[str, list[object]] = {}
         self._peers = table(native.Peer, [native.Peer(counter.address, window) for counter, window in self._windows])
         self._node = native.NodeTable(
             place=memory.place,
@@ -163,14 +194,10 @@ class BurstEngine(Engine):
             stride=1,
         )
         self._address = ctypes.addressof(self._node)
-        for number, unit in enumerate(units):
-            for index, runner in enumerate(unit):
-                fill = partial(self._fill, number, index)
-                runner.follow(PositionInTable(self._members[number][index], fill))
-                fill()
+        for runner in self.runners:
+            runner.refit()
 
     def _burst(self, wait_s: float, *, eager: bool) -> bool:
-        """See `Engine`."""
         node, library = self._node, self._library
         node.wait_ns, node.eager = int(wait_s * 1e9), eager
         started, before = perf_counter(), self._ticks
@@ -178,11 +205,11 @@ class BurstEngine(Engine):
             result = library.run(self._address)
             if result < BurstEnd.PYTHON:
                 break
-            runner, member = self._at(node.unit, node.member)
+            runner = self.units[node.unit][node.member]
             if result == BurstEnd.FORGED:
                 raise self._forged(runner)
             began = perf_counter()
-            self._complete(node.unit, runner, member, result)
+            self._complete(node.unit, runner, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
             if perf_counter() - started > _SLICE_S:
                 library.attend(self._address)  # so it returns after this tick
@@ -193,11 +220,6 @@ class BurstEngine(Engine):
     def ring_bell(self) -> None:
         """See `Engine`."""
         self._library.attend(self._address)
-
-    @property
-    def spent_s(self) -> list[float]:
-        """See `Engine`."""
-        return [unit.spent_ns / 1e9 for unit, _ in zip(self._units, self.units, strict=False)]
 
     @property
     def awaited(self) -> str | None:
@@ -216,51 +238,26 @@ class BurstEngine(Engine):
     def _ticks(self) -> int:
         return sum(runner.step for runner in self.runners)
 
-    def _unit(self, number: int) -> native.UnitTable:
-        unit = self.units[number]
-        points = self.tick_points(unit)
-        last_tick = unit[0].last_step if len(unit) == 1 else self._last_point
-        return native.UnitTable(
-            members=self._members[number], n_members=len(unit), tick_points=points, last_tick=last_tick, burst=1
-        )
-
-    def _fill(self, unit: int, index: int) -> None:
+    def _fill(self, unit: Sequence[Runner], runner: Runner) -> None:
         """Fill the table of a runner: at the start, and again whenever it steps in another way."""
-        runner, before = self._at(unit, index)
+        before = runner.table
         own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
         if own is not None and any(source.transfer.has_text for source in runner.sources):
             own = None
-        gates, loads = [], []
-        for number, source in enumerate(runner.sources):
-            gates.append(source.gate)
-            loads += source.transfer.moves(RowBase.FIRST_GATE + number)
-        loads += own.loads if own is not None else ()
-        setters, getters, stores = (own.setters, own.getters, own.stores) if own is not None else ((), (), ())
-        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(gates)))()
+        moves = [source.transfer.moves(RowBase.FIRST_GATE + number) for number, source in enumerate(runner.sources)]
+        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(runner.sources)))()
         grid, points = runner.grid, runner.plan.step_points
         watched = runner.watched if runner.watched is not None else runner.outputs
         rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
         made = native.MemberTable(
-            gates=table(native.Gate, gates),
-            loads=table(native.Move, loads),
-            setters=table(native.Call, setters),
-            getters=table(native.Call, getters),
-            stores=table(native.Move, stores),
-            n_gates=len(gates),
-            n_loads=len(loads),
-            n_setters=len(setters),
-            n_getters=len(getters),
-            n_stores=len(stores),
-            kind=own.kind if own is not None else StepKind.BY_PYTHON,
-            component=own.component if own is not None else None,
-            do_step=own.do_step if own is not None else None,
-            said=own.said if own is not None else None,
+            kind=StepKind.BY_PYTHON,
             start_time=grid.start_time,
             base_step_size=grid.step_size,
             step_size=points * grid.step_size,
             points=points,
-            every=points // self.tick_points(self.units[unit]),
+            every=points // self.tick_points(unit),
             last_step=runner.last_step,
+            python_at=NEVER,
             outputs=(native.OutputTable * 2)(*rings),
             counter=runner.counter.address,
             bases=ctypes.cast(bases, ctypes.POINTER(ctypes.c_void_p)),
@@ -268,28 +265,27 @@ class BurstEngine(Engine):
             stage=before.stage,
             outcome=before.outcome,
         )
-        made.check_rows(runner.is_finite.spans)
-        self._kept[unit, index] = [made, bases, own]  # what the table points to
-        self._members[unit][index] = made
-        self._follow(unit, index)
+        loads = list(chain(*moves))
+        if own is not None:
+            made.kind, made.component, made.do_step, made.said = own.kind, own.component, own.do_step, own.said
+            made.give(setters=own.setters, getters=own.getters, stores=own.stores)
+            loads += own.loads
+        made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
+        self._kept[runner.name] = [made, bases, own]  # what the table points to
+        ctypes.pointer(before)[0] = made
+        self._follow(runner)
 
-    def _follow(self, unit: int, index: int) -> None:
+    def _follow(self, runner: Runner) -> None:
         """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""
-        runner, member = self._at(unit, index)
-        timed = runner.instance if isinstance(runner.instance, TimedInputs) else None
-        member.python_at = timed.python_at if timed is not None else NEVER
-        tracks = timed.tracks if timed is not None else []
-        addresses = [native.Track(values.ctypes.data, to) for to, values in tracks]
-        made = table(native.Track, addresses)
-        self._tracks[unit, index] = [made, tracks]  # what the table points to
-        member.tracks, member.n_tracks = made, len(addresses)
-        member.tracks_from = timed.tracks_from if timed is not None else 0
+        timed = runner.instance
+        if isinstance(timed, TimedInputs):
+            self._tracks[runner.name] = [timed.tracks]  # what the table points to
+            runner.table.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
+            runner.table.python_at, runner.table.tracks_from = timed.python_at, timed.tracks_from
 
-    def _at(self, unit: int, member: int) -> tuple[Runner, native.MemberTable]:
-        return self.units[unit][member], self._members[unit][member]
-
-    def _complete(self, unit: int, runner: Runner, member: native.MemberTable, result: int) -> None:
+    def _complete(self, unit: int, runner: Runner, result: int) -> None:
         """Let Python take a step, or complete one that returned something unusual."""
+        member = runner.table
         step = member.step
         try:
             if result == BurstEnd.NOT_FINITE:
@@ -298,7 +294,7 @@ class BurstEngine(Engine):
                 for source in runner.sources:
                     source.transfer.step_text(step)
                 runner.instance.do_step(step)
-                self._follow(unit, self._node.member)
+                self._follow(runner)
             else:
                 if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
                     for source in runner.sources:
@@ -317,14 +313,9 @@ class BurstEngine(Engine):
         member.stage = Stage.STEPPED
 
     def _forged(self, runner: Runner) -> ProtocolBroken:
-        source = next(
-            (
-                source
-                for source in runner.sources
-                if not source.transfer.source.has_row(source.transfer.rule.row_for(runner.step))
-            ),
-            runner.sources[0],
-        )
+        step, sources = runner.step, runner.sources
+        lost = [own for own in sources if not own.transfer.source.has_row(own.transfer.rule.row_for(step))]
+        source = (lost or sources)[0]
         return ProtocolBroken(
             f"a row of '{source.instance}' for '{runner.name}' is not the one that was written",
             instance=runner.name,
@@ -352,22 +343,17 @@ class PlainEngine(Engine):
     ) -> None:
         super().__init__(plan, units, memory, shared=shared)
         self._slice_s = slice_s
-        self._positions = {runner.name: Position() for runner in self.runners}
-        self._ticks = [0] * len(units)
-        self._next = [0] * len(units)
-        self._stopped: set[int] = set()
-        self._spent_s = [0.0] * len(units)
         self._attention = False
-        for runner in self.runners:
-            runner.follow(self._positions[runner.name])
+
+    def _fill(self, unit: Sequence[Runner], runner: Runner) -> None:
+        """Nothing: each step asks the runner itself."""
 
     def _burst(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
-        """See `Engine`."""
         started = perf_counter()
         seen = self._memory.seen()
         stepped = False
         while not self._attention:
-            advanced = [self._advance(number, started) for number in range(len(self.units))]
+            advanced = [self._advance(*both, started) for both in zip(self.units, self._units, strict=False)]
             self._progress.raise_to(self.covered + 1)
             stepped = stepped or any(advanced)
             if not any(advanced) or perf_counter() - started > self._slice_s:
@@ -384,59 +370,48 @@ class PlainEngine(Engine):
         self._attention = True
         self._memory.ring_bell()
 
-    @property
-    def spent_s(self) -> list[float]:
-        """See `Engine`."""
-        return self._spent_s
-
-    def _allowed(self) -> int:
-        """The point up to which the grant and the windows allow steps."""
-        limits = [counter.value - 1 + window for counter, window in self._windows]
-        return min(self._memory.grant.value, self._last_point, *limits)
-
-    def _advance(self, number: int, started: float) -> bool:
+    def _advance(self, unit: Sequence[Runner], place: native.UnitTable, started: float) -> bool:
         """Step one unit for the rest of the slice; whether there was a step."""
-        unit, tick_points = self.units[number], self.tick_points(self.units[number])
-        last = unit[0].last_step if len(unit) == 1 else self._last_point
         began, stepped = perf_counter(), False
-        while number not in self._stopped and self._ticks[number] < last and not self._attention:
-            if not self._next[number] and self._ticks[number] * tick_points >= self._allowed():
-                break
-            for index in range(self._next[number], len(unit)):
-                self._next[number] = index
-                every = unit[index].plan.step_points // tick_points
-                if (self._ticks[number] + 1) % every:
-                    continue
-                if any(unit[index].lacking):
-                    self._spent_s[number] += perf_counter() - began
-                    return stepped
-                self._step(number, unit[index])
-                stepped = True
-            self._ticks[number] += 1
-            self._next[number] = 0
-            if perf_counter() - started > self._slice_s:
-                break
-        self._spent_s[number] += perf_counter() - began
-        return stepped
+        try:
+            while not place.stopped and place.tick < place.last_tick and not self._attention:
+                if not place.next:
+                    limits = [counter.value - 1 + window for counter, window in self._windows]
+                    if place.tick * place.tick_points >= min(self._memory.grant.value, self._last_point, *limits):
+                        break
+                for index in range(place.next, len(unit)):
+                    place.next, runner = index, unit[index]
+                    if (place.tick + 1) % (runner.plan.step_points // place.tick_points):
+                        continue
+                    if any(runner.lacking):
+                        return stepped
+                    self._step(place, runner)
+                    stepped = True
+                place.tick += 1
+                place.next = 0
+                if perf_counter() - started > self._slice_s:
+                    break
+            return stepped
+        finally:
+            place.spent_ns += int((perf_counter() - began) * 1e9)
 
-    def _step(self, number: int, runner: Runner) -> None:
-        position = self._positions[runner.name]
-        step = position.step
+    def _step(self, place: native.UnitTable, runner: Runner) -> None:
+        table, step = runner.table, runner.step
         try:
             for source in runner.sources:
                 source.transfer.step(step)
-            position.enter(Stage.IN_PYTHON)
+            table.stage = Stage.IN_PYTHON
             runner.instance.do_step(step)
             if not runner.is_finite.check(step + 1):
                 raise runner.is_finite.error(step + 1, runner.grid)
         except FmuMeshError as error:
-            self._stopped.add(number)
+            place.stopped = 1
             runner.is_finite.explain(error)
             raise
         finally:
-            position.enter(Stage.WAITING)
+            table.stage = Stage.WAITING
         if floating_point_changed():
             restore_floating_point()
         runner.outputs.stamp(step + 1)
-        position.count()
+        table.step = step + 1
         runner.counter.raise_to(step + 2)

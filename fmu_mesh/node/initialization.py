@@ -26,7 +26,9 @@ from .stepping import Runner
 
 __all__ = ["Initialization"]
 
-_LOOK_S = 0.5
+# `AwakeClock` has to be read twice a second, or a pause of this process counts as waiting: a longer wait is cut into
+# pieces of this length.
+_WAIT_SLICE_S = 0.5
 _SWEEP = 1 << 32
 """An INITIAL message has the number `level + sweep * this`."""
 
@@ -185,7 +187,7 @@ class Initialization:
             if left_s <= 0:
                 text = f"its initial value did not come within {self._plan.timeouts.initialize:g} s"
                 raise DeadlineExceeded(text, instance=instance, variable=variable)
-            self._wait(min(left_s, _LOOK_S))
+            self._wait(min(left_s, _WAIT_SLICE_S))
         return self._known[instance, variable, sweep]
 
     def _get_outputs(self, runner: Runner, names: Sequence[str], sweep: int | None = None) -> dict[str, Value]:

@@ -46,7 +46,6 @@ class TimedInputs(AroundNativeSteps):
     set in the steps in which it changes, and then replaces any other value. The instance may be of any kind.
 
     Args:
-        instance: the inner instance.
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
         courses: what a scenario prescribes, by variable.
 

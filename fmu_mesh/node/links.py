@@ -12,10 +12,18 @@ from ..rings.transfer import Index, elements_at
 from ..system.layout import Layout
 from ..system.plan import RECORDER, Link
 from ..variables.value_types import Value
+from ..wire.frames import encode_frames, encode_rows
 from ..wire.messages import FRAME, HEADER, INITIAL, LAST
-from ..wire.rows import encode_frames, encode_rows
 
 __all__ = ["OutLink"]
+
+# Threads: the main thread sends between bursts; during a step that lasts long, the thread of the server does, because
+# other nodes may wait for the rows before it, and they must not be lost if this process dies in the step. Both hold
+# `Engine.sending`, so a row is never sent twice or in the wrong order. A put may block: that is how a receiver that
+# is stopped holds its sender, and it ends with the deadline of the link (ADR 4).
+#
+# Why one link for each pair of instance and node, and not one frame for all: in a cycle the other node needs each row
+# at once, the recorder may get hundreds in one frame (ADR 1).
 
 _FRAME_BYTES = 128 * 1024
 

@@ -25,6 +25,7 @@ import zenoh
 
 from ..awake import AwakeClock
 from ..errors import (
+    ErrorReport,
     FmuError,
     FmuMeshError,
     Interrupted,
@@ -52,7 +53,7 @@ from ..wire.messages import (
     PROGRESS,
     NodeReport,
     SetValue,
-    decode_abort,
+    decode_json,
     encode_set,
 )
 from ..wire.session import RouterLink
@@ -69,9 +70,25 @@ from .time_measurement import Profiler
 
 __all__ = ["Node"]
 
+# Threads and processes: this is the main thread, the only one that calls an FMU. Messages, lost tokens and requests
+# to end arrive on threads of Zenoh and are handed over by the inbox; `register` runs on a thread of `Membership`
+# while FMUs load; queries are served by `NodeServer`; `report_hang` and `interrupt` come from watching threads. Other
+# nodes and the master are met in the memory of the host, or by frames (ADR 58).
+#
+# What may go wrong, and who decides:
+# * The master's token is gone. That is a question, not a verdict (ADR 67): on this host its process answers, else a
+#   query for the token; and its last message may still be on its way, so `_LAST_WORD_S` is given to it.
+# * The master is silent: `Membership.check_silence` knows the deadlines of a link and of a step.
+# * The run is aborted while a step lasts: the step ends first; a hang is reported by another thread.
+# * An FMU fails: the recorder first gets all rows that are complete, then the master gets the report. The order
+#   matters: after the report it ends the others.
+
 log = logging.getLogger(__name__)
 
-_LOOK_S = 0.5
+# Whatever a node sleeps for, after this time it looks at everything again: a wake-up that a killed process has lost
+# costs this much once (docs/rings.md), silence of the master is noticed in steps of it, and `AwakeClock` is read often
+# enough.
+_LONGEST_SLEEP_S = 0.5
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
 _NO_MASTER_S = 1.0
@@ -85,13 +102,10 @@ class Node:
     """One node of a mesh.
 
     Args:
-        plan: what it has to do.
         session: the session of this process; the caller closes it.
         open_instance: opens an instance of the plan by name; the caller closes the instances too.
         on_hang: called on another thread if a step does not return in time.
-        router: the link to the router that connects this node to the others, if there is one.
         launch: the launcher that started this process; None if it was started manually.
-        engine: makes the engine, as `make_engine` does.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -127,7 +141,7 @@ class Node:
         self._own_memory = HostMemory.private(plan.memory, plan.node)
         self._memory = self._own_memory
         self._engine: Engine | None = None
-        self._initialization = Initialization(plan, self._wait_for_initial_value)
+        self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
         self._membership = Membership(plan, session, self._inbox, launch, router)
         self._profiler: Profiler | None = None
@@ -171,7 +185,11 @@ class Node:
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point or during the current wait."""
-        self._inbox.post(lambda: _raise(Interrupted(reason)), first=True)
+
+        def end() -> None:
+            raise Interrupted(reason)
+
+        self._inbox.post(end, first=True)
 
     def report_hang(self, error: FmuError) -> bool:
         """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""
@@ -183,7 +201,6 @@ class Node:
     # --- before the first point
 
     def _load(self) -> None:
-        """Instantiate the FMUs."""
         plan = self._plan
         self._activity.enter("loading")
         instances = {}
@@ -245,10 +262,6 @@ class Node:
         self._tell_progress(engine)
         return engine
 
-    def _wait_for_initial_value(self, left_s: float) -> None:
-        if (message := self._inbox.wait(left_s)) is not None:
-            self._sort_in(message)
-
     # --- from point to point
 
     def _step_to_the_end(self, engine: Engine) -> None:
@@ -260,7 +273,7 @@ class Node:
         all_sent = True
         while not self.finished:
             try:  # it waits only when everything is sent: the grant may depend on it
-                stepped = engine.run(_LOOK_S if all_sent or not eager else 0.0, eager=eager)
+                stepped = engine.run(_LONGEST_SLEEP_S if all_sent or not eager else 0.0, eager=eager)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(asked)
@@ -271,7 +284,7 @@ class Node:
             if stepped:
                 self.server.stepped()
             while (message := self._inbox.poll()) is not None:
-                self._sort_in(message)
+                self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
             self._tell_progress(engine)
             if self._token_went and not self._membership.master_runs:
                 self._end_without_master()
@@ -298,9 +311,9 @@ class Node:
             runner.flush(lazy=lazy)
         return lazy
 
-    def _sort_in(self, message: Message) -> None:
-        """Put a frame into its mirror, or store a new grant; any other message is refused."""
-        self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
+    def _wait_for_message(self, left_s: float) -> None:
+        if (message := self._inbox.wait(left_s)) is not None:
+            self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
 
     def _take_from_node(self, message: Message) -> None:
         sender, kind, number, count, point, data = message
@@ -330,7 +343,7 @@ class Node:
         elif kind == FINISH:
             self._finish_at = point
         elif kind == ABORT:
-            raise _Aborted(from_report(decode_abort(data)))
+            raise _Aborted(from_report(decode_json(data[HEADER.size :], ErrorReport)))
         else:
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
@@ -359,19 +372,14 @@ class Node:
             self._inbox.post(self._end_without_master)
 
     def _end_without_master(self) -> None:
-        """The master's token is gone; its last message may still arrive.
-
-        Raises:
-            FmuMeshError: why the master ended the run, or that the master is gone.
-        """
+        """The master's token is gone: raise why it ended the run, which may still arrive, or that it is gone."""
         if not self._membership.master_is_gone:
             self._token_went = self._membership.master_runs  # then it is asked again whether it runs
             return
         error = self._membership.without_master(self._clock() - self._heard)
         deadline = time.monotonic() + _LAST_WORD_S
         while not self.finished and (left := deadline - time.monotonic()) > 0:
-            if (message := self._inbox.wait(left)) is not None:
-                self._sort_in(message)
+            self._wait_for_message(left)
         if not self.finished:
             raise error
 
@@ -444,7 +452,3 @@ class _Aborted(FmuMeshError):
     def __init__(self, cause: FmuMeshError) -> None:
         super().__init__(cause.message)
         self.cause = cause
-
-
-def _raise(error: FmuMeshError) -> None:
-    raise error

@@ -1,8 +1,6 @@
 """What other programs see of a node: info, status, current values, settings, streams and log.
 
-The server has its own thread; `fmu_mesh.node.answering` has the answers. Values come from complete rows in the rings,
-or the main thread reads them at the next point. So a query never waits for a step, a step never waits for a query, and
-`status` is answered while an FMU hangs.
+`fmu_mesh.node.answering` has the answers. `status` is answered while an FMU hangs.
 """
 
 from __future__ import annotations
@@ -33,10 +31,25 @@ from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams
 
 __all__ = ["NodeServer"]
 
+# Threads: one of its own, `server`, on which every job runs: queries, searches, samples, log lines. Threads of Zenoh
+# and the main thread only put jobs. What needs an FMU is posted to the main thread through the inbox, and its answer
+# comes back as a job. So a query never waits for a step, a step never waits for a query, and no lock is held while
+# either runs.
+#
+# What may go wrong: a job fails (the guard of the inbox counts it, and the thread goes on); a step never returns
+# (this thread notices it in `_tick` and answers `status`); a subscriber is slower than the run (samples are dropped,
+# and told); the main thread ends while jobs wait (`close` gives them a second, then what is left is not published);
+# the master ends before log lines have reached it (`say_everything` waits for an answer that comes after them).
+#
+# Why not in the callbacks of Zenoh: one that waits for a point would hold all later queries of its instance. ADR 68
+# says why nothing is declared for a variable.
+
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25
-_LOOK_S = 0.05
+# A stream whose subscriber Zenoh does not announce (it reports only the first of an instance) begins within about this
+# time; shorter would take the main thread's time for nothing.
+_SEARCH_S = 0.05
 _LOOK_SHARE = 20
 """Looking for new subscribers takes one part in so many of the time. For one subscriber it takes about 1 ms."""
 _LAST_ROWS_S = 1.0
@@ -103,11 +116,8 @@ class NodeServer:
         """From now on values can be read and set, and streams can be subscribed."""
         self._activity.serve(runners)
         for runner in runners.values():
-            self._streams.append(
-                InstanceStreams(
-                    runner, self._session, self._keys, self._plan.grid, partial(self._jobs.put, self._search)
-                )
-            )
+            changed = partial(self._jobs.put, self._search)
+            self._streams.append(InstanceStreams(runner, self._session, self._keys, self._plan.grid, changed))
             for kind in ("in", "param"):
                 key = f"{self._keys.instance(runner.name)}/{kind}/*"
                 take = partial(self._answers.put_arrived, runner)
@@ -159,7 +169,7 @@ class NodeServer:
         published = 0.0
         while True:
             with suppress(queue.Empty):
-                if (job := self._jobs.get(timeout=_LOOK_S if self._searches else _TICK_S)) is None:
+                if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
                     return
                 with self._inbox.refusals.guard("a query or a value"):
                     job()
@@ -198,27 +208,22 @@ class NodeServer:
     # --- queries
 
     def _declare(self) -> None:
+        session = self._session
         try:
-            self._declare_instances()
+            for name in (instance.name for instance in self._plan.instances):
+                root = self._keys.instance(name)
+                self._entities.append(session.liveliness().declare_token(root))
+                take = self._inbox.refusals.answering(partial(self._answer, name), self._jobs.put)
+                self._entities.append(session.declare_queryable(f"{root}/**", take))
+                publisher = partial(session.declare_publisher, encoding=json_encoding)
+                # A log message must not be lost; the status is published again.
+                drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
+                self._status_publishers[name] = publisher(f"{root}/status", congestion_control=drop)
+                self._log_publishers[name] = publisher(f"{root}/log", congestion_control=block)
         finally:
             self._visible.set()
         for line in self._early_lines:
             self._publish_log(line)
-
-    def _declare_instances(self) -> None:
-        for name in (instance.name for instance in self._plan.instances):
-            root = self._keys.instance(name)
-            self._entities.append(self._session.liveliness().declare_token(root))
-            take = self._inbox.refusals.answering(partial(self._answer, name), self._jobs.put)
-            self._entities.append(self._session.declare_queryable(f"{root}/**", take))
-            # A log message must not be lost; the status is published again.
-            for what, publishers, congestion_control in (
-                ("status", self._status_publishers, zenoh.CongestionControl.DROP),
-                ("log", self._log_publishers, zenoh.CongestionControl.BLOCK),
-            ):
-                publishers[name] = self._session.declare_publisher(
-                    f"{root}/{what}", encoding=json_encoding, congestion_control=congestion_control
-                )
 
     def _answer(self, name: str, query: zenoh.Query) -> None:
         if SUBSCRIBED in query.parameters:
@@ -241,10 +246,10 @@ class NodeServer:
     def _search(self) -> None:
         """Go on looking for new subscribers: Zenoh reports only the first one of an instance, and when all are gone."""
         for streams in self._streams:
-            if streams.look(_LOOK_S / _LOOK_SHARE):
+            if streams.look(_SEARCH_S / _LOOK_SHARE):
                 self._inbox.post(partial(self._update, streams))
         self._searches = any(streams.is_followed for streams in self._streams)
-        self._next_search = time.monotonic() + _LOOK_S
+        self._next_search = time.monotonic() + _SEARCH_S
 
     def _look(self, name: str, names: bytes | None) -> None:
         """Find what a program has subscribed to before it asked: the variables that it names, or any."""

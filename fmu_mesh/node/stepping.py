@@ -23,15 +23,13 @@ from ..system.plan import InstancePlan
 from ..system.window import rows_of_ring
 from .links import OutLink
 
-__all__ = ["Position", "PositionInTable", "Runner", "Source"]
+__all__ = ["Runner", "Source"]
 
 
 class Source(NamedTuple):
     """Where values of a runner come from.
 
     Attributes:
-        instance: whose outputs they are.
-        transfer: moves them from its rows.
         counter: the number of its complete rows.
     """
 
@@ -57,64 +55,14 @@ class Source(NamedTuple):
         )
 
 
-class Position:
-    """How far a runner is; whoever steps it has a class of its own for it.
-
-    Attributes:
-        step: number of own steps done.
-        stage: what it is doing, a `fmu_mesh.rings.native.Stage`.
-    """
-
-    def __init__(self) -> None:
-        self.step = 0
-        self.stage = 0
-
-    def enter(self, stage: int) -> None:
-        """Note what it is doing."""
-        self.stage = stage
-
-    def count(self) -> None:
-        """Note that a step is done."""
-        self.step += 1
-
-    def refit(self) -> None:
-        """The runner steps in another way from now on."""
-
-
-class PositionInTable(Position):
-    """How far a runner is, as its table has it."""
-
-    def __init__(self, member: native.MemberTable, fill: Callable[[], None]) -> None:
-        self._member = member
-        self._fill = fill
-
-    @property
-    def step(self) -> int:  # type: ignore[override]  # only the burst changes it
-        """See `Position`."""
-        return int(self._member.step)
-
-    @property
-    def stage(self) -> int:  # type: ignore[override]  # as above
-        """See `Position`."""
-        return int(self._member.stage)
-
-    def refit(self) -> None:
-        """See `Position`."""
-        self._fill()
-
-
 class Runner:
     """One instance with its row of inputs and its output ring.
 
-    Args:
-        outputs: its ring.
-        counter: the number of complete rows of this ring.
-
     Attributes:
-        sources: where its inputs come from.
         out_links: send its rows to those who do not read its ring.
         watched: a ring with further outputs, which somebody watches.
-        is_finite: checks a row of outputs.
+        table: how far it is, which whoever steps it writes, and for the burst how it is stepped.
+        refit: to be called where the instance steps in another way from the next step on.
     """
 
     def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter) -> None:
@@ -130,7 +78,8 @@ class Runner:
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
         self.is_finite = FiniteRows(plan, outputs, self.inputs)
-        self._position = Position()
+        self.table = native.MemberTable()
+        self.refit: Callable[[], None] = lambda: None
 
     def bind(self) -> None:
         """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode.
@@ -145,7 +94,7 @@ class Runner:
         self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, self.step)
         for part, kept in zip(self.outputs.parts, row, strict=False):
             part[slot] = kept
-        self._position.refit()
+        self.refit()
 
     def begin(self) -> None:
         """The outputs after Initialization Mode are complete: row 0.
@@ -160,7 +109,7 @@ class Runner:
     def stop(self) -> None:
         """This instance takes no more steps: its outputs hold to the end."""
         self.last_step = self.step
-        self._position.refit()
+        self.refit()
 
     def flush(self, *, lazy: bool = True) -> None:
         """Send all rows that were not sent yet; those for the recorder only if ``lazy``, or if no more will come."""
@@ -175,9 +124,9 @@ class Runner:
             if link.to_recorder:
                 link.send_last(end)
 
-    def follow(self, position: Position) -> None:
-        """From now on, ``position`` is where this runner is."""
-        self._position = position
+    def follow(self, table: native.MemberTable, refit: Callable[[], None] = lambda: None) -> None:
+        """From now on an engine steps it, with this ``table``, and fills it anew by ``refit``."""
+        self.table, self.refit = table, refit
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; the plan does not contain them."""
@@ -189,7 +138,7 @@ class Runner:
     def wrap(self, wrapped: Instance) -> None:
         """From the next step on, ``wrapped`` is stepped, which has the instance inside."""
         self.instance = wrapped
-        self._position.refit()
+        self.refit()
 
     def take_care(self) -> None:
         """A step has changed the state of its process: from the next step on, it is looked after."""
@@ -197,19 +146,15 @@ class Runner:
             self.instance.take_care()
             self.refit()
 
-    def refit(self) -> None:
-        """The instance steps in another way from the next step on."""
-        self._position.refit()
-
     @property
     def step(self) -> int:
         """Number of own steps done; this is also the newest row of `outputs`."""
-        return self._position.step
+        return int(self.table.step)
 
     @property
     def stage(self) -> int:
         """What it is doing, a `fmu_mesh.rings.native.Stage`."""
-        return self._position.stage
+        return int(self.table.stage)
 
     @property
     def doing(self) -> str:

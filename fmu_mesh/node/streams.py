@@ -1,8 +1,4 @@
-"""Streams: every value of a variable as a Zenoh sample. Without subscribers there is no work.
-
-The main thread only copies the subscribed columns of new rows; the server thread encodes and publishes them. A
-subscriber that stops loses samples (their points show which), and does not slow down the mesh.
-"""
+"""Streams: every value of a variable as a Zenoh sample; a subscriber that is too slow loses some, and sees which."""
 
 from __future__ import annotations
 
@@ -29,6 +25,15 @@ from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
 __all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "VariableKeys", "kind_of"]
+
+# Threads: the main thread calls `update`, `collect` and reads `_active`; the thread of the server calls `look`,
+# `look_at` and `publish`, and owns `_wanted` and `_search`; a thread of Zenoh calls `changed`, which only puts a job.
+# `update` takes `_wanted` in one assignment, and `collect` copies rows, so nobody waits for anybody: a slow
+# subscriber loses samples, and never slows down a step.
+#
+# Tried and given up (ADR 68): a publisher and a listener for each variable (a thread of zenoh-python for each of
+# 60,000), a listener without them (declaring takes time that grows with the square), and the list of subscribers in
+# the admin space (a session that answers it while another one subscribes can stand for ever, zenoh 1.10).
 
 MAX_WAITING_ROWS = 1 << 14
 _MAX_WAITING_VALUES = 1 << 20

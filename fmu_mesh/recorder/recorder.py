@@ -47,7 +47,9 @@ __all__ = ["RecordedSource", "Recorder"]
 
 log = logging.getLogger(__name__)
 
-_LOOK_S = 0.2
+# Rows that have come and are too few to wake the recorder are written after this time at the latest, so that a result
+# can be followed while the run is slow. A wake-up that a killed process has lost costs this much once (docs/rings.md).
+_LONGEST_SLEEP_S = 0.2
 _WRITE_ROWS = 4096
 _WAKE_ROWS = 2048
 _REST_S = 0.005
@@ -196,7 +198,7 @@ class Recorder:
                 self._flush()
                 if (wishes := self._wishes()) is None:
                     continue
-                message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, wishes)
+                message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LONGEST_SLEEP_S, wishes)
             if message is not None:
                 self._take(message)
 

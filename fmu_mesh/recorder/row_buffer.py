@@ -19,7 +19,8 @@ from .record_files import RecordFiles
 
 __all__ = ["RowBuffer"]
 
-_CLOSE_S = 0.5
+# Longer than a block takes to be written: whoever still writes then writes to a disk that does not answer.
+_OTHER_WRITER_S = 0.5
 
 
 class RowBuffer:
@@ -84,7 +85,7 @@ class RowBuffer:
         Raises:
             ConfigurationError: a file cannot be written.
         """
-        if not self._writing.acquire(timeout=_CLOSE_S):
+        if not self._writing.acquire(timeout=_OTHER_WRITER_S):
             return  # another thread is writing to a disk that does not answer
         try:
             try:

@@ -1,22 +1,45 @@
 /* The burst: a node steps its instances as far as inputs, windows and the grant allow, in one call.
  *
- * Everything here is driven by tables that Python fills (fmu_mesh/rings/native.py has the same structures). One value
- * passes from the row of its source into the input of its target, and the outputs are read into a row of the own ring.
+ * Everything here is driven by tables that Python fills (`burst.h` declares them). One value passes from the row of
+ * its source into the input of its target, and the outputs are read into a row of the own ring.
+ *
+ * Threads and processes. `node_run` is called by the main thread of a node, without the lock of the interpreter;
+ * several nodes run it at the same time over one memory, and a process that is killed may stop at any instruction. Of
+ * one node:
+ *
+ *   node_run, member_step               the main thread only; nobody else writes its tables meanwhile
+ *   node_attend, ring_bell              any thread of the process: they set one flag and one bell
+ *   counter_raise                       the one thread that raises this counter
+ *   counter_value, bell_seen, sleep_for each participant for itself: one thread that sleeps
+ *   grant_withdraw                      the master
+ *
+ * What may go wrong: a peer writes garbage into the memory (a value never comes of it, see Rows), a peer is killed
+ * between a value and its bell (a sleeper loses its time limit once), a model changes the floating-point mode (it is
+ * set back after each step), a value does not fit into its type (the burst ends, and Python makes the error), a model
+ * never returns (only other threads can tell it). A crash of a model ends this process; the others go on with the
+ * rows that it has counted.
+ *
+ * Tried or considered, and given up: messages and semaphores between processes (ADR 5), code for each model (LLVM: slower
+ * to start, 170 MB, and nobody can check it; ADR 57), a fence after each row (a good part of a point of the fastest
+ * chain, see docs/rings.md), waiting without spinning (a sleeper on another core needs 50 us to wake up), and
+ * spinning without an end (two processes on one core). ADR 58 has the decision.
  *
  * Rows. Row n of a ring is in slot n & mask. A row begins with its stamp, n + 1. The writer clears the stamp, writes
- * the values, writes the stamp, and then counts the row (release). A reader looks at the counter (acquire), and at the
- * stamp before and after it has read: a counter that is wrong, or a row that was overwritten, never becomes a value.
+ * the values, writes the stamp, and then counts the row (release). A reader looks at the counter (acquire), and at
+ * the stamp before and after it has read: a counter that is wrong, or a row that was overwritten, never becomes a
+ * value.
  *
- * Waiting. A counter has one writer and only grows; only a pause lowers the grant. Who waits for it spins, yields, and
- * then sleeps on its own bell:
+ * Waiting. A counter has one writer and only grows; only a pause lowers the grant. Who waits for it spins, yields,
+ * and then sleeps on its own bell:
  *
  *   sleeper:  seen = bell; need = goal; lower wake_at; FENCE; counter >= goal? otherwise futex_wait(bell, seen)
  *   writer:   counter = value; FENCE; wake_at <= value? then for each need that is met: clear it (compare and swap),
  *             bell += 1, futex_wake(bell)
  *
- * Of the two, at least one sees what the other has written before its fence. Within a burst the writer looks at wake_at
- * without the fence: a sleeper that it misses is seen after the next step. With the fence it looks at the end of a burst
- * and before it waits itself. Every sleep has a time limit. docs/rings.md explains the protocol; tests/property/test_waiting.py explores it.
+ * Of the two, at least one sees what the other has written before its fence. Within a burst the writer looks at
+ * wake_at without the fence: a sleeper that it misses is seen after the next step. With the fence it looks at the end
+ * of a burst and before it waits itself. Every sleep has a time limit. docs/rings.md explains the protocol;
+ * tests/property/test_waiting.py explores it.
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -32,187 +55,27 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "burst.h"
+
 #define PUBLIC __attribute__((visibility("default")))
 #define NEVER INT64_MAX
 
 /* ---- shared memory */
 
-typedef struct {
+struct Counter {
   _Atomic int64_t value;   /* rows of a ring, points that are known of a node, or points that are granted */
   _Atomic int64_t wake_at; /* the lowest need of a sleeper */
   _Atomic int64_t claimed; /* of a node: it may step below this point without another look at the grant */
   int64_t unused[5];
   _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
-} Counter;
+};
 
-typedef struct {
+struct Bell {
   _Atomic uint32_t rung;
   uint32_t unused[15];
-} Bell;
+};
 
-/* Which process this is among those of the memory. */
-typedef struct {
-  Bell *bells;
-  int64_t processes;
-  int64_t own;
-} Place;
-
-/* ---- tables of one node */
-
-typedef struct { /* the rows of one source, for one delay */
-  Counter *counter;
-  const char *rows;
-  int64_t stride;
-  int64_t mask;
-  int64_t lead;   /* see system/coupling_rule.py */
-  int64_t points; /* base points per step of the source */
-  int64_t known;  /* the counter when it was last read */
-} Gate;
-
-typedef struct { /* a value of the source, and what the target gets instead; large: see as_integer */
-  int64_t from, to;
-  int32_t from_large, to_large;
-} Entry;
-
-typedef struct { /* the map of a connection, and the items of its input; both in ascending order */
-  const Entry *entries;
-  const int64_t *items;
-  int64_t n_entries;
-  int64_t n_items; /* 0: the input can be each number of its type */
-} Lookup;
-
-/* Values that are copied. A base is a row, or 0: then the offset is an address. */
-typedef struct {
-  int64_t from_base;
-  int64_t from;
-  int64_t to_base;
-  int64_t to;
-  int64_t count;
-  int32_t from_type;
-  int32_t to_type;
-  int32_t change;
-  int32_t negated; /* an alias of FMI 1.0 with the opposite sign */
-  double factor;
-  double offset;
-  const Lookup *lookup;
-} Move;
-
-typedef struct { /* a getter or a setter */
-  void *function;
-  const void *references;
-  int64_t count;
-  int64_t base;
-  int64_t values;
-  int64_t size; /* number of values for FMI 3.0; otherwise -1 */
-} Call;
-
-typedef struct {
-  char *rows;
-  int64_t stride;
-  int64_t mask;
-} Output;
-
-typedef struct { /* floats of a row that have to be finite */
-  int64_t place; /* in the row */
-  int64_t count;
-  int64_t type; /* F64 or F32 */
-} Span;
-
-typedef struct { /* what a model says in a step besides its status, and how far it is: Python looks at it between steps */
-  uint8_t event_needed, terminate, early; /* FMI 3.0: not 0 if it is so */
-  int32_t call;       /* the getter or setter that returned a status above warning */
-  double last_time;   /* of an early return (FMI 3.0) */
-  double quiet_until; /* a step that ends here or later is taken by Python */
-  double time;        /* of the model */
-  int64_t step;       /* own steps done */
-} Said;
-
-typedef struct { /* an input with a value for each own step that the burst takes before python_at */
-  const double *values;
-  double *to; /* in the row of inputs */
-} Track;
-
-enum { BY_PYTHON, FMI1, FMI2, FMI3 };                                    /* Member.kind */
-enum { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };        /* Member.stage */
-enum { FIXED, OUTPUT, WATCHED, FIRST_GATE, MAX_GATES = 4096 };           /* bases */
-enum { WARNING = 1, OUT_OF_RANGE = 100, WRONG_ROW = 101, STAGE_BITS = 24 }; /* statuses */
-enum { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH };          /* types */
-enum { UNCHANGED, SCALED, LOOKED_UP };                                   /* Move.change */
-
-typedef struct {
-  Gate *gates;
-  Move *loads;  /* from the rows of the sources into the row of inputs, and from there into buffers */
-  Call *setters;
-  Call *getters;
-  Move *stores; /* from buffers into the own row */
-  int64_t n_gates, n_loads, n_setters, n_getters, n_stores;
-  int64_t kind;
-  void *component;
-  void *do_step;
-  Said *said; /* of an FMU */
-  double start_time, base_step_size, step_size;
-  int64_t points; /* base points per own step */
-  int64_t every;  /* ticks of the unit per own step */
-  int64_t last_step;
-  int64_t python_at; /* the first own step that Python takes, whatever its kind */
-  Track *tracks;
-  int64_t n_tracks;
-  int64_t tracks_from; /* the own step of their first values */
-  Span *finite;
-  int64_t n_finite;
-  Output outputs[2]; /* the own ring; and outputs that somebody watches */
-  Counter *counter;  /* rows of the own ring */
-  char **bases;      /* room for the rows of the gates */
-  int64_t step;
-  int64_t stage;
-  int64_t outcome;   /* stage and status of a call that Python has to look at */
-} Member;
-
-typedef struct { /* members that step together, tick by tick: a tick of a single member is its own step */
-  Member *members;
-  int64_t n_members;
-  int64_t tick_points;
-  int64_t last_tick;
-  int64_t tick;
-  int64_t next; /* the member that steps next within the tick */
-  int64_t burst;
-  int64_t stopped;
-  int64_t spent_ns;
-  Counter *blocked_by;
-  int64_t need;
-} Unit;
-
-typedef struct {
-  Counter *progress;
-  int64_t window;
-} Peer;
-
-typedef struct {
-  Place place;
-  Unit *units;
-  int64_t n_units;
-  Peer *peers;
-  int64_t n_peers;
-  Counter *ceiling;  /* the grant of the master */
-  Counter *progress; /* of this node */
-  int64_t last_point;
-  int64_t slice_ns;
-  int64_t wait_ns;   /* how long to sleep where nothing can step */
-  int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
-  int64_t spins;     /* whether it spins before it sleeps */
-  int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
-  int64_t stride;    /* how many it sleeps for now */
-  int64_t allowed;
-  int64_t patience;
-  int64_t waited_ns;
-  int64_t restored;  /* how often a model had changed the floating-point mode */
-  int64_t late;      /* sleeps that ended by their time limit although the value was there: lost wake-ups */
-  int64_t unit;      /* whom the result is about */
-  int64_t member;
-  _Atomic int64_t attention; /* Python has something to do */
-} Node;
-
-enum { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* results of run */
+enum { WARNING = 1, OUT_OF_RANGE = 100, WRONG_ROW = 101, STAGE_BITS = 24 }; /* statuses, and where the stage begins */
 
 /* ---- waiting */
 
@@ -298,12 +161,6 @@ PUBLIC int64_t grant_withdraw(Counter *grant, Counter *const *nodes, int64_t n) 
 
 PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
 
-/* One value that somebody waits for. */
-typedef struct {
-  Counter *counter;
-  int64_t need;
-} Wish;
-
 static int granted(const Wish *wishes, int64_t n) {
   for (int64_t i = 0; i < n; i++)
     if (wishes[i].counter != NULL && value_of(wishes[i].counter) >= wishes[i].need) return 1;
@@ -352,22 +209,6 @@ static inline int mode_changed(void) {
   return one + HALF_ULP - QUARTER_ULP != one || TINY + TINY == 0.0;
 }
 
-static inline double as_double(const char *from, int type) {
-  switch (type) {
-    case F64: { double v; memcpy(&v, from, 8); return v; }
-    case F32: { float v; memcpy(&v, from, 4); return v; }
-    case I8: return *(const int8_t *)from;
-    case U8: return *(const uint8_t *)from;
-    case I16: { int16_t v; memcpy(&v, from, 2); return v; }
-    case U16: { uint16_t v; memcpy(&v, from, 2); return v; }
-    case I32: { int32_t v; memcpy(&v, from, 4); return v; }
-    case U32: { uint32_t v; memcpy(&v, from, 4); return v; }
-    case I64: { int64_t v; memcpy(&v, from, 8); return (double)v; }
-    case U64: { uint64_t v; memcpy(&v, from, 8); return (double)v; }
-    default: return *(const uint8_t *)from != 0;
-  }
-}
-
 /* An integer as 65 bits: the number, and whether it is above those of int64_t. */
 static inline int64_t as_integer(const char *from, int type, int *large) {
   *large = 0;
@@ -381,6 +222,15 @@ static inline int64_t as_integer(const char *from, int type, int *large) {
     case I64: { int64_t v; memcpy(&v, from, 8); return v; }
     case U64: { uint64_t v; memcpy(&v, from, 8); *large = v > INT64_MAX; return (int64_t)v; }
     default: return *(const uint8_t *)from != 0;
+  }
+}
+
+static inline double as_double(const char *from, int type) {
+  switch (type) {
+    case F64: { double v; memcpy(&v, from, 8); return v; }
+    case F32: { float v; memcpy(&v, from, 4); return v; }
+    case U64: { uint64_t v; memcpy(&v, from, 8); return (double)v; }
+    default: { int large; return (double)as_integer(from, type, &large); }
   }
 }
 
@@ -923,12 +773,3 @@ PUBLIC void node_attend(Node *node) {
 }
 
 PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
-
-/* Sizes of the structures, which Python compares with its own. */
-PUBLIC int64_t structure_sizes(int64_t *sizes) {
-  const int64_t own[] = {sizeof(Place), sizeof(Gate), sizeof(Move), sizeof(Call), sizeof(Output),
-                         sizeof(Member), sizeof(Unit), sizeof(Peer), sizeof(Node), sizeof(Wish), sizeof(Said),
-                         sizeof(Track), sizeof(Entry), sizeof(Lookup), sizeof(Span)};
-  memcpy(sizes, own, sizeof own);
-  return sizeof own / sizeof own[0];
-}

@@ -29,14 +29,8 @@ _MANY = 32
 class FiniteRows:
     """Checks the output rows of one instance, and says what was not finite.
 
-    Args:
-        plan: says which outputs have to be finite.
-        outputs: the rows.
-        inputs: the row of inputs.
-
     Attributes:
         spans: where these outputs are in a row, for the burst.
-        check: whether a row is finite.
     """
 
     def __init__(self, plan: InstancePlan, outputs: Ring, inputs: Ring) -> None:
@@ -46,11 +40,8 @@ class FiniteRows:
         runs: list[tuple[VariableType, int, int, int]] = []  # type, place in bytes, size in bytes, count
         for name in plan.finite:
             place, type_ = outputs.layout.place(name), outputs.layout.column(name).type
-            start, size, count = (
-                outputs.place_in_row(place.part, place.first),
-                8 if type_ == "Float64" else 4,
-                place.size,
-            )
+            start, count = outputs.place_in_row(place.part, place.first), place.size
+            size = 8 if type_ == "Float64" else 4
             if runs and runs[-1][0] == type_ and runs[-1][1] + size * runs[-1][3] == start:
                 _, start, _, before = runs.pop()
                 count += before

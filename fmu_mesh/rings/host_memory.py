@@ -1,8 +1,6 @@
 """Memory with the rings and counters of a run: shared by the processes of one host, or private to one process.
 
-Shared memory is anonymous: the master makes it, processes that it starts inherit its descriptor, and others of the same
-user open it through `/proc`. So there is no file, and nothing is left behind if a process is killed. Nobody can shrink
-it. A random token proves that an offer means the memory of this host.
+Shared memory is anonymous: the master makes it, and other processes of the same user open it through `/proc`.
 """
 
 from __future__ import annotations
@@ -27,6 +25,25 @@ from . import native
 from .ring import Ring
 
 __all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
+
+# Processes: the master makes the memory; nodes and the recorder open it; each is one participant with a number and a
+# bell. Threads: the one that sleeps (of a node its main thread) may use everything here; any other thread of the
+# process may only read counters and call `ring_bell`. A counter has one thread that raises it.
+#
+# What may go wrong, and what then happens:
+# * A participant is killed, anywhere. The kernel frees the memory with its last user, because there is no file; who
+#   slept for the dead one wakes up by the limit of its sleep and looks again (docs/rings.md has the cases).
+# * An offer reaches a process that cannot mean the same memory: on another host, in a container with process ids of
+#   its own, as another user. Then /proc/<pid>/fd is not there, or leads elsewhere: the size, the seals and the token
+#   are compared, and the process gets frames instead.
+# * Somebody shrinks the memory: each access would be SIGBUS. So it is sealed, and memory without the seal is not
+#   opened.
+# * The library is missing. Python has no acquire and release, so nothing is shared then: `private` memory has a
+#   condition in the place of the bell, and values of numpy in the place of atomic ones.
+#
+# Tried and given up: a file in /dev/shm (left behind by a killed process), the shared memory of Zenoh (it keeps
+# sockets and threads, and waking those is what takes the time), one buffer of messages for each sender, with
+# semaphores (ADR 5). Now: ADR 58.
 
 _NAME: Final = "fmu_mesh"
 _TOKEN_BYTES: Final = 16
@@ -59,12 +76,6 @@ def can_share() -> bool:
 
 class HostMemory:
     """One piece of memory, as one participant uses it.
-
-    Args:
-        memory: the memory, as long as ``map_`` says.
-        map_: what lies where.
-        process: which participant this is.
-        descriptor: of shared memory; closed by `close`.
 
     Make it with `create`, `opened` or `private`.
     """
@@ -205,12 +216,7 @@ class HostMemory:
 
 
 class Counter:
-    """A number in a `HostMemory` that has one writer and only grows; only a pause lowers the grant.
-
-    Args:
-        memory: the memory.
-        offset: where it lies.
-    """
+    """A number in a `HostMemory` that has one writer and only grows; only a pause lowers the grant."""
 
     def __init__(self, memory: HostMemory, offset: int) -> None:
         self.address = memory.address + offset

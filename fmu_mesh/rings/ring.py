@@ -30,7 +30,6 @@ class Ring:
         (0.5, 0.5)
 
     Args:
-        layout: the columns.
         rows: how many rows; a power of two.
         memory: as many bytes as the rows have, such as shared memory; None: memory of its own.
 
@@ -38,7 +37,6 @@ class Ring:
         parts: arrays of shape (rows, elements), in the order of ``layout.parts``; text as Python objects.
         stamps: an array with the stamp of each row.
         offsets: the place of each part in a row, in bytes.
-        address: address of the first row.
         stride: distance of two rows in bytes.
         mask: ``rows - 1``; the slot of row ``n`` is ``n & mask``.
     """

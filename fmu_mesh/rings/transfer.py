@@ -22,6 +22,17 @@ from .value_change import ValueChange
 
 __all__ = ["Index", "Transfer", "elements_at"]
 
+# Threads: only the one that steps the target (of a node the main thread) calls a `Transfer`. What it reads is a row
+# that another process or thread has written: it is complete because its counter was read before (acquire, see
+# docs/rings.md), and it stays because the window of the writer ends before this slot comes again. A forged counter or
+# a broken window is found by the stamp of the row: by the burst after it has copied, in Python by `Ring.has_row`.
+#
+# Two implementations on purpose: the burst moves numbers by `moves`, `step` does the same in Python where the library
+# is missing, and for text, which has no fixed size in a ring. That both give the same bits is tested for all types.
+# So `step` may not be simplified by arithmetic that rounds otherwise: factor and offset are one multiplication and
+# one addition in Float64. Tried and given up: code that is compiled for each transfer (ADR 57), and values that
+# travel as messages, which were copied seven times on their way (ADR 58).
+
 Index = slice | NDArray[np.intp]
 
 
@@ -29,17 +40,10 @@ class Transfer:
     """The columns of one feed.
 
     Args:
-        feed: the source, the delay and the columns.
-        source: the ring of the source.
-        inputs: the row of inputs of the target.
-        target: the name of the target.
-        source_points: base points per step of the source.
-        target_points: base points per step of the target.
         text: True takes the columns with text only, False those with numbers; None takes all.
 
     Attributes:
         rule: which row of the source a step needs.
-        columns: the columns that are moved.
     """
 
     def __init__(  # noqa: PLR0913  the two ends of a connection

@@ -33,9 +33,6 @@ class ValueChange(NamedTuple):
 
     Attributes:
         source: the output, as `instance.variable`.
-        target: the instance of the input.
-        variable: the input.
-        input_type: its type.
         factor: of the connection; ``offset`` likewise. Only for floating-point inputs.
         mapping: what the input gets instead of a value; other values stay as they are.
         items: the names and numbers that the input can be; empty if it can be each number of its type.

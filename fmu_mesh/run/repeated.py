@@ -31,7 +31,7 @@ from ..node.connecting import connect
 from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
-from ..node.stepping import Position, Runner
+from ..node.stepping import Runner
 from ..recorder.growth import GrowthWatch
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -51,7 +51,8 @@ log = logging.getLogger(__name__)
 _NODE = "instances"
 _SCRATCH = "scratch"
 _WRITE_ROWS = 2048
-_LOOK_S = 0.5
+# After this time without a step, the deadline of a step is looked at.
+_LONGEST_SLEEP_S = 0.5
 
 
 class RepeatedRuns:
@@ -328,7 +329,7 @@ class _Run:
             granted, pause_s = pacer.limit(min(self._last, writer.written - 1 + window), point)
             memory.grant.raise_to(granted)
             try:
-                stepped = engine.run(min(pause_s, _LOOK_S), eager=True)
+                stepped = engine.run(min(pause_s, _LONGEST_SLEEP_S), eager=True)
             except (FmuError, TerminationRequested) as event:
                 self._end_at(event, engine, memory)
                 continue
@@ -385,7 +386,7 @@ class _Run:
     def _forget(self) -> None:
         """The memory of the run is freed now: it is in no cycle of objects any more."""
         for runner in self._runners.values():
-            runner.follow(Position())
+            runner.follow(native.MemberTable())
         self._runners.clear()
         self._engine = None
 

@@ -21,7 +21,8 @@ from .results import what_is_kept
 __all__ = ["RowWriter"]
 
 _FLUSH_S = 0.2
-_CLOSE_S = 0.5
+# Longer than a block takes to be written: whoever still writes then writes to a disk that does not answer.
+_OTHER_WRITER_S = 0.5
 
 
 class RowWriter:
@@ -111,7 +112,7 @@ class RowWriter:
         Raises:
             ConfigurationError: the file cannot be written.
         """
-        if not self._writing.acquire(timeout=_CLOSE_S):
+        if not self._writing.acquire(timeout=_OTHER_WRITER_S):
             return  # another thread is writing to a disk that does not answer
         try:
             self._files.close()

@@ -25,7 +25,8 @@ from .variant_run import path_of
 __all__ = ["SlurmOptions", "SlurmSweep"]
 
 _JOB: Final = "slurm.json"
-_LOOK_S: Final = 2.0
+# A shared file system shows a new file after about a second, and each look costs its server something.
+_FOLDER_CHECK_S: Final = 2.0
 _ASK_S: Final = 10.0
 _SILENCE_S: Final = 600.0
 """How long Slurm may leave questions without an answer, in s."""
@@ -118,7 +119,7 @@ class SlurmSweep(Sweep):
         """
         left: int | None = job.tasks
         answered = asked = time.monotonic()
-        while self._left and left != 0 and not self._cancelled.wait(_LOOK_S):
+        while self._left and left != 0 and not self._cancelled.wait(_FOLDER_CHECK_S):
             now = time.monotonic()
             if now - asked > _ASK_S:
                 asked, left = now, unfinished(job)

@@ -43,7 +43,8 @@ from .worker_pool import WorkerLost, WorkerPool, unguarded_call
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 
 _TRIES: Final = 2
-_LOOK_S: Final = 0.2
+# How late a cancelled sweep stops: the end of a variant is an event, a cancellation is not.
+_CANCEL_CHECK_S: Final = 0.2
 _JOIN_S: Final = 10.0
 _AHEAD: Final = 2
 """Variants under way for each worker: one waits, so that the worker never does."""
@@ -311,7 +312,7 @@ class ExecutorSweep(Sweep):
                     number = self._waiting.popleft()
                     under_way[self._submit(executor, number)] = number
                 try:
-                    future = self._ended.get(timeout=_LOOK_S)
+                    future = self._ended.get(timeout=_CANCEL_CHECK_S)
                 except Empty:
                     continue
                 number = under_way.pop(future)

@@ -1,8 +1,7 @@
 """The inbox of a process: the only place where its main thread waits.
 
-Messages arrive on threads of Zenoh, which only keep them and ring the bell. Rare events (a query, a lost token, a
-request to end) are posted by any thread. The rows of other instances on this host come through rings, and not through
-here; a wait may also be for them. Every wait has a deadline.
+Messages of other hosts, and rare events that any thread posts (a query, a lost token, a request to end). Rows of this
+host come through rings; a wait may also be for them. Every wait has a deadline.
 """
 
 from __future__ import annotations
@@ -21,6 +20,20 @@ from .messages import HEADER
 from .refusals import Refusals
 
 __all__ = ["Inbox", "Message", "Sleeper"]
+
+# Threads: one thread, the owner, calls `poll`, `wait` and `close`, and runs what was posted. Threads of Zenoh call
+# `take`, any thread calls `post`. Between them are two deques, whose ends are atomic in CPython, and a bell: first
+# something is put into a deque, then the bell is rung; the owner reads the bell first, looks into the deques second,
+# and sleeps third. So what comes in between rings a bell that the owner has not seen, and the sleep ends at once
+# (docs/rings.md).
+#
+# What may go wrong: a callback that raises would end a thread of Zenoh, so `take` only compares a key and stores
+# bytes, and everything else happens on the owner's thread inside a guard (ADR 8). A flood of queries must not hold
+# grants back: after `_MOST_AT_ONCE` posted actions the messages have their turn. When the owner moves to shared
+# memory, somebody may ring the old bell meanwhile: `move_to` rings both.
+#
+# Why not `queue.Queue`: it takes a lock and a condition for each message, and cannot wait for a counter as well.
+# Tried and given up: a buffer in shared memory for each sender (ADR 5, replaced by rings, ADR 58).
 
 Message = tuple[str, int, int, int, int, bytes]
 """Sender, kind, link, count, point, and the whole message."""
@@ -43,9 +56,6 @@ class Inbox:
 
     Args:
         memory: has the bell on which it waits.
-
-    Attributes:
-        refusals: counts the refused messages.
     """
 
     def __init__(self, memory: HostMemory) -> None:

@@ -41,7 +41,6 @@ class Keys(msgspec.Struct, frozen=True):
 
     Attributes:
         prefix: first part of every key, `fmu_mesh` by default.
-        mesh: name of the mesh.
     """
 
     prefix: str

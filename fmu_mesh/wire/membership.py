@@ -35,6 +35,25 @@ from .session import Question, RouterLink, ask, tokens
 
 __all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
 
+# Threads: `register` starts one that asks the master, so that FMUs are loaded meanwhile; it sets `_admitted` (a
+# future) and `_keys` and ends. The owner's thread calls `keys`, `join`, `check_silence`. A thread of Zenoh answers
+# `hello`, and another one notes that the master's token went (`_master_went`): it may not ask anything, because a
+# query inside a callback waits for the thread that it is on. So it only sets a flag, and the owner asks
+# (`master_is_gone`).
+#
+# What may go wrong, and why it is done so:
+# * A query that is sent before its queryable is known gets no answer: `ask` waits until one matches.
+# * A frame that is sent before its receiver is known is lost: so each target says `hello` to its sources. A source
+#   that answers has got the subscription, which was declared before the question. Only then a node is ready.
+# * The token of the master seems to be gone although it runs: Zenoh notifies a lost token although another session
+#   still has one with this key. On this host the process decides, elsewhere a query (ADR 67).
+# * Two runs of one name: all keys but `register` have the id of the run, and nothing is declared before the master
+#   has admitted this process (ADR 8).
+# * Somebody else reports in the name of a node: the master knows a seal, and only the node its secret.
+#
+# Tried and given up: tokens as the only sign of life (a suspended host ended healthy runs). Not chosen: a heartbeat
+# of our own, which tells nothing that the lease does not (ADR 67).
+
 T = TypeVar("T")
 
 _SILENCE_S = 2.0
@@ -65,7 +84,6 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The master's answer to a registration.
 
     Attributes:
-        run: the id of the run.
         grants: the key of the master's messages to this node.
         offer: the memory that processes on the master's host share; None if there is none.
     """
@@ -85,7 +103,6 @@ class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a node reports when its links work.
 
     Attributes:
-        shared: whether it has opened the shared memory.
         opened: what its seal was made from.
     """
 
@@ -109,14 +126,11 @@ class Membership:
     """One participant's part in the mesh.
 
     Args:
-        session: the session of this process; the caller closes it.
         inbox: its inbox; opened by `join`.
         launch: the launcher that started this process; None if it was started manually.
-        router: the link to the router that connects this process to the others, if there is one.
         memory: the shared memory, for a participant in the process of the master.
 
     Attributes:
-        given_up: whether `give_up` was called.
         memory: the shared memory, once `open_memory` has opened it; None if this process does not share any.
         lost_master: whether the master was found to be gone, or does not answer.
         lost_link: whether only the link to it may be lost, so that nobody else can say it.
@@ -351,11 +365,6 @@ class Membership:
 
 
 def _understood(answer: bytes, kind: type[T]) -> T:
-    """The decoded answer of the master.
-
-    Raises:
-        MeshLost: it is not an answer of this version.
-    """
     try:
         return decode_json(answer, kind)
     except MessageRefused as error:

@@ -1,7 +1,7 @@
 """The messages of the synchronization, as bytes.
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
-four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.rows`), in an ABORT an `ErrorReport` as
+four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), in an ABORT an `ErrorReport` as
 JSON, in a SET a `SetValue` as JSON, for the recorder. LAST says that no more rows of a link come, because the run has
 ended early. Every decoder checks sizes before it reads anything, and raises only `MessageRefused`.
 """
@@ -32,7 +32,6 @@ __all__ = [
     "SET",
     "NodeReport",
     "SetValue",
-    "decode_abort",
     "decode_json",
     "encode_abort",
     "encode_set",
@@ -58,7 +57,6 @@ class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a node ended.
 
     Attributes:
-        point: where it ended.
         error: why, if it is a failure, or if an FMU asked for it.
         profile: what it has measured, if the master asked for it.
         secret: `Membership.report` adds it; see `fmu_mesh.wire.membership.Registration`.
@@ -75,8 +73,6 @@ class SetValue(msgspec.Struct, frozen=True):
     """A value that another program gave to an input or a parameter while the mesh ran.
 
     Attributes:
-        instance: the instance.
-        variable: its variable.
         value: the value, as JSON has it.
         point: the communication point at which the instance took it: the step from there is the first that may use it.
         time: simulation time in s from which on it holds; None: from `point` on.
@@ -101,15 +97,6 @@ def sealed(secret: str) -> str:
 def encode_abort(report: ErrorReport) -> bytes:
     """An ABORT message."""
     return HEADER.pack(ABORT, 0, 0, 0) + msgspec.json.encode(report)
-
-
-def decode_abort(data: bytes) -> ErrorReport:
-    """The error that ended the mesh.
-
-    Raises:
-        MessageRefused: it is not an `ErrorReport`.
-    """
-    return decode_json(data[HEADER.size :], ErrorReport)
 
 
 def encode_set(value: SetValue) -> bytes:

@@ -25,11 +25,7 @@ _MOST_WAITING = 1024
 
 
 class Refusals:
-    """The refused messages of one process.
-
-    Attributes:
-        count: number of refused messages.
-    """
+    """The refused messages of one process."""
 
     def __init__(self) -> None:
         self.count = 0

@@ -32,9 +32,9 @@ __all__ = [
     "enter_run_folder",
     "fmu_folder",
     "is_alive",
+    "is_stopped",
     "leave_run_folder",
     "meshes",
-    "process_state",
     "remove_stale_folders",
     "run_folder",
     "run_name",
@@ -331,17 +331,12 @@ def is_alive(pid: int) -> bool:
     return state not in {"Z", "X"} and not int(flags) & _PF_EXITING and not pending & _KILLED
 
 
-def process_state(pid: int) -> str | None:
-    """The state of a process as one letter (proc(5): R runs, S sleeps, T is stopped, Z has ended); None if unknown."""
-    try:
-        return _stat(pid)[0]
-    except (OSError, IndexError):
-        return None
-
-
 def is_stopped(pid: int) -> bool:
-    """Whether a process is stopped by a signal, such as SIGSTOP or Ctrl-Z."""
-    return process_state(pid) == "T"
+    """Whether a process is stopped by a signal, such as SIGSTOP or Ctrl-Z; False if it is gone."""
+    try:
+        return _stat(pid)[0] == "T"
+    except (OSError, IndexError):
+        return False
 
 
 def _stat(pid: int) -> list[str]:

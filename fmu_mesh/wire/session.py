@@ -39,6 +39,20 @@ __all__ = [
     "undeclare_all",
 ]
 
+# Threads: a session has its own. Each callback of zenoh-python has a thread in addition, unless it is
+# `indirect=False`; that one runs on the thread that reads the link, and must return at once. No function here may be
+# called in a callback: those that ask would wait for the thread that they are on. `close_session` closes on a thread
+# of its own, which may be left behind. Where Zenoh has no event (a queryable whose process is gone), a wait looks
+# every `_OVER_CHECK_S`.
+#
+# What may go wrong: a receiver is stopped, and a sender blocks on it. Then `stuck_s` closes the link; the lease does
+# not expire meanwhile (measured, ADR 4). A slow reader loses samples and answers, which have queues of their own
+# behind all other messages. A process that ends while a thread of Zenoh calls Python may abort: `last_exit`.
+#
+# Tried and given up: gossip and scouting on one host (slower than endpoints, and open to others), a loopback port
+# (every user of the host can connect), the lease as it is by default (4 s ended runs whose host was suspended; ADR
+# 67).
+
 LEASE_S = 30.0
 """After so long in s without a sign of life a link counts as lost; a dead process is noticed within milliseconds."""
 
@@ -73,16 +87,19 @@ _ADMIN_SPACE_IS_OURS: Final = {
 }
 """A session whose admin space others ask for its subscribers, while one comes or goes, stands for ever (zenoh 1.10)."""
 
-_CLOSE_S = 1.0
+# Zenoh closes a session within milliseconds, unless an endpoint does not answer: then it would take ten seconds.
+_SESSION_END_S = 1.0
 _OWN_S = 5.0
-_LOOK_S = 0.05
+# How late a question notices that its answer is not needed any more, or that the process it asks is gone: neither is
+# an event here.
+_OVER_CHECK_S = 0.05
 _TIMEOUT = "Timeout"
 """The reply of Zenoh itself if a queryable did not answer in time."""
 _TOKENS_S = 2.0
 _TOKENS_TRIES = 10
 _LINK_S = 1.0
 _UNLINK_S = 0.2
-_LINK_LOOK_S = 0.01
+_LINK_CHECK_S = 0.01
 
 
 class Wiring(msgspec.Struct, frozen=True):
@@ -90,10 +107,8 @@ class Wiring(msgspec.Struct, frozen=True):
 
     Attributes:
         mode: `peer` or `client`.
-        listen: endpoints to listen on.
         connect: endpoints to connect to; repeated until they answer.
         gossip: whether peers find each other through other peers (meshes over several hosts).
-        config: a Zenoh configuration file to start from.
         patience_s: how long a client tries to connect, in s.
         lease_s: how long a process at the other end waits for a sign of life of this one, in s.
         stuck_s: how long a sender may be blocked before its link is closed, in s; the lease does not expire meanwhile.
@@ -212,7 +227,7 @@ def close_session(session: zenoh.Session) -> None:
     """
     closing = threading.Thread(target=session.close, name="close", daemon=True)
     closing.start()
-    closing.join(_CLOSE_S)
+    closing.join(_SESSION_END_S)
 
 
 def own_endpoints(session: zenoh.Session, wiring: Wiring) -> tuple[str, ...]:
@@ -291,7 +306,7 @@ class RouterLink:
         while self.look() != there:
             if time.monotonic() > end:
                 return False
-            never.wait(_LINK_LOOK_S)
+            never.wait(_LINK_CHECK_S)
         return True
 
 
@@ -305,7 +320,6 @@ class Question(msgspec.Struct, frozen=True):
     """A query that waits for its answer.
 
     Attributes:
-        key: key expression of the queryable.
         whom: the receiver, for the error.
         deadline_s: how long to wait for an answer, in s.
         payload: JSON of the query, if there is any.
@@ -361,7 +375,7 @@ def answers(
                         return samples
                 if over():
                     raise MeshLost(f"{question.whom} has not answered yet, and this process does not wait any more")
-                changed.wait(min(left, _LOOK_S))
+                changed.wait(min(left, _OVER_CHECK_S))
         finally:
             listener.undeclare()
     raise DeadlineExceeded(f"{question.whom} did not answer within {question.deadline_s:g} s")
@@ -388,7 +402,7 @@ def _collected(
     samples: list[zenoh.Sample] = []
     while every or not samples:
         try:
-            reply = replies.get(timeout=_LOOK_S)
+            reply = replies.get(timeout=_OVER_CHECK_S)
         except queue.Empty:  # only then: an answer may come just before the end, as that to `stop`
             if over():
                 break

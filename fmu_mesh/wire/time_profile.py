@@ -99,7 +99,6 @@ class MeshProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The profile of one run.
 
     Attributes:
-        nodes: in the order of the plan; the recorder is not among them.
         held_s: how long each node limited the grant.
     """
 

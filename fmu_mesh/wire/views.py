@@ -160,7 +160,6 @@ class MeshInfo(msgspec.Struct, frozen=True):
     Attributes:
         run: the id of the run, which all its internal keys contain.
         result_file: the first result file; None if nothing is recorded.
-        result_files: all of them.
         shared_memory: the processes that exchange values, grants and progress through the memory of the master's host;
             all others do it through Zenoh. Empty until all nodes are ready.
         host_id: of the master's host; ``host`` is a name, which two hosts can have.
@@ -200,7 +199,6 @@ class MeshStatus(msgspec.Struct, frozen=True):
         points_per_second: since the first point, or since the last pause.
         real_time_factor: simulated over wall-clock time since the first point.
         overruns: points by which the run fell behind the wall clock beyond `catch_up`.
-        progress: last point of every node.
         refused: messages that the master refused: malformed ones, and those of unknown senders.
     """
 

@@ -27,10 +27,9 @@ from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import Link
 from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, is_text, nested
-from fmu_mesh.wire.frames import FrameReceiver
+from fmu_mesh.wire.frames import FrameReceiver, decode_rows, encode_frames, encode_rows
 from fmu_mesh.wire.keys import Keys, escape, unescape
-from fmu_mesh.wire.messages import FRAME, HEADER, decode_abort, decode_json, encode_abort
-from fmu_mesh.wire.rows import decode_rows, encode_frames, encode_rows
+from fmu_mesh.wire.messages import FRAME, HEADER, decode_json, encode_abort
 from fmu_mesh.wire.values import Stamp, ValueRefused, attachment, decode_value, encode_value
 
 columns = st.tuples(st.sampled_from(TYPES), st.lists(st.integers(1, 3), max_size=2).map(tuple))
@@ -124,7 +123,7 @@ def test_a_frame_that_is_cut_off_or_too_long_is_refused(
 
 
 def test_rows_too_large_for_one_message_go_in_several(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fmu_mesh.wire.rows.MAX_MESSAGE_SIZE", 100)
+    monkeypatch.setattr("fmu_mesh.wire.frames.MAX_MESSAGE_SIZE", 100)
     layout = Layout.of([("b", "Binary"), ("n", "UInt8")])
     rows = (np.arange(7, dtype=np.uint8)[:, None], np.array([[b"x" * 30]] * 7, dtype=np.object_))
 
@@ -167,7 +166,7 @@ texts = st.none() | st.text(max_size=20)
     )
 )
 def test_an_error_report_comes_back(report: ErrorReport) -> None:
-    assert decode_abort(encode_abort(report)) == report
+    assert decode_json(encode_abort(report)[HEADER.size :], ErrorReport) == report
 
 
 deep = st.integers(1, 3_000).flatmap(lambda depth: st.sampled_from([b"[" * depth, b'{"a":' * depth]))
@@ -180,7 +179,7 @@ wild = st.binary(max_size=300) | deep | st.text(max_size=100).map(lambda text: b
 @example(b'{"kind":"x","message":"\xff","exit_code":1}')
 def test_bytes_that_are_no_report_are_refused(data: bytes) -> None:
     with pytest.raises(MessageRefused):
-        decode_abort(HEADER.pack(6, 0, 0, 0) + data)
+        decode_json(data, ErrorReport)
 
 
 def test_json_that_is_too_large_is_refused_with_the_limit() -> None:

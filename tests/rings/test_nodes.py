@@ -45,7 +45,8 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
         if (sanitizer, burst) not in built:
             program = tmp_path_factory.mktemp("nodes") / "nodes"
             options = [*SANITIZERS[sanitizer], *([f"-fsanitize={sanitizer}"] if sanitizer else [])]
-            command = [compiler, "-std=c11", "-ffp-contract=off", "-pthread", *options, f'-DBURST="{burst}"']
+            options += [f'-DBURST="{burst}"', f"-I{BURST.parent}"]  # a changed copy includes the header of the original
+            command = [compiler, "-std=c11", "-ffp-contract=off", "-pthread", *options]
             made = subprocess.run(
                 [*command, HERE / "nodes.c", "-o", program, "-lm"], capture_output=True, text=True, check=False
             )

@@ -10,15 +10,15 @@ import pytest
 
 from fmu_mesh.errors import FmuMeshError, FrameGap, MessageRefused, ProtocolBroken
 from fmu_mesh.node.links import OutLink
-from fmu_mesh.node.stepping import Position, Runner
+from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import HostMemory
+from fmu_mesh.rings.native import MemberTable
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import RECORDER, Link
-from fmu_mesh.wire.frames import FrameReceiver, initial_values, rows_of
+from fmu_mesh.wire.frames import FrameReceiver, encode_rows, initial_values, rows_of
 from fmu_mesh.wire.messages import FRAME, HEADER, INITIAL
-from fmu_mesh.wire.rows import encode_rows
 
 LAYOUT = Layout.of([("a", "Float64"), ("n", "Int32"), ("b", "Float64")])
 LINK = Link(3, "source", "left", "right", 2, LAYOUT, (0, 2, -1))
@@ -215,10 +215,10 @@ def test_rows_for_the_recorder_wait_for_more_rows_unless_no_more_will_come(step:
     ring, messages = memory.ring(place), list[bytes]()
     plan = SimpleNamespace(name="source", step_points=1, inputs=Layout(), input_row=Layout(), finite=())
     runner = Runner(cast("Any", plan), cast("Any", None), TimeGrid(0.0, 0.1, 10), ring, memory.counter(place.counter))
-    position = Position()
+    position = MemberTable()
     runner.follow(position)
     for _ in range(step):
-        position.count()
+        position.step += 1
     runner.out_links.append(OutLink(Link(3, "source", "left", RECORDER, 1, LAYOUT, ()), LAYOUT, ring, messages.append))
 
     runner.flush(lazy=False)

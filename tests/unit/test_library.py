@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from enum import IntEnum
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from hatchling.builders.wheel import WheelBuilder
 
 import build_library
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.rings import native
 from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, library_missed, load_library, why_no_library
 from tests.helpers import write_config
 
@@ -194,6 +196,23 @@ def test_a_library_of_older_sources_is_an_error_that_says_how_to_build_it(clone:
     )
 
 
+@pytest.mark.parametrize("known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd])
+def test_an_enumeration_has_the_names_of_the_header_in_their_order(known: type[IntEnum]) -> None:
+    header = (LIBRARY.parent / "burst.h").read_text()
+    declared = re.search(rf"enum {known.__name__} \{{ (.*) \}};", header)
+
+    assert declared is not None
+    assert [member.name for member in known] == declared[1].split(", ")
+    assert [*known] == [*range(len(known))]
+
+
+def test_fields_of_a_table_are_those_of_the_header_with_their_types() -> None:
+    assert ("members", ctypes.POINTER(native.MemberTable)) in native.UnitTable._fields_
+    assert ("outputs", native.OutputTable * 2) in native.MemberTable._fields_
+    assert ("said", ctypes.c_void_p) in native.MemberTable._fields_
+    assert [name for name, *_ in native.Entry._fields_] == ["from_", "to", "from_large", "to_large"]
+
+
 def test_a_library_without_its_sources_is_loaded(clone: Path) -> None:
     (clone / "fmu_mesh" / "rings" / "burst.c").unlink()
 
@@ -219,6 +238,7 @@ def test_a_wheel_for_linux_has_the_library_of_the_tree(tmp_path: Path) -> None:
     assert wheel.endswith("-py3-none-manylinux_2_17_x86_64.whl")
     with zipfile.ZipFile(wheel) as archive:
         assert archive.read(NAME) == LIBRARY.read_bytes()
+        assert "fmu_mesh/rings/burst.h" in archive.namelist()
         assert [name for name in archive.namelist() if name.endswith(".so")] == [NAME]
 
 
@@ -250,7 +270,7 @@ def test_the_source_distribution_has_the_library_and_what_builds_it(tmp_path: Pa
 
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {NAME, "fmu_mesh/rings/burst.c", "build_library.py"} <= names
+    assert {NAME, "fmu_mesh/rings/burst.c", "fmu_mesh/rings/burst.h", "build_library.py"} <= names
 
 
 @pytest.mark.parametrize("chosen", [False, True], ids=["missing", "switched off"])

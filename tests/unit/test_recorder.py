@@ -20,10 +20,10 @@ from fmu_mesh.recorder.recorder import Recorder
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan
+from fmu_mesh.wire.frames import encode_rows
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Welcome
 from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, LAST, encode_abort
-from fmu_mesh.wire.rows import encode_rows
 from fmu_mesh.wire.session import Wiring, close_session, open_session
 from tests.helpers import DEADLINE_S, wait_until
 from tests.scenarios.scenario import Scenario
@@ -169,7 +169,7 @@ def test_a_recorder_takes_rows_that_come_after_the_end_of_the_run(mesh: Mesh, mo
 
 def test_a_recorder_writes_before_its_window_is_full(mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the nodes, which may not be further ahead, wait until it looks."""
-    monkeypatch.setattr(module, "_LOOK_S", 2 * DEADLINE_S)
+    monkeypatch.setattr(module, "_LONGEST_SLEEP_S", 2 * DEADLINE_S)
     memory, mesh.shared = HostMemory.create(mesh.plan.memory, MASTER), ("n",)
     plan = msgspec.structs.replace(mesh.plan, window=64)
 

@@ -12,8 +12,9 @@ from fmu_mesh.instances.contract import Instance
 from fmu_mesh.instances.fmi import Fmi2Instance, read_description
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.node.inputs import TimedInputs, set_input
-from fmu_mesh.node.stepping import Position, Runner
+from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import HostMemory
+from fmu_mesh.rings.native import MemberTable
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
@@ -104,7 +105,7 @@ def test_a_value_whose_time_is_past_holds_unless_a_later_one_is_in_use(hold: Ste
     assert hold.go(1) == [8.0]
 
 
-def runner_of(instance: Instance) -> tuple[Runner, Position]:
+def runner_of(instance: Instance) -> tuple[Runner, MemberTable]:
     """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])
     plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
@@ -112,7 +113,7 @@ def runner_of(instance: Instance) -> tuple[Runner, Position]:
     memory = HostMemory.private(map_, "gain")
     ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
     runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), ring, counter)
-    position = Position()
+    position = MemberTable()
     runner.follow(position)
     runner.bind()
     return runner, position

@@ -20,8 +20,8 @@ from ...ssp.configuration_files import read_configuration
 from ...system.scenario import BAG_STAMP_S
 from ...variables.model_description import Value
 from ...wire.client.mesh_client import MeshClient
-from ...wire.client.pausing import go_on, paused_at, wait_until_at
 from ...wire.client.readings import Target
+from ...wire.client.waiting import go_on, paused_at, wait_until_at
 from ...wire.views import Command, MeshInfo
 from .bag import Bag, BagSample, chosen_topics, timed
 from .play_options import PlayOptions

@@ -31,7 +31,8 @@ log = logging.getLogger(__name__)
 _INTERVAL_S = 0.25
 _PATIENCE_S = 3.0
 _OPEN_S = 1.0
-_CLOSE_S = 3.0
+# Longer than one look at the link, which may wait for a bridge that does not answer.
+_WATCH_END_S = 3.0
 _MAX_WARNINGS = 20
 
 _BRIDGES = "@/*/@ros2_lv"
@@ -95,7 +96,7 @@ class RosLink:
     def close(self) -> None:
         """Stop watching. If there never was a link, warn now at the latest."""
         self._over.set()
-        self._thread.join(_CLOSE_S)
+        self._thread.join(_WATCH_END_S)
         if not self._was_linked and not self._warned_absence and not self._linked():
             self._warn(f"{self._view.activity}, so ROS got nothing of mesh '{self._keys.mesh}'. {self._hint}")
         undeclare_all(self._entities)

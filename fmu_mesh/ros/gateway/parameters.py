@@ -41,7 +41,8 @@ SERVICES = {
 
 _ANSWER_S = 2.0
 _WHO = "ros set_parameters"
-_CLOSE_S = 2.0
+# As long as the mesh may take for the answer that is under way.
+_ANSWERS_END_S = 2.0
 _NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING = range(5)
 _VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "double_value", _STRING: "string_value"}
 
@@ -83,7 +84,7 @@ class ParameterServices:
             yield
         finally:
             self._jobs.put(None)
-            thread.join(_CLOSE_S)
+            thread.join(_ANSWERS_END_S)
 
     def _queued(self, answer: Callable[[Message], Message]) -> Service:
         def service(request: Message, reply: Callable[[Message], None]) -> None:

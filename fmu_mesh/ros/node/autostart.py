@@ -15,7 +15,8 @@ __all__ = ["Autostart"]
 
 _ATTEMPT_S = 2.0
 _INTERVAL_S = 0.25
-_CLOSE_S = 5.0
+# Longer than one attempt, which it may be in the middle of.
+_ATTEMPT_END_S = 5.0
 
 
 class Autostart:
@@ -50,7 +51,7 @@ class Autostart:
         """Stop waiting."""
         self._over.set()
         if self._thread is not None:
-            self._thread.join(_CLOSE_S)
+            self._thread.join(_ATTEMPT_END_S)
 
     def _start(self) -> None:
         done = ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS

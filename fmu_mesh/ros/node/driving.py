@@ -25,7 +25,8 @@ from ...variables.model_description import ModelDescription, Value
 __all__ = ["DriveSettings", "FmuDriver", "FmuThread", "Update"]
 
 _ANSWER_S = 60.0
-_CLOSE_S = 5.0
+# As long as `FmuNode` waits for the FMU itself: the thread ends when its FMU has.
+_THREAD_END_S = 5.0
 
 Result = TypeVar("Result")
 Parameters = ParamSpec("Parameters")
@@ -276,7 +277,7 @@ class FmuThread:
         self._pool.shutdown(wait=False, cancel_futures=True)
         if self._thread is None:
             return True
-        self._thread.join(_CLOSE_S)
+        self._thread.join(_THREAD_END_S)
         return not self._thread.is_alive()
 
     def _keep_thread(self) -> None:

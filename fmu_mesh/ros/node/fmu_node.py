@@ -31,7 +31,8 @@ from .variable_parameters import (
 
 __all__ = ["FmuNode"]
 
-_CLOSE_S = 5.0
+# Longer than an FMU needs to end; one that hangs is left behind, because its thread cannot be ended.
+_FMU_END_S = 5.0
 
 
 class FmuNode:
@@ -113,9 +114,9 @@ class FmuNode:
             topics.close_inputs()
         if driver is not None:
             try:
-                self._thread.submit(driver.close).result(_CLOSE_S)
+                self._thread.submit(driver.close).result(_FMU_END_S)
             except FutureTimeout:
-                self._log.error(f"the FMU did not return within {_CLOSE_S:g} s; it is left behind")
+                self._log.error(f"the FMU did not return within {_FMU_END_S:g} s; it is left behind")
                 driver.remove_files()
         if topics is not None:
             topics.close_outputs()

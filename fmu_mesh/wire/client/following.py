@@ -1,6 +1,8 @@
-"""Follows what a mesh publishes until the mesh ends.
+"""Follows what a mesh publishes: `Follower` until the mesh ends, `ValueStream` a changing set of variables.
 
-Owns the detection of that end: the liveliness token of the master disappears, also if the master is killed.
+Owns the detection of that end: the liveliness token of the master disappears, also if the master is killed. And what is
+lost where values come faster than they are taken: `Follower`, whose variables stay the same, keeps the oldest,
+`ValueStream` the newest.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 from types import TracebackType
@@ -18,9 +21,15 @@ from zenoh.handlers import Callback
 
 from ...errors import DeadlineExceeded, MessageRefused
 from ..keys import Keys
-from .readings import latecomers
+from .readings import Reading, Target, latecomers, reading_of
 
-__all__ = ["Follower"]
+__all__ = ["Follower", "ValueStream"]
+
+# Threads: those of Zenoh put samples (`take`, `arrived`) and the loss of the token; any other thread takes them.
+# Callbacks are `indirect=False`: a thread for each of 1,000 keys would be too many, so they only store, and never
+# wait; of what is stored there is a limit. The token may be reported as gone before samples that were sent earlier
+# have arrived (another priority, another thread), so the end is only the end after `latecomers`. And Zenoh may report
+# one token twice: a mesh that has ended does not begin again for the same follower (ADR 67 on lost tokens).
 
 Item = TypeVar("Item")
 
@@ -31,13 +40,10 @@ class Follower(Generic[Item]):
     """Follows a mesh as long as the `with` block lasts.
 
     Args:
-        session: a session that reaches the mesh.
-        keys: the keys of the mesh.
         on_end: called on a thread of Zenoh when the mesh ends.
 
     Attributes:
         arrived: what subscribers have received, in order; None marks the end of the mesh.
-        there: set when the mesh was found.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, on_end: Callable[[], None] = lambda: None) -> None:
@@ -112,3 +118,70 @@ class Follower(Generic[Item]):
             self._over = True
             self.arrived.put(None)
             self._on_end()
+
+
+class ValueStream:
+    """Values as they come, as long as the `with` block lasts; from any thread.
+
+    Args:
+        session: a session that reaches the mesh.
+        limit: number of values that wait at most; of more, the oldest are lost.
+    """
+
+    def __init__(self, session: zenoh.Session, limit: int) -> None:
+        self._session = session
+        self._waiting: deque[tuple[Target, zenoh.Sample]] = deque(maxlen=limit)
+        self._limit = limit
+        self._lost = 0
+        self._lock = threading.Lock()
+        self._arrived = threading.Event()
+        self._subscribers: dict[str, zenoh.Subscriber[None]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for key in list(self._subscribers):
+            self._subscribers.pop(key).undeclare()
+
+    def follow(self, target: Target) -> None:
+        """From now on values of this variable arrive; twice is as once."""
+        if target.key in self._subscribers:
+            return
+
+        def arrived(sample: zenoh.Sample) -> None:
+            if str(sample.key_expr) == target.key:
+                with self._lock:
+                    self._lost += len(self._waiting) == self._limit
+                    self._waiting.append((target, sample))
+                    self._arrived.set()
+
+        directly = Callback(arrived, indirect=False)  # no thread for each variable
+        self._subscribers[target.key] = self._session.declare_subscriber(target.key, directly)
+
+    def leave(self, target: Target) -> None:
+        """From now on no value of this variable arrives."""
+        if (subscriber := self._subscribers.pop(target.key, None)) is not None:
+            subscriber.undeclare()
+
+    def wake(self) -> None:
+        """Let `take` return."""
+        self._arrived.set()
+
+    def take(self, timeout_s: float) -> list[tuple[Target, Reading]]:
+        """What has arrived since the last call, the oldest first; waits for it for at most ``timeout_s`` seconds."""
+        self._arrived.wait(timeout_s)
+        with self._lock:
+            self._arrived.clear()
+            taken = list(self._waiting)
+            self._waiting.clear()
+        readings = [(target, reading_of(target, sample)) for target, sample in taken]
+        return [(target, reading) for target, reading in readings if reading is not None]
+
+    def take_lost(self) -> int:
+        """Number of values that were lost since the last call."""
+        with self._lock:
+            lost, self._lost = self._lost, 0
+        return lost

@@ -42,13 +42,14 @@ from ..views import (
     SetAnswer,
 )
 from .following import Follower
-from .readings import Reading, Target, reading_of
+from .readings import Reading, Target, reading_among
 
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
 
-_LOOK_S = 0.05
+# How often a wait for the mesh asks whether it has ended meanwhile; there is no event for both.
+_END_CHECK_S = 0.05
 
 
 class MeshClient:
@@ -56,9 +57,7 @@ class MeshClient:
 
     Args:
         session: a session that reaches the mesh; the caller closes it.
-        keys: the keys of the mesh.
         endpoints: where the session reaches the mesh, for messages.
-        timeout_s: the deadline of every query in s.
         over: raises `MeshLost` if the mesh has ended, where the caller knows it; otherwise returns False.
 
     Raises:
@@ -76,17 +75,12 @@ class MeshClient:
     ) -> None:
         self.keys = keys
         self.endpoints = tuple(endpoints)
-        self._session = session
+        self.session = session
         self._timeout_s = timeout_s
         self._over = over
         self._lost = threading.Event()
         self._known: dict[str, dict[str, Target]] = {}
         self._known_run = ""
-
-    @property
-    def session(self) -> zenoh.Session:
-        """The session that reaches the mesh."""
-        return self._session
 
     def info(self) -> MeshInfo:
         """The description of the mesh."""
@@ -98,10 +92,8 @@ class MeshClient:
         A query for the token of the master would not do: beside a subscriber for that token, such as `until_end`
         has, its answer is empty now and then although the mesh runs.
         """
-        try:
-            return next((_decoded(sample, MeshInfo) for sample in self._get(self.keys.mesh_key("info"))), None)
-        except MessageRefused as error:
-            raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
+        samples = self._get(self.keys.mesh_key("info"))
+        return _understood(samples[0].payload.to_bytes(), MeshInfo, f"mesh '{self.keys.mesh}'") if samples else None
 
     def status(self) -> MeshStatus:
         """The state and the point of the mesh."""
@@ -110,11 +102,8 @@ class MeshClient:
     def ros(self) -> list[RosView]:
         """The links of the gateways to ROS; empty if the mesh has no gateway."""
         # This does not wait for a queryable, because a mesh without a gateway has none.
-        samples = self._get(f"{self.keys.mesh_key('ros')}/*")
-        try:
-            return [_decoded(sample, RosView) for sample in samples]
-        except MessageRefused as error:
-            raise _not_understood(f"the gateway of mesh '{self.keys.mesh}'", error) from error
+        samples, who = self._get(f"{self.keys.mesh_key('ros')}/*"), f"the gateway of mesh '{self.keys.mesh}'"
+        return [_understood(sample.payload.to_bytes(), RosView, who) for sample in samples]
 
     def instance_info(self, instance: str) -> InstanceInfo:
         """The description of an instance: variables, connections, process. Waits while its FMU is being loaded."""
@@ -137,13 +126,10 @@ class MeshClient:
         names = msgspec.json.encode(subscribed) if subscribed is not None else None
         # A querier does not notice several queryables that match its key (zenoh 1.10), so this is a get.
         found = {str(s.key_expr): s.payload.to_bytes() for s in self._get(key, names)}
-        mesh = found.pop(self.keys.mesh_key("status"), None)
-        status = self.status() if mesh is None else None  # this session does not know the mesh yet, or the mesh is gone
-        try:
-            status = status or decode_json(mesh or b"", MeshStatus)
-            views = [decode_json(data, InstanceStatus) for data in found.values()]
-        except MessageRefused as error:
-            raise _not_understood(f"mesh '{self.keys.mesh}'", error) from error
+        mesh, who = found.pop(self.keys.mesh_key("status"), None), f"mesh '{self.keys.mesh}'"
+        # Without an answer of the mesh, this session does not know it yet, or it is gone.
+        status = _understood(mesh, MeshStatus, who) if mesh is not None else self.status()
+        views = [_understood(data, InstanceStatus, who) for data in found.values()]
         return status, {view.instance: view for view in views}
 
     @contextmanager
@@ -161,7 +147,7 @@ class MeshClient:
             ended.set()
             tell()
 
-        with Follower[None](self._session, self.keys, end) as follower:
+        with Follower[None](self.session, self.keys, end) as follower:
             if not self._is_there(follower, self._timeout_s):
                 ended.set()
             yield ended
@@ -215,9 +201,8 @@ class MeshClient:
             # An answer may be lost where this process reads too slowly; it is asked for again.
             for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
                 for sample in self._ask(asked, f"the values of instance '{instance}'"):
-                    target = own.get(str(sample.key_expr))
-                    if target is not None and (reading := reading_of(target, sample)) is not None:
-                        readings[target.key] = reading
+                    if (reading := reading_among(own, sample)) is not None:
+                        readings[reading.key] = reading
         return [readings[target.key] for target in targets if target.key in readings]
 
     def set(self, target: Target, value: object, at: float | None = None) -> SetAnswer:
@@ -249,7 +234,7 @@ class MeshClient:
         """
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
-        with Follower[MeshStatus](self._session, self.keys) as follower:
+        with Follower[MeshStatus](self.session, self.keys) as follower:
             follower.subscribe({self.keys.mesh_key("status")}, partial(_decoded, kind=MeshStatus))
             there = self._is_there(follower, min(timeout_s, self._timeout_s))
             yield follower.to_the_last(deadline) if there else iter(())
@@ -260,7 +245,7 @@ class MeshClient:
 
         A reader that is much too slow loses the newest samples; the points show which.
         """
-        with Follower[Reading](self._session, self.keys) as follower:
+        with Follower[Reading](self.session, self.keys) as follower:
             by_instance: dict[str, dict[str, Target]] = {}
             subscribed: dict[str, list[str] | None] = {}
             for target in targets:
@@ -268,7 +253,7 @@ class MeshClient:
             for name, own in by_instance.items():
                 every = len(own) == len(self._known.get(name, ()))
                 through = f"{self.keys.instance(name)}/*/*" if every else None
-                follower.subscribe(own.keys(), partial(_reading_among, own), through)
+                follower.subscribe(own.keys(), partial(reading_among, own), through)
                 subscribed[name] = None if every else [target.variable.name for target in own.values()]
             there = self._is_there(follower, self._timeout_s)
             if there:
@@ -280,7 +265,7 @@ class MeshClient:
     @contextmanager
     def logs(self, *, follow: bool) -> Iterator[Iterator[LogLine]]:
         """The log messages that the mesh has kept, the oldest first; then all new ones until it ends, if ``follow``."""
-        with Follower[LogLine](self._session, self.keys) as follower:
+        with Follower[LogLine](self.session, self.keys) as follower:
             if follow:  # from before the question, so that no message is missing between the two
                 follower.subscribe({self.keys.mesh_key("log")}, partial(_decoded, kind=LogLine))
             kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
@@ -290,11 +275,7 @@ class MeshClient:
             yield chain(kept, (line for line in new if line.number > last))
 
     def _is_over(self) -> bool:
-        """Whether the mesh has ended, in the words of who knows it.
-
-        Raises:
-            MeshLost: it has.
-        """
+        """Raise `MeshLost` if the mesh has ended, in the words of who knows it; otherwise False."""
         if self._lost.is_set() and self.info_if_running() is None:  # a token that was lost may be there again
             raise MeshLost(f"mesh '{self.keys.mesh}' has ended")
         return self._over()
@@ -302,7 +283,7 @@ class MeshClient:
     def _is_there(self, follower: Follower[Any], timeout_s: float) -> bool:
         """Whether a follower finds the mesh in time."""
         end = time.monotonic() + timeout_s
-        while not follower.there.wait(_LOOK_S):
+        while not follower.there.wait(_END_CHECK_S):
             if self._is_over() or time.monotonic() >= end:
                 return False
         return True
@@ -364,17 +345,13 @@ class MeshClient:
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> View:
-        sample = self._ask(key, who, payload, attachment)[0]
-        try:
-            return _decoded(sample, kind)
-        except MessageRefused as error:
-            raise _not_understood(who, error) from error
+        return _understood(self._ask(key, who, payload, attachment)[0].payload.to_bytes(), kind, who)
 
     def _ask(
         self, key: str, who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> list[zenoh.Sample]:
         try:
-            return answers(self._session, Question(key, who, self._timeout_s, payload, attachment), self._is_over)
+            return answers(self.session, Question(key, who, self._timeout_s, payload, attachment), self._is_over)
         except DeadlineExceeded:
             text = f"no answer from {who} within {self._timeout_s:g} s."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
@@ -385,7 +362,7 @@ class MeshClient:
     def _get(self, key: str, attachment: bytes | None = None) -> list[zenoh.Sample]:
         """The answers of all queryables that exist now; this does not wait for others."""
         try:
-            replies = self._session.get(key, timeout=self._timeout_s, attachment=attachment)
+            replies = self.session.get(key, timeout=self._timeout_s, attachment=attachment)
             return [sample for reply in replies if (sample := answer_of(reply)) is not None]
         except MeshLost as error:
             raise ConfigurationError(error.message) from error
@@ -428,14 +405,12 @@ def _decoded(sample: zenoh.Sample, kind: type[View]) -> View:
     return decode_json(sample.payload.to_bytes(), kind)
 
 
-def _reading_among(targets: Mapping[str, Target], sample: zenoh.Sample) -> Reading | None:
-    return reading_of(targets[str(sample.key_expr)], sample)
-
-
-def _not_understood(who: str, error: MessageRefused) -> ConfigurationError:
-    return ConfigurationError(
-        f"the answer of {who} is not understood: {error}.", hint="Is it another version of fmu_mesh?"
-    )
+def _understood(answer: bytes, kind: type[View], who: str) -> View:
+    try:
+        return decode_json(answer, kind)
+    except MessageRefused as error:
+        text = f"the answer of {who} is not understood: {error}."
+        raise ConfigurationError(text, hint="Is it another version of fmu_mesh?") from error
 
 
 def _unknown(message: str, name: str, names: Sequence[str]) -> ConfigurationError:

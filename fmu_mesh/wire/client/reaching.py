@@ -25,10 +25,17 @@ from .mesh_client import MeshClient, is_key, key_expression
 
 __all__ = ["Meshes"]
 
+# Threads: a session is opened on a thread of its own (`_Opening`), so that one mesh that does not answer does not
+# hold the others, and no wait is longer than its deadline; the thread is a daemon, because what it waits for cannot
+# be cancelled. All else is on the caller's thread. Notes are files that other processes write and remove at any time,
+# so each look reads them anew, and a note is no proof: its mesh may be killed, or be stopped (ADR 4 says who can
+# reach which socket).
+
 Answer = TypeVar("Answer")
 
 _GRACE_S = 1.0
-_LOOK_S = 0.05
+# A new note in the runtime folder makes no event, and a look at the folder costs less than a millisecond.
+_NOTE_CHECK_S = 0.05
 _AGAIN_S = 1.0
 _TOKENS = "**/mesh"
 _NOBODY = "nobody answered"
@@ -42,7 +49,6 @@ class Meshes:
 
     Args:
         endpoints: Zenoh endpoints to connect to; if empty, the notes of this user's meshes on this host are used.
-        timeout_s: the deadline of every wait in s.
 
     Attributes:
         silent: for meshes with a note that are not in `all`, the reason.
@@ -56,11 +62,7 @@ class Meshes:
         self._openings: dict[tuple[str, ...], _Opening] = {}
 
     def __enter__(self) -> Self:
-        """Connect.
-
-        Raises:
-            DeadlineExceeded: an endpoint does not answer.
-        """
+        """Connect, as `look` does."""
         try:
             self.look()
         except BaseException:
@@ -94,7 +96,7 @@ class Meshes:
 
         def wait(left_s: float) -> None:
             # There is no event for a new note. There is one for a token, but a query for it may still have been empty.
-            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _LOOK_S))
+            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _NOTE_CHECK_S))
             changed.clear()
 
         with ExitStack() as stack:
@@ -200,11 +202,7 @@ class Meshes:
         raise _not_running(mesh, running)
 
     def _running(self) -> list[_Found]:
-        """The meshes that were found, at least one.
-
-        Raises:
-            ConfigurationError: there is none.
-        """
+        """The meshes that were found, at least one, or `absence` as an error."""
         if (absence := self.absence) is not None:
             raise absence
         return self._found
@@ -248,16 +246,10 @@ class Meshes:
 
 
 class _Opening:
-    """A session in client mode that is opened when it is needed.
+    """A session in client mode that is opened when it is needed; ``else_`` is the message if it is not open in time."""
 
-    It is opened on its own thread, so several can be opened at the same time. `session` waits for that thread shortly
-    beyond the deadline, because a process that ends while the thread is inside Zenoh may abort.
-
-    Args:
-        endpoints: where to connect.
-        else_: the message if it is not open in time.
-        timeout_s: time limit from `start` on, in s.
-    """
+    # It is opened on its own thread, so several can be opened at the same time. `session` waits for that thread shortly
+    # beyond the deadline, because a process that ends while the thread is inside Zenoh may abort.
 
     def __init__(self, endpoints: Sequence[str], else_: str, timeout_s: float) -> None:
         self._endpoints = tuple(endpoints)
@@ -275,11 +267,7 @@ class _Opening:
         return self._opened
 
     def session(self) -> zenoh.Session:
-        """Wait until the session is open, and return it.
-
-        Raises:
-            FmuMeshError: it cannot be opened, or not in time.
-        """
+        """Wait until the session is open; an error if it cannot be opened, or not in time."""
         opened = self.start()
         try:
             return opened.result(max(0.0, self._end + _GRACE_S - time.monotonic()))
@@ -320,10 +308,8 @@ class _Found(NamedTuple):
 
 
 def _means(keys: Keys, reference: str) -> bool:
-    """Whether a reference means this mesh."""
-    if reference in (keys.mesh, keys.root) or (
-        reference.startswith(f"{keys.mesh}/") and not reference.startswith(f"{keys.prefix}/")
-    ):
+    is_within = reference.startswith(f"{keys.mesh}/") and not reference.startswith(f"{keys.prefix}/")
+    if is_within or reference in (keys.mesh, keys.root):
         return True
     return is_key(reference, keys) and key_expression(reference).intersects(zenoh.KeyExpr(f"{keys.root}/**"))
 
@@ -341,10 +327,6 @@ def _not_running(reference: str, running: Sequence[_Found]) -> ConfigurationErro
     first = reference.partition("/")[0]
     if "/" in reference and not any(reference.startswith(f"{found.keys.prefix}/") for found in running):
         names = [found.keys.mesh + reference.removeprefix(first) for found in running]
-    suggestion = nearest(reference, names)
-    hint = (
-        f"Did you mean '{suggestion}'?"
-        if suggestion is not None
-        else f"Running: {listed([found.keys.mesh for found in running])}."
-    )
+    near = nearest(reference, names)
+    hint = f"Did you mean '{near}'?" if near else f"Running: {listed([found.keys.mesh for found in running])}."
     return ConfigurationError(f"no mesh '{reference}' is running.", hint=hint)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 import msgspec
@@ -15,10 +15,12 @@ from ..messages import decode_json
 from ..values import Stamp
 from ..views import VariableView
 
-__all__ = ["Reading", "Target", "latecomers", "reading_of"]
+__all__ = ["Reading", "Target", "latecomers", "reading_among", "reading_of"]
 
 _LOOKS = 5
-_LOOK_S = 0.05
+# Five times this without a sample is the end. Each is a turn of this process, so one that had no processor for a while
+# does not take its own pause for the end.
+_LATE_SAMPLE_S = 0.05
 
 Item = TypeVar("Item")
 
@@ -61,6 +63,12 @@ def reading_of(target: Target, sample: zenoh.Sample) -> Reading | None:
     return Reading(target.key, target.instance, view.name, value, stamp.point, stamp.time, view.unit)
 
 
+def reading_among(targets: Mapping[str, Target], sample: zenoh.Sample) -> Reading | None:
+    """As `reading_of`, for the target with the key of the sample; None if there is none."""
+    target = targets.get(str(sample.key_expr))
+    return reading_of(target, sample) if target is not None else None
+
+
 def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
     """The samples that arrive after the master's token has gone, until none has arrived for a quarter of a second.
 
@@ -71,7 +79,7 @@ def latecomers(arrived: queue.SimpleQueue[Item]) -> Iterator[Item]:
     looks = 0
     while looks < _LOOKS:
         try:
-            item = arrived.get(timeout=_LOOK_S)
+            item = arrived.get(timeout=_LATE_SAMPLE_S)
         except queue.Empty:
             looks += 1
         else:

@@ -1,20 +1,25 @@
-"""Waits until a mesh has paused, or is in a state; the mesh may start later."""
+"""Waits until a mesh has paused, is at a point, or is in a state; the mesh may start later."""
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Final
 
 from msgspec.structs import replace
 
-from ...errors import DeadlineExceeded, FmuMeshError, MeshLost, from_report
+from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
 from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .reaching import Meshes
 
-__all__ = ["appearance", "rest", "wait_for", "wait_for_start"]
+__all__ = ["appearance", "go_on", "paused_at", "rest", "wait_for", "wait_for_start", "wait_until_at"]
 
 _START_S: Final = 120.0
+
+# A short step ends within a millisecond; a question costs the node about as much, so each wait is twice the last one.
+_FIRST_ASK_S = 0.001
+_LONGEST_ASK_S = 0.05
 
 _RANKS: Final[dict[MeshState, int]] = {
     "starting": 0,
@@ -52,6 +57,50 @@ def rest(client: MeshClient, command: Command) -> CommandAnswer:
             text = f"mesh '{mesh}' is at point {at}, on its way to point {answer.hold}, where it is going to rest."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
     raise _gone(mesh, what)
+
+
+def paused_at(client: MeshClient, command: Command) -> int:
+    """Give a command that pauses the mesh; returns the point at which it will be paused.
+
+    Raises:
+        ConfigurationError: the mesh refuses, or does not say it.
+    """
+    hold = client.command(command).hold
+    if hold is None:
+        raise ConfigurationError("the mesh does not say where it pauses.", hint="Is it another version of fmu_mesh?")
+    return hold
+
+
+def go_on(client: MeshClient, hold: int, point: int) -> int:
+    """Let the mesh run from the point at which it is or will be paused to a later one; returns that point.
+
+    Raises:
+        ConfigurationError: the mesh refuses.
+        MeshLost: another program controls the mesh too.
+    """
+    if point > hold and paused_at(client, Command("step", point - hold)) != point:
+        raise MeshLost(f"the mesh runs to another point than {point}: another program controls it too.")
+    return max(point, hold)
+
+
+def wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: float) -> None:
+    """Wait until an instance is paused at ``point``, one of its own.
+
+    Raises:
+        DeadlineExceeded: it stays at another point for ``timeout_s`` seconds.
+    """
+    never = threading.Event()
+    look, reached, moved = _FIRST_ASK_S, -1, time.monotonic()
+    while (status := client.instance_status(instance)).point != point:
+        now = time.monotonic()
+        if status.point != reached:
+            look, reached, moved = _FIRST_ASK_S, status.point, now
+        if now - moved > timeout_s:
+            raise DeadlineExceeded(
+                f"it does not reach point {point}: {status.activity}.", instance=instance, point=reached
+            )
+        never.wait(look)
+        look = min(2 * look, _LONGEST_ASK_S)
 
 
 def appearance(meshes: Meshes, mesh: str | None, timeout_s: float) -> MeshClient:
@@ -103,18 +152,14 @@ def wait_for(client: MeshClient, state: MeshState, timeout_s: float) -> MeshStat
             for last in statuses:
                 if last.state == state:
                     return last
-                if not _can_become(last.state, state):
+                before, then = _RANKS[last.state], _RANKS[state]
+                if not (before < then or before == then == _GOES_AND_RESTS):
                     raise _ended(last, f"become {state}")
         except DeadlineExceeded:
             now = last.state if last is not None else "silent"
             text = f"mesh '{mesh}' is {now}, and was not {state} in time."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
     raise _gone(mesh, f"become {state}")
-
-
-def _can_become(state: MeshState, wanted: MeshState) -> bool:
-    """Whether a mesh can change from one state to another."""
-    return _RANKS[wanted] > _RANKS[state] or _RANKS[wanted] == _RANKS[state] == _GOES_AND_RESTS
 
 
 def _ended(status: MeshStatus, what: str) -> FmuMeshError:

@@ -92,7 +92,7 @@ class NativeInstance(FmuInstance):
         """Let `do_step` itself raise `NotFinite` for these floats of its row; whether it does."""
         if self._member is None:
             return False
-        self._member.check_rows(spans)
+        self._member.give(finite=spans)
         return True
 
     def finish(self, step: int, outcome: int) -> None:
@@ -151,15 +151,7 @@ class NativeInstance(FmuInstance):
     def _table(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
         """The member that takes the steps in this process."""
         own = [OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs]
-        return MemberTable(
-            loads=native.table(Move, tables.loads),
-            setters=native.table(native.Call, tables.setters),
-            getters=native.table(native.Call, tables.getters),
-            stores=native.table(Move, tables.stores),
-            n_loads=len(tables.loads),
-            n_setters=len(tables.setters),
-            n_getters=len(tables.getters),
-            n_stores=len(tables.stores),
+        member = MemberTable(
             kind=tables.kind,
             component=tables.component,
             do_step=tables.do_step,
@@ -171,6 +163,8 @@ class NativeInstance(FmuInstance):
             outputs=(OutputTable * 2)(*own),
             bases=(ctypes.c_void_p * native.RowBase.FIRST_GATE)(),
         )
+        member.give(loads=tables.loads, setters=tables.setters, getters=tables.getters, stores=tables.stores)
+        return member
 
     def _fail_to_set(self, step: int, status: int) -> None:
         """Raise the error for inputs that the library could not set."""

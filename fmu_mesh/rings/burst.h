@@ -1,0 +1,163 @@
+/* The tables of the burst: this is the only list of their fields. `burst.c` includes it, and `native.py` reads it with
+ * expressions of a few lines, because a parser of C takes 40 ms at each start of a process. So it is written plainly: each
+ * structure as `typedef struct { ... } Name;` with one statement for each type, and no macros. An array `things` has its
+ * length beside it, `n_things`; any other pointer is only an address for Python. */
+#ifndef FMU_MESH_BURST_H
+#define FMU_MESH_BURST_H
+
+#include <stdint.h>
+
+/* ---- shared memory: `burst.c` has what is in it, for Python these are addresses */
+
+typedef struct Counter Counter;
+typedef struct Bell Bell;
+
+typedef struct { /* which process this is among those of the memory */
+  Bell *bells;
+  int64_t processes, own;
+} Place;
+
+typedef struct { /* one value that somebody waits for */
+  Counter *counter;
+  int64_t need;
+} Wish;
+
+/* ---- one instance */
+
+enum StepKind { BY_PYTHON, FMI1, FMI2, FMI3 };                             /* Member.kind */
+enum Stage { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };    /* Member.stage */
+enum RowBase { FIXED, OUTPUT, WATCHED, FIRST_GATE };                       /* what an offset is relative to: see Move */
+enum Change { UNCHANGED, SCALED, LOOKED_UP };                              /* Move.change */
+enum NumberType { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH }; /* Move.from_type, Move.to_type, Span.type */
+
+typedef struct { /* the rows of one source, for one delay */
+  Counter *counter;
+  const char *rows;
+  int64_t stride, mask;
+  int64_t lead;   /* see system/coupling_rule.py */
+  int64_t points; /* base points per step of the source */
+  int64_t known;  /* the counter when it was last read */
+} Gate;
+
+typedef struct { /* a value of the source, and what the target gets instead; large: see as_integer */
+  int64_t from, to;
+  int32_t from_large, to_large;
+} Entry;
+
+typedef struct { /* the map of a connection, and the items of its input; both in ascending order */
+  const Entry *entries;
+  const int64_t *items;
+  int64_t n_entries, n_items; /* without items: the input can be each number of its type */
+} Lookup;
+
+typedef struct { /* values that are copied; of FIXED, an offset is an address */
+  int64_t from_base, from, to_base, to;
+  int64_t count;
+  int32_t from_type, to_type, change;
+  int32_t negated; /* an alias of FMI 1.0 with the opposite sign */
+  double factor, offset;
+  const Lookup *lookup;
+} Move;
+
+typedef struct { /* a getter or a setter */
+  void *function;
+  const void *references;
+  int64_t count;
+  int64_t base, values;
+  int64_t size; /* number of values for FMI 3.0; otherwise -1 */
+} Call;
+
+typedef struct { /* a ring that a member writes */
+  char *rows;
+  int64_t stride, mask;
+} Output;
+
+typedef struct { /* floats of a row that have to be finite */
+  int64_t place; /* in the row, in bytes */
+  int64_t count;
+  int64_t type; /* F64 or F32 */
+} Span;
+
+typedef struct { /* what a model says in a step besides its status, and how far it is: Python looks at it between steps */
+  uint8_t event_needed, terminate, early; /* FMI 3.0, 4.2.1: not 0 if it is so */
+  int32_t call;       /* the getter or setter that returned a status above warning */
+  double last_time;   /* of an early return (FMI 3.0), in s */
+  double quiet_until; /* a step that ends at this time or later is taken by Python */
+  double time;        /* of the model; only after a step without anything special */
+  int64_t step;       /* own steps done */
+} Said;
+
+typedef struct { /* an input with a value for each own step that the burst takes before python_at */
+  const double *values;
+  double *to; /* in the row of inputs */
+} Track;
+
+typedef struct { /* one instance: how it gets its inputs, steps, and gives its outputs */
+  Gate *gates;
+  Move *loads;  /* from the rows of the sources into the row of inputs, and from there into buffers */
+  Call *setters;
+  Call *getters;
+  Move *stores; /* from buffers into the own row */
+  int64_t n_gates, n_loads, n_setters, n_getters, n_stores;
+  int64_t kind;
+  void *component, *do_step;
+  Said *said; /* of an FMU */
+  double start_time, base_step_size, step_size;
+  int64_t points; /* base points per own step */
+  int64_t every;  /* ticks of the unit per own step */
+  int64_t last_step;
+  int64_t python_at; /* the first own step that Python takes, whatever its kind */
+  Track *tracks;
+  int64_t n_tracks;
+  int64_t tracks_from; /* the own step of their first values */
+  Span *finite;
+  int64_t n_finite;
+  Output outputs[2]; /* the own ring; and outputs that somebody watches */
+  Counter *counter;  /* rows of the own ring */
+  char **bases;      /* room for the rows of the gates */
+  int64_t step, stage;
+  int64_t outcome;   /* stage and status of a call that Python has to look at */
+} Member;
+
+/* ---- a node */
+
+typedef struct { /* members that step together, tick by tick: a tick of a single member is its own step */
+  Member *members;
+  int64_t n_members;
+  int64_t tick_points, last_tick, tick;
+  int64_t next; /* the member that steps next within the tick */
+  int64_t burst; /* how many ticks it may take in one turn: about a slice of time */
+  int64_t stopped, spent_ns;
+  Counter *blocked_by; /* whom it waits for, and the value that it needs */
+  int64_t need;
+} Unit;
+
+typedef struct { /* a process that may be some points behind, and no more */
+  Counter *progress;
+  int64_t window;
+} Peer;
+
+typedef struct { /* all units of a process */
+  Place place;
+  Unit *units;
+  int64_t n_units;
+  Peer *peers;
+  int64_t n_peers;
+  Counter *ceiling;  /* the grant of the master */
+  Counter *progress; /* of this node */
+  int64_t last_point, slice_ns;
+  int64_t wait_ns;   /* how long to sleep where nothing can step */
+  int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
+  int64_t spins;     /* whether it spins before it sleeps */
+  int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
+  int64_t stride;    /* how many it sleeps for now */
+  int64_t allowed, patience, waited_ns;
+  int64_t restored;  /* how often a model had changed the floating-point mode */
+  int64_t late;      /* sleeps that ended by their time limit although the value was there: lost wake-ups */
+  int64_t unit, member; /* whom the result is about */
+  _Atomic int64_t attention; /* Python has something to do */
+} Node;
+
+enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* why node_run returns */
+
+#endif
