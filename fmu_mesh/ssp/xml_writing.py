@@ -1,4 +1,4 @@
-"""XML of SSP as it is written: elements, numbers, units and our annotation.
+"""XML of SSP as it is written: elements, numbers, units and our annotation, also in a document of another tool.
 
 Owns how values become text. Which elements stand for what is `ssd_writing`.
 """
@@ -7,19 +7,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from lxml import etree
 
+from ..archives.safe_xml import safe_xml
 from ..variables.units import BaseUnit
 from .grammar import NAMESPACES
 from .own_annotation import ANNOTATION_ELEMENT, ANNOTATION_TYPE
 
-__all__ = ["XmlNode", "annotations_element", "child", "is_xml_text", "number_text", "tag_of", "write_units"]
+__all__ = [
+    "XmlNode",
+    "annotations_element",
+    "child",
+    "is_xml_text",
+    "number_text",
+    "own_annotation_in",
+    "tag_of",
+    "with_own_annotation",
+    "write_units",
+]
 
 XmlNode = Any
 """An element of lxml, which ships no types."""
+
+_OWN: Final = f"ssd:System/ssd:Annotations/ssc:Annotation[@type='{ANNOTATION_TYPE}']"
+"""The path of our annotation in a description."""
 
 
 def number_text(value: float) -> str:
@@ -57,6 +71,32 @@ def annotations_element(text: str) -> XmlNode:
     namespace = etree.QName(ANNOTATION_ELEMENT).namespace
     etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text = text
     return parent
+
+
+def own_annotation_in(document: bytes) -> str | None:
+    """The text of our annotation in a system structure description; None if the root system has none."""
+    element = safe_xml(document, "the description").find(f"{_OWN}/*", NAMESPACES)
+    return None if element is None else element.text or ""
+
+
+def with_own_annotation(document: bytes, text: str | None) -> bytes:
+    """A system structure description with another text of our annotation; None: without an annotation of ours.
+
+    The document is written again, and says the same as before: elements, attributes, comments and the blanks between
+    them stay, also those of other tools. Quotes, character references and blanks inside of tags may change.
+    """
+    root = safe_xml(document, "the description")
+    for old in root.findall(_OWN, NAMESPACES):
+        old.getparent().remove(old)
+    if text is not None:
+        made, system = annotations_element(text), root.find("ssd:System", NAMESPACES)
+        there = system.find("ssd:Annotations", NAMESPACES)
+        if there is None:
+            system.append(made)
+        else:
+            there.append(made[0])
+    tree = root.getroottree()
+    return bytes(etree.tostring(tree, encoding=tree.docinfo.encoding or "UTF-8", xml_declaration=True))
 
 
 def is_xml_text(text: str) -> bool:
