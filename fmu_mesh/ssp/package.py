@@ -18,19 +18,22 @@ from urllib.parse import unquote
 
 from .. import files
 from ..archives.archive_entries import LIMITS_HINT
-from ..config.mesh import LimitsConfig
+from ..config.mesh import LimitsConfig, RecordConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import OpenFmu, opened
 from ..text import listed, nearest, nearest_file
 from .problems import Problems
 from .system_structure import FilePlace
 
-__all__ = ["ARCHIVE", "DEFAULT", "Package", "beginning", "is_package"]
+__all__ = ["ARCHIVE", "DEFAULT", "RESULT_BESIDE_PACKAGE", "Package", "beginning", "is_package"]
 
 ARCHIVE: Final = b"PK\x03\x04"
 """The first bytes of a ZIP archive with at least one file."""
 
 DEFAULT: Final = "SystemStructure.ssd"
+RESULT_BESIDE_PACKAGE: Final = f"../{RecordConfig().file}"
+"""The result file of a package that says none: beside the archive, and not in it."""
+
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 _SUFFIXES: Final = (".ssp", ".ssd")
 

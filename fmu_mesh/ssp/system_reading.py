@@ -24,11 +24,10 @@ from ..system.graph import feedback_edges, fewest_feedback_edges
 from ..text import listed, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable
 from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
-from .configuration_files import RESULT_BESIDE_PACKAGE
 from .flattening import FlatConnection, FlatValue, flatten
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
-from .package import DEFAULT, Package
+from .package import DEFAULT, RESULT_BESIDE_PACKAGE, Package
 from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure, read_values

@@ -16,7 +16,8 @@ from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, placed
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
-from ..variables.value_conversion import to_plain
+from ..variables.model_description import Variable
+from ..variables.value_conversion import ValueRefused, to_plain
 from ..variables.value_types import PlainValue, is_float
 from .digest import digest_of
 from .execution_order import execution_order
@@ -27,6 +28,7 @@ from .linear_inputs import LinearInput
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
+from .start_values import why_not_settable
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import batch_of, recorder_window, rows_of_ring, window_of
 
@@ -75,6 +77,20 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def input_row(self) -> Layout:
         """The inputs that are set in every step."""
         return self.row if self.row is not None else self.inputs
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """The source instance of each input that is connected, or of which an element is."""
+        return {self.inputs.column(own.target).name: feed.source for feed in self.feeds for own in feed.columns}
+
+    def check_settable(self, variable: Variable) -> None:
+        """Check that a variable may be set between two steps.
+
+        Raises:
+            ValueRefused: it may not; the message is the predicate of a sentence whose subject is the variable.
+        """
+        if (why := why_not_settable(variable, self.sources.get(variable.name))) is not None:
+            raise ValueRefused(why)
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

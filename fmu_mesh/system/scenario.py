@@ -26,7 +26,7 @@ from ..variables.value_types import PlainValue, is_float
 from .connections import Variables, offered, resolve_variable
 from .schedule import Course, Schedule, SeriesFile
 from .series_files import SeriesRefused, columns_of, content_of, course_of, read_series
-from .settable import why_not_settable
+from .start_values import why_not_settable
 
 __all__ = [
     "BAG_STAMP_S",
