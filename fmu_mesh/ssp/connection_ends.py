@@ -11,9 +11,9 @@ from typing import Final, Literal
 
 import msgspec
 
-from ..text import listed, nearest
+from ..text import listed
 from ..variables.model_description import ModelDescription, Variable
-from ..variables.value_types import element_name
+from ..variables.value_types import FMI2_TYPES, element_name
 from .problems import Problems
 from .system_structure import Connector, StructureComponent, StructureConnection, StructureSystem, Unit
 
@@ -46,9 +46,6 @@ _OUT_OF_THE_SYSTEM: Final[dict[tuple[_Owner, str], tuple[str, ...]]] = {
     ("element", "inout"): ("output", "local"),
 }
 """By owner and kind of the source: the kinds that a destination may have (SSP 2.0, 5.3.2.1)."""
-
-_TYPES: Final = {"Real": "Float64", "Integer": "Int32"}
-"""The types of SSP 1.0 in the words of FMI 3.0."""
 
 
 class ConnectionEnd(msgspec.Struct, frozen=True):
@@ -86,13 +83,7 @@ class Segment(msgspec.Struct, frozen=True):
 
 
 class ConnectionEnds:
-    """Finds the two ends of connections.
-
-    Args:
-        describe: the model descriptions.
-        problems: collects what is wrong.
-        units: of connectors of systems that have none of their own.
-    """
+    """Finds the two ends of connections; ``units`` are those of connectors of systems that have none of their own."""
 
     def __init__(self, describe: Describe, problems: Problems, units: Mapping[tuple[Path, str], Unit]) -> None:
         self._describe = describe
@@ -125,7 +116,7 @@ class ConnectionEnds:
             if connector.kind not in (has, variable.causality, "unspecified", None) and not old:
                 found = f"the kind '{connector.kind}', while the variable of the FMU is of causality '{has}'"
                 self._problems.add(connector.place, found, f"the kind '{has}'")
-            type_ = _TYPES.get(connector.type or "", connector.type)
+            type_ = FMI2_TYPES.get(connector.type or "", connector.type)
             if type_ not in (None, variable.type):
                 found = f"the type {connector.type}, while the FMU has {variable.type_name}, which counts"
                 self._problems.warn(connector.place, found)
@@ -167,10 +158,8 @@ class ConnectionEnds:
             return self._of_system(system, path, name, index, connection, "system")
         element = next((one for one in system.elements if one.name == element_named), None)
         if element is None:
-            names = [one.name for one in system.elements]
             found = f"the unknown element '{element_named}' of the system '{system.name}'"
-            near = nearest(element_named, names)
-            self._problems.add(connection.place, found, f"one of {listed(names)}", near)
+            self._problems.unknown(connection.place, found, element_named, [one.name for one in system.elements])
             return None
         own = (*path, element.name)
         if not name or (isinstance(element, StructureSystem) and not element.is_known):
@@ -192,9 +181,8 @@ class ConnectionEnds:
         if not name:
             return None  # there is a finding
         if connector is None:
-            names = [one.name for one in system.connectors]
             found = f"the unknown connector '{name}' of the system '{system.name}'"
-            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
+            self._problems.unknown(connection.place, found, name, [one.name for one in system.connectors])
             return None
         if index:
             expected = "the whole array, or elements of the arrays of components only"
@@ -214,29 +202,22 @@ class ConnectionEnds:
         connector = next((one for one in component.connectors if one.name == name), None)
         description = self._describe(path)
         variable = description.variable_of(name) if description is not None else None
-        if connector is None and (variable is not None or description is None):
-            found = f"'{component.name}' has no connector '{name}'"
-            if description is None:
-                names = [one.name for one in component.connectors]
-                self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
-                return None
-            self._problems.warn(connection.place, f"{found}; the variable of its FMU is taken")
-        elif connector is None:
-            names = [one.name for one in component.connectors]
+        if connector is None and variable is None:
             found = f"the unknown connector '{name}' of '{component.name}'"
-            self._problems.add(connection.place, found, f"one of {listed(names)}", nearest(name, names))
+            if description is None:
+                found = f"'{component.name}' has no connector '{name}'"
+            self._problems.unknown(connection.place, found, name, [one.name for one in component.connectors])
             return None
+        if connector is None:
+            found = f"'{component.name}' has no connector '{name}'; the variable of its FMU is taken"
+            self._problems.warn(connection.place, found)
         elif description is not None and variable is None:
-            names = [one.name for one in description.variables]
-            found, near = (
-                f"the variable '{name}', which the FMU of '{component.name}' does not have",
-                nearest(name, names),
-            )
-            expected = f"one of {listed(names)}"
             if name in (clock.name for clock in description.clocks):
-                found, near = f"the clock '{name}' of '{component.name}'", None
                 expected = "no connection: a clock of an FMU ticks by itself"
-            self._problems.add(connection.place, found, expected, near)
+                self._problems.add(connection.place, f"the clock '{name}' of '{component.name}'", expected)
+            else:
+                found = f"the variable '{name}', which the FMU of '{component.name}' does not have"
+                self._problems.unknown(connection.place, found, name, [one.name for one in description.variables])
             return None
         kind: str | None = connector.kind if connector is not None else None
         if kind in (None, "unspecified") and variable is not None:

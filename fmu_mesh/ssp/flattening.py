@@ -16,12 +16,7 @@ import msgspec
 from ..variables.units import Linear, conversion
 from .connection_ends import ConnectionEnd, ConnectionEnds, Describe, Segment
 from .problems import Problems
-from .system_structure import (
-    FilePlace,
-    StructureSystem,
-    Transformation,
-    Unit,
-)
+from .system_structure import FilePlace, StructureSystem, Transformation, Unit
 
 __all__ = ["FlatConnection", "FlatValue", "PathChange", "flatten"]
 
@@ -80,11 +75,8 @@ def flatten(
 ) -> tuple[list[FlatConnection], list[FlatValue]]:
     """The connections between all components of a system, and what unconnected connectors of systems lead to.
 
-    Args:
-        system: the root system.
-        describe: the model descriptions.
-        problems: collects what is wrong; the result has the rest.
-        units: the units of values that parameter bindings give to connectors of systems without a unit of their own.
+    Of what is wrong there is a finding, and the result has the rest. The ``units`` are those of values that parameter
+    bindings give to connectors of systems without a unit of their own.
     """
     flattening = _Flattening(describe, problems, units)
     flattening.collect(system, ())

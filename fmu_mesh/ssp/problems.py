@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 
 from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
-from ..text import printable
+from ..text import listed, nearest, printable
 from .system_structure import FilePlace
 
 __all__ = ["Problems"]
@@ -30,6 +30,11 @@ class Problems:
         """Add a finding: there is ``found`` instead of ``expected``."""
         self._add(self.findings, _finding(place, found, expected, suggestion))
 
+    def unknown(self, place: FilePlace, found: str, name: str, names: Iterable[str]) -> None:
+        """Add a finding about a ``name`` that is none of ``names``; suggests the nearest one."""
+        known = [*names]
+        self.add(place, found, f"one of {listed(known)}", nearest(name, known))
+
     def warn(self, place: FilePlace, found: str, expected: str = "") -> None:
         """Add a warning."""
         self._add(self.warnings, _finding(place, found, expected))
@@ -37,11 +42,7 @@ class Problems:
     def warn_once(self, like: Hashable, place: FilePlace, found: str, what: str) -> None:
         """Add a warning, or let the first one of its kind say how many others there are.
 
-        Args:
-            like: equal for all warnings of one kind.
-            place: where it is.
-            found: what there is.
-            what: the warnings of this kind are about, such as `value`.
+        The warnings of one kind have equal values of ``like``, and are about ``what``, such as `value`.
         """
         finding = _finding(place, found)
         index, alike = self._alike.setdefault(like, (len(self.warnings), []))

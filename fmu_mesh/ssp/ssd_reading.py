@@ -58,16 +58,7 @@ _MAXIMUM_NESTED: Final = 1000
 
 
 def read_structure(package: Package, name: str, problems: Problems) -> Structure | None:
-    """Read one system structure description of a package.
-
-    Args:
-        package: the package.
-        name: the file in it.
-        problems: collects what is wrong.
-
-    Returns:
-        The description with everything in it that is right; None if there is nothing to go on with.
-    """
+    """A system structure description of a package with everything in it that is right; None if there is nothing."""
     return _Reader(package, problems).structure(name, 0)
 
 
@@ -85,12 +76,9 @@ class _File(NamedTuple):
 
 
 def read_values(package: Package, name: str, problems: Problems) -> Binding | None:
-    """The values of an SSV file as a binding without a mapping; None after a finding.
+    """The values of an SSV file, in the package or else on the disk, as a binding without a mapping.
 
-    Args:
-        package: where the file is looked for first.
-        name: of the file in the package, or else its path on the disk.
-        problems: collects what is wrong in it.
+    None after a finding.
 
     Raises:
         ConfigurationError: there is no such file, or it cannot be read.
@@ -278,8 +266,7 @@ class _Reader:
         place, unit, enumeration, name = element.place, None, None, None
         if type_ is not None:
             name = type_.tag.partition(":")[2]
-            written = type_.get("unit")
-            unit = unit_named(written, file.units) if written is not None else None
+            unit = unit_named(type_.get("unit"), file.units)
             if name == "Enumeration" and (wanted := type_.text("name")):
                 enumeration = enumeration_named(wanted, file.enumerations, place, self._problems)
             if name == "Binary" and (type_.get("mime-type") or "").startswith(_MODELICA):
