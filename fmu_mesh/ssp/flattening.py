@@ -18,7 +18,7 @@ from .connection_ends import ConnectionEnd, ConnectionEnds, Describe, Segment
 from .problems import Problems
 from .system_structure import FilePlace, StructureSystem, Transformation, Unit
 
-__all__ = ["FlatConnection", "FlatValue", "PathChange", "flatten"]
+__all__ = ["FlatConnection", "PathChange", "flatten"]
 
 Path = tuple[str, ...]
 
@@ -40,28 +40,15 @@ class PathChange(msgspec.Struct, frozen=True):
 
 
 class FlatConnection(msgspec.Struct, frozen=True):
-    """A connection between variables of two components.
+    """A connection to a variable of a component.
 
     Attributes:
-        source: path of the component, and the variable or an element of it as `y[2]`; ``target`` likewise.
+        source: path of the component, and the variable or an element of it as `y[2]`; ``target`` likewise. Or path of a
+            system, and a connector of it that nothing is connected to.
         place: of the connection that ends at the target.
     """
 
     source: tuple[Path, str]
-    target: tuple[Path, str]
-    change: PathChange
-    place: FilePlace
-
-
-class FlatValue(msgspec.Struct, frozen=True):
-    """A connector of a system that nothing is connected to gives its value to a variable of a component.
-
-    Attributes:
-        connector: path of the system, and the connector.
-        unit: of the connector; None if it has none of its own: then ``change`` has no conversion.
-    """
-
-    connector: tuple[Path, str]
     target: tuple[Path, str]
     change: PathChange
     place: FilePlace
@@ -72,7 +59,7 @@ def flatten(
     describe: Describe,
     problems: Problems,
     units: Mapping[tuple[Path, str], Unit] = MappingProxyType({}),
-) -> tuple[list[FlatConnection], list[FlatValue]]:
+) -> tuple[list[FlatConnection], list[FlatConnection]]:
     """The connections between all components of a system, and what unconnected connectors of systems lead to.
 
     Of what is wrong there is a finding, and the result has the rest. The ``units`` are those of values that parameter
@@ -109,28 +96,19 @@ class _Flattening:
                 continue
             self._inbound[segment.target.node] = segment
 
-    def result(self) -> tuple[list[FlatConnection], list[FlatValue]]:
-        """All connections to components, in the order of the documents."""
-        connections: list[tuple[list[int], FlatConnection]] = []
-        values: list[tuple[list[int], FlatValue]] = []
+    def result(self) -> tuple[list[FlatConnection], list[FlatConnection]]:
+        """All connections to components from components, and from systems, both in the order of the documents."""
+        found: list[tuple[list[int], bool, FlatConnection]] = []
         for segment in self._inbound.values():
-            if not segment.target.is_component:
-                continue
-            segments = self._way_to(segment)
-            if segments is None:
+            segments = self._way_to(segment) if segment.target.is_component else None
+            change = self._change(segments) if segments is not None else None
+            if segments is None or change is None:
                 continue
             order = sorted((one.connection.number for one in segments), reverse=True)
             source, target, place = segments[0].source, segment.target, segment.connection.place
-            change = self._change(segments)
-            if change is None:
-                continue
-            if source.is_component:
-                connections.append((order, FlatConnection(source.node, target.node, change, place)))
-            else:
-                values.append((order, FlatValue(source.node, target.node, change, place)))
-        connections.sort(key=lambda one: one[0])
-        values.sort(key=lambda one: one[0])
-        return [one for _, one in connections], [one for _, one in values]
+            found.append((order, source.is_component, FlatConnection(source.node, target.node, change, place)))
+        found.sort(key=lambda one: one[0])
+        return [one for _, between, one in found if between], [one for _, between, one in found if not between]
 
     # --- ways
 
@@ -178,7 +156,7 @@ class _Flattening:
             found = f"a mapping and a factor or a unit conversion on the way from '{source}' to '{target}'"
             self._problems.add(mapping.place, found, "one of the two")
             return None
-        entries = _entries(mapping) if mapping is not None else {}
+        entries = {one.source: one.target for one in mapping.entries} if mapping is not None else {}
         if mapping is None and _by_variables(source, target, own, relative=relative) == total:
             return PathChange(own, place=place)
         return PathChange(total, entries, ignore_units=mapping is None, place=place)
@@ -213,15 +191,3 @@ def _by_variables(source: ConnectionEnd, target: ConnectionEnd, own: Linear, *, 
         return own
     change = conversion(have.base_unit, want.base_unit, relative=relative)
     return change.then(own) if change is not None else None
-
-
-def _entries(mapping: Transformation) -> dict[str, str]:
-    """The entries of a mapping as a configuration has them."""
-    match mapping.kind:
-        case "boolean":
-            words = {"1": "true", "0": "false"}
-            return {words.get(one.source, one.source): words.get(one.target, one.target) for one in mapping.entries}
-        case "integer":
-            return {str(int(one.source)): str(int(one.target)) for one in mapping.entries}
-        case _:
-            return {one.source: one.target for one in mapping.entries}

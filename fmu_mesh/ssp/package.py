@@ -64,7 +64,6 @@ class Package:
         is_ssd = path.suffix.lower() == ".ssd" and not files.is_folder(path)
         self.root = path.parent if is_ssd else path
         self.given = path.name if is_ssd else ""
-        self._shown = path.parent if is_ssd else path
         self._open = ExitStack()
         self._containers: dict[str, OpenFmu] = {}
         if is_ssd and not files.is_file(path):
@@ -98,7 +97,7 @@ class Package:
 
     def shown(self, name: str) -> str:
         """A file as messages name it."""
-        return str(self._shown / name)
+        return str(self.root / name)
 
     def exists(self, name: str) -> bool:
         """Whether there is a file of this name."""
@@ -117,7 +116,7 @@ class Package:
         if owner is None:
             near = nearest(name, self.names())
             hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(self.names())}."
-            raise ConfigurationError(f"'{self._shown}' has no file '{name}'", hint=hint)
+            raise ConfigurationError(f"'{self.root}' has no file '{name}'", hint=hint)
         try:
             if owner[1].startswith("../"):
                 return self.read_beside(self.root / owner[1])
@@ -134,7 +133,7 @@ class Package:
         if not files.is_file(path):
             near = nearest(str(path), self.names()) or nearest_file(path)
             hint = f"Did you mean '{near}'?" if near is not None else None
-            raise ConfigurationError(f"'{path}': there is no such file, nor is it in '{self._shown}'", hint=hint)
+            raise ConfigurationError(f"'{path}': there is no such file, nor is it in '{self.root}'", hint=hint)
         try:
             size, limit = path.stat().st_size, LimitsConfig().description_bytes
             if size > limit:

@@ -19,7 +19,7 @@ from ..system.value_map import map_words
 from ..variables.model_description import Kind, ModelDescription, Value, Variable
 from ..variables.units import BaseUnit
 from ..variables.value_conversion import to_value
-from ..variables.value_types import flattened
+from ..variables.value_types import FMI2_TYPES, flattened
 from .grammar import NAMESPACES
 from .xml_writing import XmlNode, annotations_element, child, is_xml_text, number_text, tag_of, write_units
 
@@ -31,14 +31,7 @@ _KINDS_OF_1: Final = ("input", "output", "parameter", "calculatedParameter")
 _KINDS: Final = (*_KINDS_OF_1, "structuralParameter")
 """The connectors that are written even if nothing uses them."""
 
-_TYPES_OF_1: Final = {
-    "Float64": "Real",
-    "Int32": "Integer",
-    "Boolean": "Boolean",
-    "String": "String",
-    "Enumeration": "Enumeration",
-    "Binary": "Binary",
-}
+_TYPES_OF_1: Final = {**{type_: name for name, type_ in FMI2_TYPES.items()}, "Binary": "Binary"}
 """The names in SSP 1.0 of the types that it has."""
 
 _IMPLEMENTATIONS: Final[dict[Kind, str]] = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
@@ -74,14 +67,9 @@ class NewDocument(NamedTuple):
 def ssd_of(
     system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str | None, findings: Findings
 ) -> NewDocument:
-    """A system structure description.
+    """A system structure description of a mesh whose instances are FMUs, with the text of our annotation.
 
-    Args:
-        system: the mesh; all of its instances are FMUs.
-        names: how the components are called, and where their FMUs are.
-        version: the version of SSP.
-        annotation: the text of our annotation; None: there is none.
-        findings: gets what this version, or no version, can say. Then the document is useless.
+    What this version of SSP, or no version, can say is a finding. Then the document is useless.
     """
     writer = _Writer(system, names, version, findings)
     return NewDocument(writer.document(annotation), writer.units)
@@ -140,11 +128,14 @@ class _Writer:
         component = child(parent, "ssd:Component", name=self._names.elements[name], type=type_, source=source)
         if name in self._names.kinds:
             component.set("implementation", _IMPLEMENTATIONS[self._names.kinds[name]])
-        connected = self._connected(name)
+        connected = {one.source.name for one in self._system.connections if one.source_instance == name}
+        connected |= {one.target.name for one in self._system.connections if one.target_instance == name}
+        # One that is not connected is shown to other tools if they can connect or set it, and it has a type.
         connectors = [
             variable
             for variable in description.variables
-            if variable.name in connected or self._has_connector(variable, start_values)
+            if variable.name in connected
+            or ((variable.causality in _KINDS or variable.name in start_values) and self._is_known(variable))
         ]
         if connectors:
             parent = child(component, "ssd:Connectors")
@@ -153,15 +144,6 @@ class _Writer:
         variables = {variable.name: variable for variable in description.variables}
         if start_values:
             self._binding(component, name, [(variables[key], value) for key, value in start_values.items()])
-
-    def _connected(self, name: str) -> set[str]:
-        """The variables of an instance that are ends of connections."""
-        sources = {one.source.name for one in self._system.connections if one.source_instance == name}
-        return sources | {one.target.name for one in self._system.connections if one.target_instance == name}
-
-    def _has_connector(self, variable: Variable, start_values: Mapping[str, Any]) -> bool:
-        """Whether an unconnected variable is shown to other tools: it can be connected or set, and has a type."""
-        return (variable.causality in _KINDS or variable.name in start_values) and self._is_known(variable)
 
     def _is_known(self, variable: Variable) -> bool:
         """Whether this version of SSP has the kind and the type of a variable."""

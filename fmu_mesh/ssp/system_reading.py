@@ -6,9 +6,10 @@ configuration came from which line.
 
 from __future__ import annotations
 
+import math
 import posixpath
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
@@ -23,15 +24,15 @@ from ..instances.fmi.archive.reading import read_description
 from ..system.graph import feedback_edges, fewest_feedback_edges
 from ..text import listed, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable
-from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
-from .flattening import FlatConnection, FlatValue, flatten
+from .flattening import FlatConnection, flatten
+from .grammar import PATTERNS, number_of
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
 from .package import DEFAULT, RESULT_BESIDE_PACKAGE, Package
 from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure, read_values
-from .system_structure import FilePlace, Structure, StructureComponent, StructureSystem, components_of
+from .system_structure import Annotation, FilePlace, Structure, StructureComponent, StructureSystem, components_of
 
 __all__ = ["NEEDED", "chosen_description", "read_system"]
 
@@ -46,18 +47,23 @@ _KINDS: Final[Mapping[str, Kind]] = {
     "CoSimulation": "co_simulation",
     "ModelExchange": "model_exchange",
 }
-_KNOWN: Final = {OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
+# SSP has no step size and no algorithm. OMSimulator and libcosim write their own, and both exchange values between
+# steps of equal length: all components step with the values of the last communication point, which is `jacobi`.
+_OPEN_MODELICA: Final = "org.openmodelica"
+_OPEN_SIMULATION_PLATFORM: Final = "com.opensimulationplatform"
+_STEP_SIZES: Final = {
+    _OPEN_MODELICA: ("FixedStepMaster", "stepSize"),
+    _OPEN_SIMULATION_PLATFORM: ("FixedStepAlgorithm", "baseStepSize"),
+}
+_HINTS: Final = {_OPEN_SIMULATION_PLATFORM: ("StepSizeHint", "value")}
+_KNOWN: Final = {_OPEN_MODELICA, _OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
 
 
 def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> PlainConfig:
     """Read a package as the values of a configuration.
 
-    What the configuration means is checked with everything else before a run; so are the findings of the package.
-
-    Args:
-        path: an .ssp file, a folder that was one, or an .ssd file.
-        ssd: which description of the package: the name of its file, or the name that it has; None: the default one.
-        ssv: files with values, in the package or else on the disk; each is a last binding of the root system.
+    What the configuration means is checked with everything else before a run; so are the findings of the package. The
+    arguments are those of `read_configuration`; each file with values is a last binding of the root system.
 
     Raises:
         ConfigurationError: there is no such package, description or file with values, or it has no system.
@@ -217,33 +223,31 @@ class _Configuration:
     def _settle(
         self,
         connections: Iterable[FlatConnection],
-        values: Iterable[FlatValue],
+        values: Iterable[FlatConnection],
         of_components: dict[tuple[str, ...], dict[str, AppliedValue]],
         of_systems: Mapping[tuple[tuple[str, ...], str], AppliedValue],
     ) -> None:
         """Give components the values of connectors of systems; a connected variable takes that of the connection."""
         for value in values:
-            applied = of_systems.get(value.connector)
             path, variable = value.target
-            if applied is not None:
-                description = self._describe(path)
-                target = description.variable_of(variable) if description is not None else None
-                given = changed(applied, value.change, target, path, self._problems)
+            if (applied := of_systems.get(value.source)) is not None:
+                given = changed(applied, value.change, self._variable(value.target), path, self._problems)
                 if given is not None:
                     of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
-            bound = of_components.get(path, {}).get(variable)
-            if bound is None or self._is_input(path, variable):
+            bound, target = of_components.get(path, {}).get(variable), self._variable(connection.target)
+            if bound is None or (target is not None and target.causality == "input"):
                 continue  # an input has it before the first value of the connection
             found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
             self._problems.warn(bound.origin, found)
             del of_components[path][variable]
 
-    def _is_input(self, path: tuple[str, ...], name: str) -> bool:
+    def _variable(self, end: tuple[tuple[str, ...], str]) -> Variable | None:
+        """The variable of a component at an end of a connection; None if it is not known."""
+        path, name = end
         description = self._describe(path)
-        variable = description.variable_of(name) if description is not None else None
-        return variable is not None and variable.causality == "input"
+        return description.variable_of(name) if description is not None else None
 
     # --- sections
 
@@ -255,7 +259,7 @@ class _Configuration:
         if structure.stop_time is not None:
             simulation["stop_time"] = structure.stop_time
         before = len(self._problems.findings)
-        found = base_step_size(annotations_of(structure), self._problems)
+        found = _base_step_size(annotations_of(structure), self._problems)
         if len(self._problems.findings) > before:
             self._explained += ("simulation.step_size", "simulation.algorithm")
         if found is not None:
@@ -291,7 +295,7 @@ class _Configuration:
 
     def _step_size(self, component: StructureComponent, simulation: Mapping[str, Plain]) -> float | None:
         """The step size that libcosim takes for a component: a multiple of the base step size, in whole nanoseconds."""
-        hint, base = step_size_hint(component.annotations, self._problems), simulation.get("step_size")
+        hint, base = _step_size_hint(component.annotations, self._problems), simulation.get("step_size")
         if hint is None or not isinstance(base, float):
             return None
         points = max(1, _nanoseconds(hint[0]) // max(1, _nanoseconds(base)))
@@ -305,7 +309,9 @@ class _Configuration:
 
         Nobody has chosen the order in a document. If no other order has fewer delays, it stays.
         """
-        stepped = [one for one in connections if not self._sets_parameter(one)]
+        targets = [self._variable(one.target) for one in connections]
+        pairs = zip(connections, targets, strict=True)
+        stepped = [one for one, target in pairs if target is None or target.causality != "parameter"]
         edges = [(one.source[0], one.target[0], True) for one in stepped]
         paths = dict.fromkeys(path for source, target, _ in edges for path in (source, target))
         fewest = fewest_feedback_edges(paths, edges)
@@ -313,11 +319,6 @@ class _Configuration:
             return connections
         last = {stepped[index].target for index in fewest}
         return sorted(connections, key=lambda one: one.target in last)
-
-    def _sets_parameter(self, connection: FlatConnection) -> bool:
-        description = self._describe(connection.target[0])
-        variable = description.variable_of(connection.target[1]) if description is not None else None
-        return variable is not None and variable.causality == "parameter"
 
     def _connection(self, number: int, connection: FlatConnection) -> dict[str, Plain]:
         """A connection as a configuration has it."""
@@ -333,9 +334,7 @@ class _Configuration:
         if connection.change.ignore_units:
             written["ignore_units"] = True
         if connection.change.mapping:
-            path, name = connection.target
-            description = self._describe(path)
-            target = description.variable_of(name) if description is not None else None
+            target = self._variable(connection.target)
             entries = connection.change.mapping.items()
             written["map"] = {have: _map_value(want, target) for have, want in entries}
         if connection.change.place is not None:
@@ -353,11 +352,11 @@ class _Configuration:
     def _note_annotations(self, system: StructureSystem, step_size: Plain) -> None:
         """Note which annotations of a system, and of those in it, have no effect."""
         annotations = annotations_of(self._structure) if system is self._structure.system else system.annotations
-        own = base_step_size(system.annotations, Problems())
+        own = _base_step_size(system.annotations, Problems())
         if own is not None and own[0] != step_size:
             found = f"a step size of {own[0]:g} s for the system '{system.name}'"
             self._problems.warn(own[1].place, found, "that of the root system, which all its instances have")
-        for solver, annotation in common_solvers(annotations):
+        for solver, annotation in _common_solvers(annotations):
             found = (
                 f"the {solver} for the whole system '{system.name}' is not used: an FMU for co-simulation has its own "
                 "solver, and one for model exchange gets one of its own, see `solver`"
@@ -390,3 +389,38 @@ def _map_value(text: str, target: Variable | None) -> bool | int | str:
         return text == "true"
     names = [item for item, _ in target.items] if target is not None else []
     return int(text) if text not in names and re.fullmatch(r"-?[0-9]+", text) else text
+
+
+def _base_step_size(annotations: Iterable[Annotation], problems: Problems) -> tuple[float, Annotation] | None:
+    """The step size of a whole system in s, and the annotation that says it; None if none does.
+
+    The annotations are those of the root system, of its default experiment and of its description.
+    """
+    return _step_size(annotations, _STEP_SIZES, "{0} with {1} '{2}'", problems)
+
+
+def _step_size_hint(annotations: Iterable[Annotation], problems: Problems) -> tuple[float, Annotation] | None:
+    """The step size that libcosim is to use for one component in s, and its annotation; None if there is none."""
+    return _step_size(annotations, _HINTS, "{0} '{2}'", problems)
+
+
+def _common_solvers(annotations: Iterable[Annotation]) -> Iterator[tuple[str, Annotation]]:
+    """The solvers that OMSimulator is to use for all FMUs of a system together, and their annotations."""
+    for annotation in annotations:
+        for local in ("VariableStepSolver", "FixedStepSolver") if annotation.type == _OPEN_MODELICA else ():
+            yield from ((local, annotation) for name, _ in annotation.elements if name == local)
+
+
+def _step_size(
+    annotations: Iterable[Annotation], places: Mapping[str, tuple[str, str]], words: str, problems: Problems
+) -> tuple[float, Annotation] | None:
+    """The first step size at one of the places: element and attribute by type of annotation. Others are findings."""
+    for annotation in annotations:
+        wanted, attribute = places.get(annotation.type, ("", ""))
+        for text in (attributes.get(attribute) for name, attributes in annotation.elements if name == wanted):
+            number = (text or "").strip()
+            value = number_of(number) if PATTERNS["number"].fullmatch(number) else math.nan
+            if math.isfinite(value) and value > 0.0:
+                return value, annotation
+            problems.add(annotation.place, words.format(wanted, attribute, text), "a step size > 0 in s")
+    return None

@@ -133,9 +133,9 @@ class XmlElement:
 
     def as_annotation(self) -> Annotation:
         """This element, an `ssc:Annotation`, as a value."""
-        content = b"".join(etree.tostring(child) for child in self._element)
+        inside = [(etree.QName(one).localname, dict(one.attrib)) for one in self._element.iterdescendants("*")]
         text = next((child.text or "" for child in self._element if isinstance(child.tag, str)), "")
-        return Annotation(self.text("type"), content, self.place, text)
+        return Annotation(self.text("type"), tuple(inside), self.place, text)
 
     def with_id(self, identifier: str) -> XmlElement | None:
         """The element of the whole file with this `id`; None if there is none."""
