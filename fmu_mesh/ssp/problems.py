@@ -6,7 +6,7 @@ from collections.abc import Hashable, Iterable
 
 from msgspec.structs import replace
 
-from ..errors import ConfigurationError, Finding
+from ..errors import Finding
 from ..text import listed, nearest, printable
 from .system_structure import FilePlace
 
@@ -54,18 +54,6 @@ class Problems:
         else:
             more = f"one more {what}" if len(alike) == 2 else f"{len(alike) - 1} more {what}s"
             self.warnings[index] = replace(alike[0], found=f"{alike[0].found}; {more} likewise")
-
-    def raise_any(self, file: str) -> None:
-        """Raise one error with all findings in the order of their files and lines; do nothing if there are none.
-
-        Raises:
-            ConfigurationError: there is at least one finding.
-        """
-        if self.findings:
-            files = {finding.file: number for number, finding in reversed(list(enumerate(self.findings)))}
-            ordered = sorted(self.findings, key=lambda finding: (files[finding.file], finding.line or 0))
-            text = f"{file}: {len(ordered)} problems" if len(ordered) > 1 else str(ordered[0])
-            raise ConfigurationError(text, findings=tuple(ordered))
 
     @staticmethod
     def _add(found_so_far: list[Finding], finding: Finding) -> None:

@@ -119,17 +119,16 @@ class _Reader:
         top = root.child("ssd:System")
         if top is None:
             return None
-        experiment = root.child("ssd:DefaultExperiment")
-        times: dict[str, float | None] = {"start_time": None, "stop_time": None}
-        annotations = root.annotations()
-        if experiment is not None:
-            times = {
-                "start_time": experiment.optional_number("startTime"),
-                "stop_time": experiment.optional_number("stopTime"),
-            }
-            annotations += experiment.annotations()
         system = self._system(top, file, depth)
-        return Structure(root.text("name"), root.version, system, root.place, annotations=annotations, **times)
+        structure = Structure(root.text("name"), root.version, system, root.place, annotations=root.annotations())
+        if (experiment := root.child("ssd:DefaultExperiment")) is None:
+            return structure
+        return replace(
+            structure,
+            start_time=experiment.optional_number("startTime"),
+            stop_time=experiment.optional_number("stopTime"),
+            annotations=(*structure.annotations, *experiment.annotations()),
+        )
 
     def _root(self, name: str, tag: str) -> XmlElement | None:
         """The root element of a file; None after a finding."""

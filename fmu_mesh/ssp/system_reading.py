@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 import posixpath
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
 from msgspec.structs import replace
 
-from ..config.loading import PlainConfig, ValueOrigin
+from ..config.findings import Findings, ValueOrigin
+from ..config.loading import PlainConfig
 from ..config.mesh import LimitsConfig
 from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, LoadFailed
@@ -73,7 +74,7 @@ def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = 
         name = chosen_description(package, ssd)
         structure = read_structure(package, name, problems)
         if structure is None:
-            problems.raise_any(package.shown(name))
+            Findings(package.shown(name), first=problems.findings).raise_any()
         assert structure is not None  # otherwise there is a finding
         chosen = [read_values(package, str(name), problems) for name in ssv]
         bindings = (*structure.system.bindings, *(binding for binding in chosen if binding is not None))
@@ -295,7 +296,8 @@ class _Configuration:
 
     def _step_size(self, component: StructureComponent, simulation: Mapping[str, Plain]) -> float | None:
         """The step size that libcosim takes for a component: a multiple of the base step size, in whole nanoseconds."""
-        hint, base = _step_size_hint(component.annotations, self._problems), simulation.get("step_size")
+        hint = _step_size(component.annotations, _HINTS, "{0} '{2}'", self._problems)
+        base = simulation.get("step_size")
         if hint is None or not isinstance(base, float):
             return None
         points = max(1, _nanoseconds(hint[0]) // max(1, _nanoseconds(base)))
@@ -356,7 +358,8 @@ class _Configuration:
         if own is not None and own[0] != step_size:
             found = f"a step size of {own[0]:g} s for the system '{system.name}'"
             self._problems.warn(own[1].place, found, "that of the root system, which all its instances have")
-        for solver, annotation in _common_solvers(annotations):
+        solvers = [(name, one) for one in annotations if one.type == _OPEN_MODELICA for name, _ in one.elements]
+        for solver, annotation in (both for both in solvers if both[0] in {"VariableStepSolver", "FixedStepSolver"}):
             found = (
                 f"the {solver} for the whole system '{system.name}' is not used: an FMU for co-simulation has its own "
                 "solver, and one for model exchange gets one of its own, see `solver`"
@@ -397,18 +400,6 @@ def _base_step_size(annotations: Iterable[Annotation], problems: Problems) -> tu
     The annotations are those of the root system, of its default experiment and of its description.
     """
     return _step_size(annotations, _STEP_SIZES, "{0} with {1} '{2}'", problems)
-
-
-def _step_size_hint(annotations: Iterable[Annotation], problems: Problems) -> tuple[float, Annotation] | None:
-    """The step size that libcosim is to use for one component in s, and its annotation; None if there is none."""
-    return _step_size(annotations, _HINTS, "{0} '{2}'", problems)
-
-
-def _common_solvers(annotations: Iterable[Annotation]) -> Iterator[tuple[str, Annotation]]:
-    """The solvers that OMSimulator is to use for all FMUs of a system together, and their annotations."""
-    for annotation in annotations:
-        for local in ("VariableStepSolver", "FixedStepSolver") if annotation.type == _OPEN_MODELICA else ():
-            yield from ((local, annotation) for name, _ in annotation.elements if name == local)
 
 
 def _step_size(
