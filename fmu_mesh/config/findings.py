@@ -79,7 +79,7 @@ class Findings:
 
     def add(self, path: str, found: str, expected: str, suggestion: str | None = None) -> None:
         """Add a finding: the file, or an option, has ``found`` at ``path`` instead of ``expected``."""
-        if any(_same_place(path, settled) for settled in self._settled):
+        if any(_is_inside(path, settled) or _is_inside(settled, path) for settled in self._settled):
             return
         self._places.add(path)
         if path.startswith("`"):
@@ -147,12 +147,7 @@ def located(
         >>> print(located("instances.gain.start_values.k", "mesh.yaml", lines, options, {}))
         `start_values=...`
 
-    Args:
-        path: of the value.
-        file: the file of the configuration.
-        lines: line numbers in this file by path.
-        replaced: options by the path of the value that they replaced; nothing in a file says more.
-        origins: the places in other files by path.
+    The arguments are those of `Findings`; an option that has replaced a value is its origin, whatever a file says.
     """
     option = replaced.get(max((own for own in replaced if _is_inside(path, own)), key=len, default=""))
     if option is not None:
@@ -163,11 +158,6 @@ def located(
         if path in lines or not path:
             return ValueOrigin(file, lines.get(path))
         path = path[: max(path.rfind("."), path.rfind("["), 0)]
-
-
-def _same_place(path: str, other: str) -> bool:
-    """Whether one of two paths is equal to the other one or inside it."""
-    return _is_inside(path, other) or _is_inside(other, path)
 
 
 def _is_inside(path: str, outer: str) -> bool:

@@ -20,7 +20,7 @@ from fmu_mesh.config.findings import CONTAINERS, Findings, ValueOrigin, located
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.partial import partial_configuration, partial_scenario
-from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, scenario_type
+from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
@@ -99,10 +99,6 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         """An empty collection of findings about this file."""
         return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
 
-    def locate(self, path: str) -> int | None:
-        """The line of ``path``, or of the innermost part of the file around it that has one."""
-        return self.origin(path).line
-
     def origin(self, path: str) -> ValueOrigin:
         """Where the value at ``path`` comes from: a file and a line of it, or an option."""
         return located(path, str(self.file), self.lines, self.overrides, self.origins)
@@ -154,9 +150,7 @@ def read_text(text: str, path: Path) -> PlainConfig:
 def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | None:
     """The scenario of a configuration: its section, or the file that the section names; None if there is none.
 
-    Args:
-        loaded: the configuration.
-        findings: where everything goes that is wrong with the file; then the result has only its valid parts.
+    If something is wrong with the file, which are findings, the result has only its valid parts.
 
     Raises:
         ConfigurationError: the file cannot be read, or is no YAML.
@@ -176,7 +170,7 @@ def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | 
     shown_path = loaded.file.parent / section  # from inside an archive, only the resolved path can be opened
     plain = read_file(shown_path if shown_path.is_file() else path)
     own = Findings(str(plain.file), plain.lines, None, plain.findings)
-    check(plain.data, scenario_type(), "", own)
+    check(plain.data, _type_info(ScenarioConfig), "", own)
     config = partial_scenario(plain.data, own.places)
     findings.merge(own)
     wrong = frozenset(place for place in own.places if not CONTAINERS.fullmatch(place))
@@ -214,7 +208,7 @@ def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kind
 
 
 @lru_cache(maxsize=8)
-def _type_info(type_: type[Config]) -> inspect.Type:
+def _type_info(type_: type[msgspec.Struct]) -> inspect.Type:
     """The fields of a type as msgspec sees them; to find them takes longer than to check a configuration."""
     return inspect.type_info(type_)
 

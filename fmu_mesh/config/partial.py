@@ -42,12 +42,7 @@ def partial_configuration(
     """The configuration without the values at the paths ``wrong``; None if too little is valid.
 
     A missing or wrong time is NaN, a missing model an empty path, a missing end of a connection an empty name, and an
-    event without a time never happens.
-
-    Args:
-        data: what the file says.
-        wrong: the places of all findings.
-        sections: the sections of the kinds of instances by key, the usual kind first.
+    event without a time never happens. The sections are those of the kinds of instances by key, the usual kind first.
     """
     rest = _without(data, wrong, "")
     instances = data.get("instances") if isinstance(data, dict) else None
@@ -91,17 +86,13 @@ def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
     if isinstance(value, list):
         places_of_items = [f"{path}[{index}]" for index in range(len(value))]
         placeholder = next((own for lists, own in _PLACEHOLDERS.items() if re.fullmatch(lists, path)), None)
-        if placeholder is None and any(_is_wrong(place, wrong) for place in places_of_items):
+        inside = (place for place in places_of_items for one in wrong if one == place or one.startswith(f"{place}."))
+        if placeholder is None and any(inside):
             return []
         pairs = zip(value, places_of_items, strict=True)
         kept = [placeholder if place in wrong else _without(item, wrong, place) for item, place in pairs]
         return [{**_mapping(placeholder), **item} if isinstance(item, dict) else item for item in kept]
     return value
-
-
-def _is_wrong(place: str, wrong: AbstractSet[str]) -> bool:
-    """Whether an item of a list, or anything in it, is wrong."""
-    return any(path == place or path.startswith(f"{place}.") for path in wrong)
 
 
 def _mapping(value: Plain) -> dict[str, Plain]:

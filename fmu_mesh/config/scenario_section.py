@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from msgspec import Meta, inspect
+from msgspec import Meta
 
 from fmu_mesh.config.base import Base
 from fmu_mesh.config.findings import Findings
@@ -113,8 +113,3 @@ class ScenarioSource(NamedTuple):
     def resolve(self, relative: str) -> Path:
         """The absolute path for a path in the file."""
         return beside(self.file, relative)
-
-
-def scenario_type() -> inspect.Type:
-    """The type of a file with a scenario, as msgspec sees it."""
-    return inspect.type_info(ScenarioConfig)

@@ -55,13 +55,9 @@ _INTEGERS = range(-(2**63), 2**64)  # 64 bits; a decimal number beyond is a floa
 
 
 def read(text: str, findings: Findings, lines: dict[str, int]) -> Plain:
-    """The value of a YAML text.
+    """The value of a YAML text of one document; ``lines`` gets the line, from 1, of every path (`connections[2].to`).
 
-    Args:
-        text: the text; one document.
-        findings: collects everything that is wrong with it. After a syntax error or a broken limit the value is None;
-            after any other finding it has all valid parts.
-        lines: gets the line, counted from 1, of every path (`connections[2].to`).
+    After a syntax error or a broken limit the value is None; after any other finding it has all valid parts.
     """
     try:
         return _Reader(text, findings, lines).document()
