@@ -29,6 +29,7 @@ __all__ = [
     "short_number",
     "short_path",
     "shown",
+    "with_article",
 ]
 
 _LISTED_NAMES = 8
@@ -96,6 +97,11 @@ def listed(names: Sequence[str], *, nothing: str = "none") -> str:
 def counted(number: int, what: str) -> str:
     """`1 row`, `2 rows`, `0 processes`."""
     return f"{number} {what}{'' if number == 1 else 'es' if what.endswith('s') else 's'}"
+
+
+def with_article(word: str) -> str:
+    """`an input`, `a Real`."""
+    return f"an {word}" if word[0] in "aeiouAEIOU" else f"a {word}"
 
 
 def shown(value: object) -> str:

@@ -23,12 +23,8 @@ def automatic_nodes(config: Config, edges: Iterable[tuple[str, str]], claims: Cl
     """The names of the nodes that several instances of a cycle share, by instance. Other instances are not in it.
 
     An instance with a ``group`` of its own stays there. Instances with different hosts or interpreters never share a
-    node, nor do two that cannot share a process (`fmu_mesh.system.process_sharing`).
-
-    Args:
-        config: the configuration, whatever its own ``group`` says.
-        edges: (source instance, target instance) of every connection.
-        claims: what the instances claim of a process.
+    node, nor do two that cannot share a process (`fmu_mesh.system.process_sharing`). The edges are those of all
+    connections between instances.
     """
     position = {name: place for place, name in enumerate(config.instances)}
     taken = {*config.instances, *(instance.group for instance in config.instances.values() if instance.group)}

@@ -80,10 +80,8 @@ class InitializationPlan(msgspec.Struct, frozen=True):
 def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection]) -> InitializationPlan:
     """Levels of all connected outputs, and the loops.
 
-    Args:
-        system: the system, for the start values of inputs.
-        connections: all connections, with their delays. In Initialization Mode a delay has no effect, but a connection
-            with a delay is torn before one without: so the values flow in the order of the steps.
+    In Initialization Mode a delay has no effect, but a connection with a delay is torn before one without: so the
+    values flow in the order of the steps.
     """
     outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
     reached = _reached(system, connections)
@@ -119,12 +117,6 @@ def check_loops(
     plan: InitializationPlan, connections: Sequence[Connection], system: ResolvedSystem, findings: Findings
 ) -> None:
     """Refuse parameters of FMI 1.0 in a loop: they cannot be set again after the initialization.
-
-    Args:
-        plan: what `plan_initialization` returned.
-        connections: all connections.
-        system: the system.
-        findings: where they go.
 
     Raises:
         ConfigurationError: there is one; has all findings.

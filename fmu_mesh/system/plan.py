@@ -217,13 +217,9 @@ def make_plan(
     findings: Findings | None = None,
     contents: Mapping[str, str] = {},
 ) -> Plan:
-    """Plan a validated system.
+    """Plan a validated system; a ``window`` in points overrides that of the configuration.
 
-    Args:
-        system: the system.
-        window: overrides the window of the configuration, in points.
-        findings: those about this host; an error has them, too.
-        contents: the SHA-256 of the content of each model, by instance name.
+    An error has the ``findings`` about this host, too. The contents are the SHA-256 of each model, by instance name.
 
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
@@ -295,6 +291,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
+        shared = any(name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles)
         links_in = tuple(link for link in links if link.target_node == node)
         nodes[node] = NodePlan(
             mesh=config.mesh,
@@ -305,7 +302,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
-            batch=batch_of(plan.window) if not _in_cycle(plan, members, within) else 1,
+            batch=1 if shared else batch_of(plan.window),  # a cycle over several nodes waits for each row
             memory=memory,
             rings=tuple(
                 places[name]
@@ -337,11 +334,6 @@ def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ..
             unit = tuple(name for name in plan.order if name in cycle)
             units.update(dict.fromkeys(unit, unit))
     return units
-
-
-def _in_cycle(plan: Plan, members: list[str], units: dict[str, tuple[str, ...]]) -> bool:
-    """Whether a member of a node belongs to a cycle over several nodes."""
-    return any(name in cycle and len(units[name]) < len(cycle) for name in members for cycle in plan.cycles)
 
 
 def _output_layouts(system: ResolvedSystem, connections: Iterable[Connection]) -> dict[str, Layout]:

@@ -108,12 +108,6 @@ def courses_of(
 ) -> dict[str, Course]:
     """What the steps of an instance use, by variable; tables are read here.
 
-    Args:
-        schedules: those of the instance.
-        description: its model description.
-        grid: the communication points.
-        points: points per own step.
-
     Raises:
         ConfigurationError: a table cannot be read, or has changed since the run was planned.
     """

@@ -30,11 +30,7 @@ _SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.
 def sized(name: str, description: ModelDescription, config: InstanceSection, findings: Findings) -> ModelDescription:
     """A model description with its arrays in the sizes that the structural parameters of the configuration give.
 
-    Args:
-        name: instance name.
-        description: the model description.
-        config: the instance's section of the configuration.
-        findings: where arrays go that would be too large; these keep their sizes.
+    If an array would be too large, which is a finding, all keep their sizes.
     """
     sizes: dict[str, Value] = {}
     for variable in description.with_causality("structuralParameter"):
@@ -56,12 +52,7 @@ def resolve_start_values(
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
-    Args:
-        name: instance name.
-        config: its section of the configuration.
-        description: its model description.
-        findings: where unknown names and wrong values go; the result does not have them.
-        finite: whether NaN and infinity are refused.
+    Unknown names and wrong values are findings, and with ``finite`` NaN and infinity are; the result has the others.
     """
     settable = [variable.name for variable in description.variables if variable.settable_before_start]
     values: dict[str, Value] = {}
@@ -105,11 +96,7 @@ def forbidden_start_values(
 ) -> None:
     """Add a finding for each start value that FMI forbids. FMUs get these values anyway, because some use them.
 
-    Args:
-        config: the configuration.
-        descriptions: the model descriptions by instance name.
-        findings: where they go.
-        strict: true: for the instances where they are errors; false: for those where they are warnings.
+    They are those of the instances where they are errors (``strict``), or of those where they are warnings.
     """
     for name, instance in config.instances.items():
         if not instance.follows_fmi or name not in descriptions or config.is_strict(instance) != strict:
