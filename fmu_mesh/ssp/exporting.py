@@ -28,7 +28,7 @@ from ..system.system import ResolvedSystem
 from ..text import listed, nearest_file
 from .grammar import NAMESPACES
 from .naming import element_path, instance_name, mesh_name
-from .own_annotation import ANNOTATION_TYPE, names_in, without, written
+from .own_annotation import ANNOTATION_TYPE, names_in, written
 from .package import DEFAULT, Package
 from .package_writing import ArchiveEntry, PackageEntry, resource_names, write_package
 from .ssd_writing import ElementNames, SspVersion, ssd_of
@@ -76,7 +76,8 @@ def export(
         raise ConfigurationError(f"'{path}' is no name of a package", hint="Let it end in '.ssp'.")
     kept = _kept_package(plain)
     if kept is not None and (version is None or kept.is_of(version)):
-        original = read_system(kept.root / kept.name) if is_folder(kept.root) else read_system(kept.root, kept.name)
+        place = (kept.root / kept.name,) if is_folder(kept.root) else (kept.root, kept.name)
+        original = read_system(*place, annotated=False)
         Findings(kept.shown, first=original.findings).raise_any()  # the package may have changed since it was read
         if json.dumps(_content(plain.data)) == json.dumps(_content(original.data)):
             return _write_copy(plain, original, kept, path)
@@ -101,10 +102,8 @@ def _write_copy(plain: PlainConfig, original: PlainConfig, kept: _KeptPackage, p
     """Write a copy of the package with an annotation of ours that says the rest."""
     data = _packable(plain)
     described: Mapping[str, Any] = original.data if isinstance(original.data, dict) else {}
-    names: dict[str, str] = {}
     before = own_annotation_in(kept.document)
-    if before is not None:
-        described, names = without(described, before), names_in(before)
+    names = names_in(before) if before is not None else {}
     annotation = written(data, described, names=names, moved=_to_package(plain.file))
     document = kept.document if annotation == before else with_own_annotation(kept.document, annotation)
     try:
@@ -135,12 +134,12 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
     data = {**data, "simulation": {"algorithm": system.config.simulation.algorithm, **data["simulation"]}}
     annotation = written(data, _described(system.config), names=changed, moved=_to_package(plain.file))
     findings = Findings(str(plain.file), plain.lines, plain.overrides)
-    document = ssd_of(system, names, version, annotation, findings)
+    document, units = ssd_of(system, names, version, annotation, findings)
     findings.raise_any()
     models_of = {resource: model for model, resource in reversed(resources.items())}
     entries = [PackageEntry(resource, models_of[resource]) for resource in dict.fromkeys(resources.values())]
-    write_package(path, [PackageEntry(DEFAULT, document.xml), *entries])
-    return document.units
+    write_package(path, [PackageEntry(DEFAULT, document), *entries])
+    return units
 
 
 def _described(config: Config) -> dict[str, Any]:

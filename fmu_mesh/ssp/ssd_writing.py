@@ -7,7 +7,7 @@ Owns which elements and attributes stand for what, and what a version cannot say
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import msgspec
 from lxml import etree
@@ -23,7 +23,7 @@ from ..variables.value_types import FMI2_TYPES, flattened
 from .grammar import NAMESPACES
 from .xml_writing import XmlNode, annotations_element, child, is_xml_text, number_text, tag_of, write_units
 
-__all__ = ["ElementNames", "NewDocument", "SspVersion", "ssd_of"]
+__all__ = ["ElementNames", "SspVersion", "ssd_of"]
 
 SspVersion = Literal["1.0", "2.0"]
 
@@ -53,43 +53,27 @@ class ElementNames(msgspec.Struct, frozen=True):
     kinds: Mapping[str, Kind]
 
 
-class NewDocument(NamedTuple):
-    """A system structure description.
-
-    Attributes:
-        units: the names of the units that it defines.
-    """
-
-    xml: bytes
-    units: set[str]
-
-
 def ssd_of(
     system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str | None, findings: Findings
-) -> NewDocument:
-    """A system structure description of a mesh whose instances are FMUs, with the text of our annotation.
+) -> tuple[bytes, set[str]]:
+    """A system structure description of a mesh whose instances are FMUs, and the names of the units that it defines.
 
     What this version of SSP, or no version, can say is a finding. Then the document is useless.
     """
     writer = _Writer(system, names, version, findings)
-    return NewDocument(writer.document(annotation), writer.units)
+    return writer.document(annotation), {*writer.units}
 
 
 class _Writer:
-    """Writes one document; units and enumerations are collected on the way."""
+    """Writes one document; ``units`` by name and enumerations are collected on the way."""
 
     def __init__(self, system: ResolvedSystem, names: ElementNames, version: SspVersion, findings: Findings) -> None:
         self._system = system
         self._names = names
         self._version: SspVersion = version
         self._findings = findings
-        self._units: dict[str, BaseUnit] = {}
+        self.units: dict[str, BaseUnit] = {}
         self._enumerations: dict[tuple[tuple[str, int], ...], str] = {}
-
-    @property
-    def units(self) -> set[str]:
-        """The names of the units that the document defines."""
-        return {*self._units}
 
     def document(self, annotation: str | None) -> bytes:
         config = self._system.config
@@ -200,7 +184,7 @@ class _Writer:
             self._value(parameter, variable, texts)
             if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
                 parameter[0].set("unit", unit)
-                units[unit] = self._units[unit]
+                units[unit] = self.units[unit]
             self._dimensions(parameter, variable)
         if units:
             write_units(child(own, "ssv:Units"), units)
@@ -287,7 +271,7 @@ class _Writer:
         name, base = variable.unit, variable.base_unit
         if name is None or base is None or not base.usable:
             return None
-        return name if self._units.setdefault(name, base) == base else None
+        return name if self.units.setdefault(name, base) == base else None
 
     def _enumeration(self, variable: Variable, description: ModelDescription) -> str | None:
         """The name of an enumeration in the document; None if it cannot be defined there."""
@@ -309,8 +293,8 @@ class _Writer:
                 enumeration = child(parent, "ssc:Enumeration", name=name)
                 for item, number in items:
                     child(enumeration, "ssc:Item", name=item, value=str(number))
-        if self._units:
-            write_units(child(root, "ssd:Units"), self._units)
+        if self.units:
+            write_units(child(root, "ssd:Units"), self.units)
 
 
 def _map_kind(source: Variable, target: Variable) -> str | None:

@@ -60,11 +60,14 @@ _HINTS: Final = {_OPEN_SIMULATION_PLATFORM: ("StepSizeHint", "value")}
 _KNOWN: Final = {_OPEN_MODELICA, _OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
 
 
-def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> PlainConfig:
+def read_system(
+    path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = (), *, annotated: bool = True
+) -> PlainConfig:
     """Read a package as the values of a configuration.
 
     What the configuration means is checked with everything else before a run; so are the findings of the package. The
-    arguments are those of `read_configuration`; each file with values is a last binding of the root system.
+    arguments are those of `read_configuration`; each file with values is a last binding of the root system. If it is
+    not ``annotated``, our annotation says the names of the instances only.
 
     Raises:
         ConfigurationError: there is no such package, description or file with values, or it has no system.
@@ -79,7 +82,7 @@ def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = 
         chosen = [read_values(package, str(name), problems) for name in ssv]
         bindings = (*structure.system.bindings, *(binding for binding in chosen if binding is not None))
         structure = replace(structure, system=replace(structure.system, bindings=bindings))
-        return _Configuration(package, name, structure, problems).plain()
+        return _Configuration(package, name, structure, problems).plain(annotated=annotated)
 
 
 def chosen_description(package: Package, ssd: str | None) -> str:
@@ -132,8 +135,8 @@ class _Configuration:
         self._annotation = next(own, None)
         self._names = self._chosen_names()
 
-    def plain(self) -> PlainConfig:
-        """All of it."""
+    def plain(self, *, annotated: bool) -> PlainConfig:
+        """All of it, with what our annotation says."""
         system = self._structure.system
         parameters = resolve_parameters(system, self._describe, self._problems)
         units = {node: value.unit for node, value in parameters.of_systems.items() if value.unit is not None}
@@ -155,7 +158,8 @@ class _Configuration:
         }
         if self._package.is_archive:
             data["record"] = {"file": RESULT_BESIDE_PACKAGE}
-        data = self._with_annotation(data)
+        if annotated and self._annotation is not None:
+            data = self._with_annotation(data, self._annotation)
         times = data["simulation"]
         assert isinstance(times, dict)  # `merged` adds to a mapping
         self._place("", self._structure.place)
@@ -183,26 +187,24 @@ class _Configuration:
                 self._annotation = None
         return {name: name for name in defaults}
 
-    def _with_annotation(self, data: dict[str, Plain]) -> dict[str, Plain]:
+    def _with_annotation(self, data: dict[str, Plain], own: Annotation) -> dict[str, Plain]:
         """The values with what our annotation says."""
-        if self._annotation is None:
-            return data
         folder = ".." if self._package.is_archive else ""
         try:
-            result = merged(data, self._annotation.text, moved=lambda path: posixpath.join(folder, path))
+            result = merged(data, own.text, moved=lambda path: posixpath.join(folder, path))
         except AnnotationRefused as refused:
-            self._problems.add(self._annotation.place, refused.found, refused.expected)
+            self._problems.add(own.place, refused.found, refused.expected)
             return data
         record = result.data.get("record")
         if self._package.is_archive and isinstance(record, dict) and "file" not in record:
             result.data["record"] = {**record, "file": RESULT_BESIDE_PACKAGE}
         for path in result.paths:
-            self._place(path, self._annotation.place)
+            self._place(path, own.place)
         if "zenoh" in result.paths:
             found = f"the package says how the mesh connects: {str(result.data['zenoh'])[:200]}"
-            self._problems.warn(self._annotation.place, found, "`connect=...` and `listen=...`, if you do not trust it")
+            self._problems.warn(own.place, found, "`connect=...` and `listen=...`, if you do not trust it")
         for gone in result.gone:
-            self._problems.warn(self._annotation.place, f"{gone} is not there any more")
+            self._problems.warn(own.place, f"{gone} is not there any more")
         return result.data
 
     def _describe(self, path: tuple[str, ...]) -> ModelDescription | None:
