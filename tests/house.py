@@ -297,7 +297,7 @@ ALLOWED: dict[str, dict[str, str]] = {
             f"ssp/package_writing.py: info.{name}": _ZIP
             for name in ("compress_type", "create_system", "external_attr", "file_size")
         },
-        "ssp/xml_writing.py: etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text": "lxml has no "
+        "ssp/ssd_writing.py: etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text": "lxml has no "
         "parameter for it",
         "instances/mujoco/mujoco_instance.py: self._data.time": _MUJOCO,
         "instances/mujoco/mujoco_instance.py: self._model.opt.disableflags": _MUJOCO,

@@ -31,9 +31,16 @@ from .naming import element_path, instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, names_in, written
 from .package import DEFAULT, Package
 from .package_writing import ArchiveEntry, PackageEntry, resource_names, write_package
-from .ssd_writing import ElementNames, SspVersion, ssd_of
+from .ssd_writing import (
+    ElementNames,
+    SspVersion,
+    XmlNode,
+    is_xml_text,
+    own_annotation_in,
+    ssd_of,
+    with_own_annotation,
+)
 from .system_reading import read_system
-from .xml_writing import XmlNode, is_xml_text, own_annotation_in, with_own_annotation
 
 __all__ = ["export"]
 

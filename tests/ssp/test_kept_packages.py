@@ -14,8 +14,8 @@ from lxml import etree
 
 import fmu_mesh
 from fmu_mesh.ssp.own_annotation import AnnotationRefused, chosen_names, merged, names_in, written
+from fmu_mesh.ssp.ssd_writing import own_annotation_in, with_own_annotation
 from fmu_mesh.ssp.system_reading import read_system
-from fmu_mesh.ssp.xml_writing import own_annotation_in, with_own_annotation
 from tests.helpers import FMUS
 
 MAIN = "SystemStructure.ssd"
