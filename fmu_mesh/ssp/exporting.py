@@ -190,10 +190,12 @@ def _packable(plain: PlainConfig, *, fmus_only: bool = False) -> dict[str, Any]:
     """
     findings = Findings(str(plain.file), plain.lines, plain.overrides)
     data = plain.data
-    if not isinstance(data, dict) or not isinstance(instances := data.get("instances"), dict):
+    instances = data.get("instances") if isinstance(data, dict) else None
+    if not isinstance(data, dict) or not isinstance(instances, dict):
         findings.add("", "no mapping with instances", "a configuration")
         findings.raise_any()
     assert isinstance(data, dict)  # see above
+    assert isinstance(instances, dict)
     if isinstance(named := data.get("scenario"), str):
         file = beside(plain.file, named)
         if is_file(file):
