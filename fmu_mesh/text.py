@@ -22,6 +22,7 @@ __all__ = [
     "listed",
     "matched",
     "matching",
+    "meant",
     "nearest",
     "nearest_file",
     "option_text",
@@ -29,6 +30,7 @@ __all__ = [
     "short_number",
     "short_path",
     "shown",
+    "with_article",
 ]
 
 _LISTED_NAMES = 8
@@ -85,6 +87,11 @@ def nearest_file(path: Path) -> str | None:
     return str(path.with_name(name)) if name is not None else None
 
 
+def meant(near: str | None, otherwise: str | None = None) -> str | None:
+    """The question whether a name was meant, as a hint; ``otherwise`` if no name is near."""
+    return f"Did you mean '{near}'?" if near is not None else otherwise
+
+
 def listed(names: Sequence[str], *, nothing: str = "none") -> str:
     """The names, separated by commas; of more than 8 the first ones and how many more there are."""
     if not names:
@@ -96,6 +103,11 @@ def listed(names: Sequence[str], *, nothing: str = "none") -> str:
 def counted(number: int, what: str) -> str:
     """`1 row`, `2 rows`, `0 processes`."""
     return f"{number} {what}{'' if number == 1 else 'es' if what.endswith('s') else 's'}"
+
+
+def with_article(word: str) -> str:
+    """`an input`, `a Real`."""
+    return f"an {word}" if word[0] in "aeiouAEIOU" else f"a {word}"
 
 
 def shown(value: object) -> str:

@@ -268,7 +268,6 @@ _MUJOCO = "an object of MuJoCo, which is told by its fields"
 _ONNX = "an option of onnxruntime, which is told by its fields"
 _ROS = "a field of a ROS message"
 _ZIP = "a field of ZipInfo, which zipfile has no other way to set"
-_EXPAT = "a handler of an expat parser, which has no other way to set it"
 
 ALLOWED: dict[str, dict[str, str]] = {
     "attributes_assigned_from_outside": {
@@ -298,11 +297,7 @@ ALLOWED: dict[str, dict[str, str]] = {
             f"ssp/package_writing.py: info.{name}": _ZIP
             for name in ("compress_type", "create_system", "external_attr", "file_size")
         },
-        **{
-            f"ssp/document_changes.py: self._parser.{name}Handler": _EXPAT
-            for name in ("Default", "EndElement", "StartElement")
-        },
-        "ssp/xml_writing.py: etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text": "lxml has no "
+        "ssp/ssd_writing.py: etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text": "lxml has no "
         "parameter for it",
         "instances/mujoco/mujoco_instance.py: self._data.time": _MUJOCO,
         "instances/mujoco/mujoco_instance.py: self._model.opt.disableflags": _MUJOCO,

@@ -14,7 +14,8 @@ from ..instances.configuration import examine_data
 from ..run.allowed_code import check_code
 from ..run.options import PlanOptions
 from ..run.overriding import with_options
-from ..ssp.configuration_files import RESULT_BESIDE_PACKAGE, named_package, read_configuration
+from ..ssp.configuration_files import named_package, read_configuration
+from ..ssp.package import RESULT_BESIDE_PACKAGE
 from ..text import short_path
 from .mesh_builder import Mesh
 from .package_inspection import inspect_package

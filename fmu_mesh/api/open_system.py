@@ -31,7 +31,7 @@ from ..run.local_system import LocalSystem, SavedSystem, opening_of
 from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
-from ..system.settable import check_settable, sources_of, why_not_settable
+from ..system.start_values import why_not_settable
 from ..text import listed, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
@@ -225,7 +225,7 @@ class System:
         instance, variable = self._found(name)
         own = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance)
         try:
-            check_settable(own, variable)
+            own.check_settable(variable)
         except ValueRefused as refused:
             raise CallRefused(f"it {refused}.", instance=instance, variable=variable.name) from refused
         try:
@@ -363,7 +363,7 @@ class System:
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)
         if variable is None or (rest != variable.name and rest not in variable.elements):
-            sources = sources_of(self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance))
+            sources = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance).sources
             free = [one.name for one in description.variables if not why_not_settable(one, sources.get(one.name))]
             names = [one.name for one in description.variables] if elements else free
             near = nearest(rest, names)

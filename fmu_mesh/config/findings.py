@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
+
+import msgspec
 
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.files import beside
 
-__all__ = ["CONTAINERS", "Findings", "ValueOrigin", "located"]
+__all__ = ["CONTAINERS", "Findings", "ValueOrigin", "Written", "located"]
+
+C = TypeVar("C")
 
 CONTAINERS = re.compile(
     r"|simulation|connections|initialization|record|zenoh|timeouts|limits|(scenario\.)?(values|events)|scenario"
@@ -79,7 +85,7 @@ class Findings:
 
     def add(self, path: str, found: str, expected: str, suggestion: str | None = None) -> None:
         """Add a finding: the file, or an option, has ``found`` at ``path`` instead of ``expected``."""
-        if any(_same_place(path, settled) for settled in self._settled):
+        if any(_is_inside(path, settled) or _is_inside(settled, path) for settled in self._settled):
             return
         self._places.add(path)
         if path.startswith("`"):
@@ -131,6 +137,32 @@ class Findings:
             raise ConfigurationError(text, findings=tuple(by_line), plan=plan)
 
 
+class Written(msgspec.Struct, Generic[C], frozen=True):
+    """What a file says, and where each part of it stands.
+
+    Attributes:
+        config: what it says, overrides included.
+        file: the file as the user named it; relative paths in it refer to its folder.
+        lines: line numbers, counted from 1, by path in the file.
+        overrides: the option (`start_values={'pendulum.l': 2}`) that replaced a value, by path in the file.
+        origins: where a value was written, by path in the file, if that is another file.
+    """
+
+    config: C
+    file: Path
+    lines: dict[str, int] = {}
+    overrides: dict[str, str] = {}
+    origins: dict[str, ValueOrigin] = {}
+
+    def findings(self) -> Findings:
+        """An empty collection of findings about this file."""
+        return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
+
+    def resolve(self, relative: str) -> Path:
+        """The absolute path for a path in the file, which is relative to the folder of the file."""
+        return beside(self.file, relative)
+
+
 def located(
     path: str,
     file: str,
@@ -147,12 +179,7 @@ def located(
         >>> print(located("instances.gain.start_values.k", "mesh.yaml", lines, options, {}))
         `start_values=...`
 
-    Args:
-        path: of the value.
-        file: the file of the configuration.
-        lines: line numbers in this file by path.
-        replaced: options by the path of the value that they replaced; nothing in a file says more.
-        origins: the places in other files by path.
+    The arguments are those of `Findings`; an option that has replaced a value is its origin, whatever a file says.
     """
     option = replaced.get(max((own for own in replaced if _is_inside(path, own)), key=len, default=""))
     if option is not None:
@@ -163,11 +190,6 @@ def located(
         if path in lines or not path:
             return ValueOrigin(file, lines.get(path))
         path = path[: max(path.rfind("."), path.rfind("["), 0)]
-
-
-def _same_place(path: str, other: str) -> bool:
-    """Whether one of two paths is equal to the other one or inside it."""
-    return _is_inside(path, other) or _is_inside(other, path)
 
 
 def _is_inside(path: str, outer: str) -> bool:

@@ -1,30 +1,32 @@
 """Reading a configuration file: the result is a valid structure, or an error with all findings.
 
-Owns the short form of connections and the start values that options give. What the names in the file mean is
+Owns the short form of connections and the start values that options give. Of a file whose structure is wrong, there is
+a partial configuration: its valid parts, with placeholders for the others. With them the meaning of the valid parts can
+be checked, and one error shows all findings; it is never run. What the names in the file mean is
 `fmu_mesh.system.system`.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 from msgspec import inspect, structs
 
-from fmu_mesh.config.findings import CONTAINERS, Findings, ValueOrigin, located
+from fmu_mesh.config.findings import CONTAINERS, Findings, ValueOrigin, Written, located
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
-from fmu_mesh.config.partial import partial_configuration, partial_scenario
-from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource, scenario_type
+from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
-from fmu_mesh.files import archive_on_the_way, beside, opened
+from fmu_mesh.files import archive_on_the_way, opened
 from fmu_mesh.text import listed, nearest, nearest_file, option_text, shown
 
 __all__ = [
@@ -44,6 +46,19 @@ _ARCHIVE = b"PK\x03\x04"
 _ARROW = "->"
 _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
 _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
+
+_PLACEHOLDERS: Final[dict[str, Plain]] = {
+    "connections": {"from": "", "to": ""},
+    "record": {"file": None},
+    r"record(\[\d+\])?\.variables": "",
+    r"scenario\.events": {"at": math.inf, "set": {}},
+    r"scenario\.values\..+\.times": math.nan,
+    r"scenario\.values\..+\.values": 0,
+    r"ros\.topics": "",
+}
+"""By the path of a list, what stands for a wrong item, so that others keep their index, and for keys that miss."""
+
+_TIMES = ("start_time", "stop_time", "step_size")
 
 
 class PlainConfig(NamedTuple):
@@ -74,34 +89,16 @@ class PlainConfig(NamedTuple):
     foreign: str = ""
 
 
-class LoadedConfig(msgspec.Struct, frozen=True):
+class LoadedConfig(Written[Config], frozen=True):
     """A configuration with a valid structure, and the line of each of its parts.
 
     Attributes:
-        config: the configuration, overrides included.
-        file: the file as the user named it.
-        lines: line numbers, counted from 1, by path in the file.
-        overrides: the option (`start_values={'pendulum.l': 2}`) that replaced a value, by path in the file.
-        origins: where a value was written, by path in the file, if that is another file.
         warnings: findings of the file that do not prevent a run.
         foreign: as in `PlainConfig`.
     """
 
-    config: Config
-    file: Path
-    lines: dict[str, int] = {}
-    overrides: dict[str, str] = {}
-    origins: dict[str, ValueOrigin] = {}
     warnings: tuple[Finding, ...] = ()
     foreign: str = ""
-
-    def findings(self) -> Findings:
-        """An empty collection of findings about this file."""
-        return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
-
-    def locate(self, path: str) -> int | None:
-        """The line of ``path``, or of the innermost part of the file around it that has one."""
-        return self.origin(path).line
 
     def origin(self, path: str) -> ValueOrigin:
         """Where the value at ``path`` comes from: a file and a line of it, or an option."""
@@ -117,10 +114,6 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         """A finding with the file and the line of ``path``."""
         origin = self.origin(path)
         return Finding(origin.file or str(self.file), path, found, expected, suggestion, origin.line)
-
-    def resolve(self, relative: str) -> Path:
-        """The absolute path for a path in the file, which is relative to the folder of the file."""
-        return beside(self.file, relative)
 
 
 def read_file(path: Path) -> PlainConfig:
@@ -154,9 +147,7 @@ def read_text(text: str, path: Path) -> PlainConfig:
 def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | None:
     """The scenario of a configuration: its section, or the file that the section names; None if there is none.
 
-    Args:
-        loaded: the configuration.
-        findings: where everything goes that is wrong with the file; then the result has only its valid parts.
+    If something is wrong with the file, which are findings, the result has only its valid parts.
 
     Raises:
         ConfigurationError: the file cannot be read, or is no YAML.
@@ -165,7 +156,7 @@ def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | 
     if section is None:
         return None
     if isinstance(section, ScenarioConfig):
-        return ScenarioSource(section, "scenario.", loaded.file, loaded.lines, loaded.overrides)
+        return ScenarioSource(section, loaded.file, loaded.lines, loaded.overrides, prefix="scenario.")
     path = loaded.resolve(section)
     if not section or not path.is_file():
         found, expected = f"no such file '{section}'", "a file with values and events"
@@ -176,11 +167,11 @@ def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | 
     shown_path = loaded.file.parent / section  # from inside an archive, only the resolved path can be opened
     plain = read_file(shown_path if shown_path.is_file() else path)
     own = Findings(str(plain.file), plain.lines, None, plain.findings)
-    check(plain.data, scenario_type(), "", own)
-    config = partial_scenario(plain.data, own.places)
+    check(plain.data, _type_info(ScenarioConfig), "", own)
+    config = _partial_scenario(plain.data, own.places)
     findings.merge(own)
     wrong = frozenset(place for place in own.places if not CONTAINERS.fullmatch(place))
-    return ScenarioSource(config, "", plain.file, plain.lines, {}, wrong) if config is not None else None
+    return ScenarioSource(config, plain.file, plain.lines, wrong=wrong) if config is not None else None
 
 
 def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kinds) -> tuple[LoadedConfig, Findings]:
@@ -204,7 +195,7 @@ def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kind
         data = _with_kinds(_with_overrides(data, overrides, replaced, findings), sections, kinds, findings)
     type_ = config_type(tuple(sections.values()))
     check(data, _type_info(type_), "", findings)
-    config = partial_configuration(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
+    config = _partial_configuration(data, findings.places, sections) if len(findings) else msgspec.convert(data, type_)
     if config is None:
         findings.raise_any()
     assert config is not None  # without a finding there is a configuration
@@ -214,7 +205,7 @@ def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kind
 
 
 @lru_cache(maxsize=8)
-def _type_info(type_: type[Config]) -> inspect.Type:
+def _type_info(type_: type[msgspec.Struct]) -> inspect.Type:
     """The fields of a type as msgspec sees them; to find them takes longer than to check a configuration."""
     return inspect.type_info(type_)
 
@@ -349,3 +340,85 @@ def _set_start_value(instances: dict[str, Plain], name: str, variable: str, valu
         values = instance.get("start_values", {})
         if isinstance(values, dict):
             instances[name] = {**instance, "start_values": {**values, variable: value}}
+
+
+def _partial_configuration(
+    data: Plain, wrong: AbstractSet[str], sections: Mapping[str, type[InstanceSection]]
+) -> Config | None:
+    """The configuration without the values at the paths ``wrong``; None if too little is valid.
+
+    A missing or wrong time is NaN, a missing model an empty path, a missing end of a connection an empty name, and an
+    event without a time never happens. The sections are those of the kinds of instances by key, the usual kind first.
+    """
+    rest = _without(data, wrong, "")
+    instances = data.get("instances") if isinstance(data, dict) else None
+    if not isinstance(rest, dict) or not isinstance(instances, dict):
+        return None
+    models = [_with_model(own, sections) for own in ({**instances, **_mapping(rest.get("instances"))}).values()]
+    try:
+        config = msgspec.convert(
+            {
+                **rest,
+                "mesh": rest.get("mesh", "mesh"),
+                "simulation": _simulation(rest.get("simulation"), wrong),
+                "instances": {f"i{number}": model for number, model in enumerate(models)},
+            },
+            config_type(tuple(sections.values())),
+        )
+    except msgspec.ValidationError:
+        return None
+    # A name that is not allowed, for which there is a finding, is still that of an instance.
+    return msgspec.structs.replace(config, instances=dict(zip(instances, config.instances.values(), strict=True)))
+
+
+def _partial_scenario(data: Plain, wrong: AbstractSet[str]) -> ScenarioConfig | None:
+    """As `partial_configuration`, for a scenario in a file of its own."""
+    rest = _without(data, {f"scenario.{place}" for place in wrong}, "scenario")
+    try:
+        return msgspec.convert(rest, ScenarioConfig)
+    except msgspec.ValidationError:
+        return None
+
+
+def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
+    """``value`` without its wrong entries; placeholders are in their place where they are in a list."""
+    if isinstance(value, dict):
+        places = {key: f"{path}.{key}" if path else key for key in value}
+        return {
+            key: _without(item, wrong, places[key])
+            for key, item in value.items()
+            if places[key] not in wrong or (isinstance(item, dict | list) and CONTAINERS.fullmatch(places[key]))
+        }
+    if isinstance(value, list):
+        places_of_items = [f"{path}[{index}]" for index in range(len(value))]
+        placeholder = next((own for lists, own in _PLACEHOLDERS.items() if re.fullmatch(lists, path)), None)
+        inside = (place for place in places_of_items for one in wrong if one == place or one.startswith(f"{place}."))
+        if placeholder is None and any(inside):
+            return []
+        pairs = zip(value, places_of_items, strict=True)
+        kept = [placeholder if place in wrong else _without(item, wrong, place) for item, place in pairs]
+        return [{**_mapping(placeholder), **item} if isinstance(item, dict) else item for item in kept]
+    return value
+
+
+def _mapping(value: Plain) -> dict[str, Plain]:
+    return value if isinstance(value, dict) else {}
+
+
+def _simulation(section: Plain, wrong: AbstractSet[str]) -> dict[str, Plain]:
+    times: dict[str, Plain] = {"stop_time": math.nan, "step_size": math.nan}
+    unknown: dict[str, Plain] = {name: math.nan for name in _TIMES if f"simulation.{name}" in wrong}
+    return {**times, **_mapping(section), **unknown}
+
+
+def _with_model(instance: Plain, sections: Mapping[str, type[InstanceSection]]) -> dict[str, Plain]:
+    usual = next(iter(sections))
+    given = instance if isinstance(instance, dict) else {KIND: usual}
+    key = str(given[KIND])
+    with_path: dict[str, Plain] = {key: "", **given}
+    try:
+        msgspec.convert(with_path, sections[key])
+    except msgspec.ValidationError:  # a kind without a file, or one that misses something else
+        shared = {key: given[key] for key in ("step_size", "group", "host", "not_finite") if key in given}
+        return {KIND: usual, usual: "", **shared}
+    return with_path

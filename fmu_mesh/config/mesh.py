@@ -13,28 +13,13 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 from msgspec import Meta
 
-from fmu_mesh.config.base import (
-    ENDPOINT_PATTERN,
-    KEY_PREFIX_PATTERN,
-    NAME_PATTERN,
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHA256_PATTERN,
-    Base,
-    DeadlineSeconds,
-    Endpoint,
-    Name,
-)
+from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
 from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
 from fmu_mesh.config.scenario_section import ScenarioConfig
 
 __all__ = [
-    "ENDPOINT_PATTERN",
-    "KEY_PREFIX_PATTERN",
     "MAX_WINDOW",
-    "NAME_PATTERN",
-    "SHA256_PATTERN",
     "Config",
     "ConnectionConfig",
     "InitializationConfig",
@@ -375,10 +360,8 @@ class Config(Base, frozen=True, kw_only=True):
 def config_type(sections: tuple[type[InstanceSection], ...]) -> type[Config]:
     """The `Config` that a file is converted to, and that its JSON Schema is made from.
 
-    `Config` itself knows no kind of instance, so msgspec needs a hook to decode it; this one needs none.
-
-    Args:
-        sections: the sections of the kinds that instances may have, the usual kind first.
+    `Config` itself knows no kind of instance, so msgspec needs a hook to decode it; this one needs none. The sections
+    are those of the kinds that instances may have, the usual kind first.
     """
     union: Any = reduce(or_, sections)
     instances: Any = Annotated[dict[Name, union], _INSTANCES]

@@ -47,11 +47,7 @@ _SHORT_CONNECTION = {
 def check(value: Plain, kind: inspect.Type, path: str, findings: Findings) -> None:
     """Add a finding for everything in ``value`` that the type ``kind`` does not allow.
 
-    Args:
-        value: the plain value at ``path``.
-        kind: the type as `msgspec.inspect.type_info` gives it.
-        path: the place of the value in the file, such as `connections[2].to`.
-        findings: collects them.
+    The type is as `msgspec.inspect.type_info` gives it; ``path`` is the place of the value, as `connections[2].to`.
     """
     match kind:
         case inspect.Metadata(type=inspect.StrType() as text) if not _fits(value, text):
@@ -91,7 +87,9 @@ def describe(kind: inspect.Type) -> str:
         case inspect.LiteralType():
             words = " or ".join(str(value) for value in kind.values)
         case inspect.FloatType() | inspect.IntType():
-            words = f"a {'finite' if isinstance(kind, inspect.FloatType) else 'whole'} number{_bounds(kind)}"
+            limits = ((">", kind.gt), (">=", kind.ge), ("<=", kind.le))
+            bounds = " and ".join(f"{sign} {limit:g}" for sign, limit in limits if limit is not None)
+            words = f"a {'finite' if isinstance(kind, inspect.FloatType) else 'whole'} number {bounds}".rstrip()
         case inspect.StrType(pattern=str(pattern)):
             words = f"text that matches {pattern}"
         case inspect.StructType():
@@ -107,9 +105,6 @@ def json_schema(config_type: type[msgspec.Struct]) -> dict[str, object]:
     """The JSON Schema (draft 2020-12) of the configuration file, by which editors complete and check it.
 
     What names mean is beyond a schema: `fmu_mesh.system.system` can still refuse a file that is valid by it.
-
-    Args:
-        config_type: the Struct of the whole file.
     """
     (reference,), definitions = msgspec.json.schema_components([config_type])
     config = definitions[config_type.__name__]
@@ -175,8 +170,9 @@ def _check_mapping(value: dict[str, Plain], kind: inspect.DictType, path: str, f
 
 def _check_union(value: Plain, kind: inspect.UnionType, path: str, findings: Findings) -> None:
     options = _options(kind)
-    if isinstance(value, dict):
-        options = [option for option in options if _is_of_kind(value, option)] or options
+    if isinstance(value, dict):  # of several Structs it is the one whose tag it has
+        structs = [option for option in options if isinstance(option, inspect.StructType) and option.tag_field]
+        options = [option for option in structs if value.get(str(option.tag_field)) == option.tag] or options
     for option in options:
         container = isinstance(option, inspect.StructType | inspect.DictType) and isinstance(value, dict)
         if container or (isinstance(option, inspect.ListType) and isinstance(value, list)):
@@ -186,13 +182,6 @@ def _check_union(value: Plain, kind: inspect.UnionType, path: str, findings: Fin
         words = [word for option in options for word in _words(option)]
         suggestion = nearest(value, words) if isinstance(value, str) else None
         findings.add(path, shown(value), describe(kind), suggestion)
-
-
-def _is_of_kind(value: dict[str, Plain], option: inspect.Type) -> bool:
-    """Whether ``option`` is the Struct whose tag a mapping has."""
-    return isinstance(option, inspect.StructType) and (
-        option.tag_field is not None and value.get(option.tag_field) == option.tag
-    )
 
 
 def _options(kind: inspect.UnionType) -> list[inspect.Type]:
@@ -226,9 +215,3 @@ def _within(value: Plain, kind: inspect.FloatType | inspect.IntType) -> bool:
     assert isinstance(value, int | float)
     above = (kind.gt is None or value > kind.gt) and (kind.ge is None or value >= kind.ge)
     return above and (kind.le is None or value <= kind.le)
-
-
-def _bounds(kind: inspect.FloatType | inspect.IntType) -> str:
-    limits = ((">", kind.gt), (">=", kind.ge), ("<=", kind.le))
-    words = [f"{sign} {limit:g}" for sign, limit in limits if limit is not None]
-    return f" {' and '.join(words)}" if words else ""

@@ -16,7 +16,7 @@ import msgspec
 import zenoh
 
 from ..system.plan import NodePlan
-from ..system.settable import check_settable, sources_of, why_not_settable
+from ..system.start_values import why_not_settable
 from ..variables.model_description import Value, Variable
 from ..variables.value_conversion import to_plain
 from ..wire.inbox import Inbox
@@ -266,7 +266,7 @@ class Answers:
             clock = runner.instance.description.clock(name)
             raise ValueRefused(clock or f"'{runner.name}' has no variable '{name}' under '{kind}'")
         try:
-            check_settable(runner.plan, variable)
+            runner.plan.check_settable(variable)
         except ValueRefused as refused:
             raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
         try:
@@ -293,7 +293,7 @@ class _Pending:
 def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
-    sources = sources_of(runner.plan)
+    sources = runner.plan.sources
     return InstanceInfo(
         instance=runner.name,
         model_name=description.model_name,

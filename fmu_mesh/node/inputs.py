@@ -1,7 +1,7 @@
 """Unconnected inputs and tunable parameters over time: what a scenario prescribes, and what programs send with a time.
 
-Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. `fmu_mesh.system.settable` says which
-variables may be set.
+Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. Which variables may be set is
+`fmu_mesh.system.start_values`.
 """
 
 from __future__ import annotations

@@ -9,14 +9,10 @@ from typing import Final
 
 from .. import files
 from ..config.loading import PlainConfig, read_file
-from ..config.mesh import RecordConfig
 from ..errors import ConfigurationError
 from .package import ARCHIVE, beginning, is_package
 
-__all__ = ["RESULT_BESIDE_PACKAGE", "named_package", "names_package", "read_configuration"]
-
-RESULT_BESIDE_PACKAGE: Final = f"../{RecordConfig().file}"
-"""The result file of a package that says none: beside the archive, and not in it."""
+__all__ = ["named_package", "names_package", "read_configuration"]
 
 _YAML: Final = (".yaml", ".yml", ".json")
 _PARTS: Final = (".ssv", ".ssm", ".ssb")

@@ -1,38 +1,64 @@
 """From a mesh to a package of SSP, which `fmu-mesh launch` runs with the same result, and other tools can open.
 
 Owns what goes into a package, and what cannot. A mesh that comes from a package and was not changed keeps the documents
-and files of that package (`kept_package`); any other one gets a new description (`ssd_writing`).
+and files of that package; only our annotation in its description is another one. So geometry, descriptions, annotations
+of other tools and everything else that we do not read survive. Any other mesh gets a new description (`ssd_writing`).
 """
 
 from __future__ import annotations
 
 import json
 import posixpath
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
+from urllib.parse import unquote
 
+from lxml import etree
+
+from ..archives.archive_entries import checked_archive, entry_name
+from ..archives.safe_xml import safe_xml
 from ..config.findings import Findings
 from ..config.loading import PlainConfig, read_file
-from ..config.mesh import Config
+from ..config.mesh import Config, LimitsConfig
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..files import archive_on_the_way, beside, is_file, is_folder
 from ..system.system import ResolvedSystem
-from ..text import nearest_file
-from .document_changes import own_annotation_in, with_own_annotation
-from .kept_package import KeptPackage, kept_package
+from ..text import listed, nearest_file
+from .grammar import NAMESPACES
 from .naming import element_path, instance_name, mesh_name
-from .own_annotation import names_in, without, written
-from .package import DEFAULT
-from .package_writing import PackageEntry, resource_names, write_package
-from .ssd_writing import ElementNames, SspVersion, ssd_of
+from .own_annotation import ANNOTATION_TYPE, names_in, written
+from .package import DEFAULT, Package
+from .package_writing import ArchiveEntry, PackageEntry, resource_names, write_package
+from .ssd_writing import (
+    ElementNames,
+    SspVersion,
+    XmlNode,
+    is_xml_text,
+    own_annotation_in,
+    ssd_of,
+    with_own_annotation,
+)
 from .system_reading import read_system
-from .xml_writing import is_xml_text
 
 __all__ = ["export"]
 
 _OF_CONNECTIONS: Final = ("from", "to", "factor", "offset", "ignore_units", "map")
 """The keys of a connection that SSP can say."""
+
+_FOLDERS: Final = ("resources/", "documentation/", "extra/")
+"""The folders of a package that has been unpacked (SSP 2.0, 3); others may have nothing to do with it."""
+
+_DOCUMENTS: Final = (".ssd", ".ssv", ".ssm")
+_NAMESPACES: Final = frozenset(NAMESPACES.values())
+_LOST: Final = {
+    "SignalDictionary": "signal dictionaries",
+    "SignalDictionaryReference": "references to signal dictionaries",
+    "MetaData": "elements with meta data",
+    "Signature": "signatures",
+}
+_HEAD: Final = ("author", "fileversion", "copyright", "license", "generationDateAndTime")
 
 
 def export(
@@ -55,33 +81,19 @@ def export(
     """
     if path.suffix.lower() != ".ssp":
         raise ConfigurationError(f"'{path}' is no name of a package", hint="Let it end in '.ssp'.")
-    kept = kept_package(plain)
+    kept = _kept_package(plain)
     if kept is not None and (version is None or kept.is_of(version)):
-        original = _read_again(kept)
-        if _is_unchanged(plain, original):
+        place = (kept.root / kept.name,) if is_folder(kept.root) else (kept.root, kept.name)
+        original = read_system(*place, annotated=False)
+        Findings(kept.shown, first=original.findings).raise_any()  # the package may have changed since it was read
+        if json.dumps(_content(plain.data)) == json.dumps(_content(original.data)):
             return _write_copy(plain, original, kept, path)
     units = _write_new(plain, resolve, path, version or "1.0")
     return kept.lost(units) if kept is not None else ()
 
 
-def _read_again(kept: KeptPackage) -> PlainConfig:
-    """The configuration of a package as it is on the disk.
-
-    Raises:
-        ConfigurationError: it is wrong; has all findings.
-    """
-    original = read_system(kept.root / kept.name) if is_folder(kept.root) else read_system(kept.root, kept.name)
-    Findings(kept.shown, first=original.findings).raise_any()
-    return original
-
-
-def _is_unchanged(plain: PlainConfig, original: PlainConfig) -> bool:
-    """Whether a configuration has the instances, start values and connections of a package, in their order."""
-    return json.dumps(_content(plain.data)) == json.dumps(_content(original.data))
-
-
 def _content(data: Any) -> list[Any]:  # noqa: ANN401  values of a file
-    """What a configuration says that SSP can say."""
+    """What a configuration says that SSP can say, in its order."""
     instances = [
         (name, section.get("fmu"), section.get("kind", "auto"), section.get("start_values") or {})
         for name, section in data.get("instances", {}).items()
@@ -93,17 +105,12 @@ def _content(data: Any) -> list[Any]:  # noqa: ANN401  values of a file
     return [instances, connections]
 
 
-def _write_copy(plain: PlainConfig, original: PlainConfig, kept: KeptPackage, path: Path) -> tuple[Finding, ...]:
+def _write_copy(plain: PlainConfig, original: PlainConfig, kept: _KeptPackage, path: Path) -> tuple[Finding, ...]:
     """Write a copy of the package with an annotation of ours that says the rest."""
-    findings = Findings(str(plain.file), plain.lines, plain.overrides)
-    data = _with_scenario(plain, findings)
-    _check_files(data, findings)
-    findings.raise_any()
+    data = _packable(plain)
     described: Mapping[str, Any] = original.data if isinstance(original.data, dict) else {}
-    names: dict[str, str] = {}
     before = own_annotation_in(kept.document)
-    if before is not None:
-        described, names = without(described, before), names_in(before)
+    names = names_in(before) if before is not None else {}
     annotation = written(data, described, names=names, moved=_to_package(plain.file))
     document = kept.document if annotation == before else with_own_annotation(kept.document, annotation)
     try:
@@ -120,11 +127,7 @@ def _write_copy(plain: PlainConfig, original: PlainConfig, kept: KeptPackage, pa
 
 def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: Path, version: SspVersion) -> set[str]:
     """Write a package with a new description; returns the names of its units."""
-    findings = Findings(str(plain.file), plain.lines, plain.overrides)
-    data = _with_scenario(plain, findings)
-    _check_kinds(data, findings)
-    _check_files(data, findings)
-    findings.raise_any()
+    data = _packable(plain, fmus_only=True)
     system = resolve()
     models = {name: Path(instance.fmu) for name, instance in system.instances.items()}
     resources = resource_names(models.values())
@@ -137,12 +140,13 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
     )
     data = {**data, "simulation": {"algorithm": system.config.simulation.algorithm, **data["simulation"]}}
     annotation = written(data, _described(system.config), names=changed, moved=_to_package(plain.file))
-    document = ssd_of(system, names, version, annotation, findings)
+    findings = Findings(str(plain.file), plain.lines, plain.overrides)
+    document, units = ssd_of(system, names, version, annotation, findings)
     findings.raise_any()
     models_of = {resource: model for model, resource in reversed(resources.items())}
     entries = [PackageEntry(resource, models_of[resource]) for resource in dict.fromkeys(resources.values())]
-    write_package(path, [PackageEntry(DEFAULT, document.xml), *entries])
-    return document.units
+    write_package(path, [PackageEntry(DEFAULT, document), *entries])
+    return units
 
 
 def _described(config: Config) -> dict[str, Any]:
@@ -178,44 +182,42 @@ def _element_names(instances: Sequence[str]) -> tuple[dict[str, str], dict[str, 
     return elements, {default: name for name, default in defaults.items() if default != name}
 
 
-def _with_scenario(plain: PlainConfig, findings: Findings) -> dict[str, Any]:
-    """The values of the configuration with the scenario that it may name a file of."""
+def _packable(plain: PlainConfig, *, fmus_only: bool = False) -> dict[str, Any]:
+    """The values of the configuration with the scenario that it may name a file of.
+
+    Raises:
+        ConfigurationError: a file cannot go into a package, or with ``fmus_only`` there is an instance that is no FMU.
+    """
+    findings = Findings(str(plain.file), plain.lines, plain.overrides)
     data = plain.data
-    if not isinstance(data, dict) or not isinstance(data.get("instances"), dict):
+    instances = data.get("instances") if isinstance(data, dict) else None
+    if not isinstance(data, dict) or not isinstance(instances, dict):
         findings.add("", "no mapping with instances", "a configuration")
         findings.raise_any()
     assert isinstance(data, dict)  # see above
-    scenario = data.get("scenario")
-    if not isinstance(scenario, str):
-        return data
-    file = beside(plain.file, scenario)
-    if not is_file(file):
-        findings.add("scenario", f"no such file '{scenario}'", "a file with values and events", nearest_file(file))
-        return data
-    return {**data, "scenario": read_file(file).data}
-
-
-def _check_kinds(data: Mapping[str, Any], findings: Findings) -> None:
-    """Add a finding for every instance that is no FMU."""
-    for name, section in data["instances"].items():
+    assert isinstance(instances, dict)
+    if isinstance(named := data.get("scenario"), str):
+        file = beside(plain.file, named)
+        if is_file(file):
+            data = {**data, "scenario": read_file(file).data}
+        else:
+            findings.add("scenario", f"no such file '{named}'", "a file with values and events", nearest_file(file))
+    for name, section in instances.items() if fmus_only else ():
         if isinstance(section, dict) and section and "fmu" not in section:
             found = f"'{name}', which is no FMU but has the key '{next(iter(section))}'"
             expected = "only FMUs: SSP has no components of other kinds. Export the mesh without it"
             findings.add(f"instances.{name}", found, expected)
-
-
-def _check_files(data: Mapping[str, Any], findings: Findings) -> None:
-    """Add a finding for every file that cannot go into a package."""
-    scenario = data.get("scenario")
+    scenario, zenoh = data.get("scenario"), data.get("zenoh")
     values = scenario.get("values") if isinstance(scenario, dict) else None
-    for name, entry in (values or {}).items():
+    for name, entry in values.items() if isinstance(values, dict) else ():
         if isinstance(entry, dict) and entry.get("file") is not None:
             found = f"values from the file '{entry['file']}', which has no place in a package"
             findings.add(f"scenario.values.{name}", found, "`times` and `values`, or no entry for this variable")
-    zenoh = data.get("zenoh")
     if isinstance(zenoh, dict) and zenoh.get("config") is not None:
         found = f"the file '{zenoh['config']}', which has no place in a package"
         findings.add("zenoh.config", found, "the keys of the section `zenoh`, such as `connect`")
+    findings.raise_any()
+    return data
 
 
 def _to_package(file: Path) -> Callable[[str], str]:
@@ -225,3 +227,140 @@ def _to_package(file: Path) -> Callable[[str], str]:
         return lambda path: path
     folder = file.parent.relative_to(package.parent).as_posix()
     return lambda path: posixpath.normpath(posixpath.join(folder, path))
+
+
+class _KeptPackage(NamedTuple):
+    """A package on the disk, an archive or a folder, with the name and the bytes of the description that was read."""
+
+    root: Path
+    name: str
+    document: bytes
+
+    @property
+    def shown(self) -> str:
+        """The description as messages name it."""
+        return str(self.root / self.name)
+
+    def is_of(self, version: str) -> bool:
+        """Whether the description, and all sets and mappings that it has or refers to, are of a version of SSP."""
+        own = self._tree()
+        with Package(self.root) as package:
+            names = [name for name in _sources(own) if name.lower().endswith(_DOCUMENTS) and package.exists(name)]
+            others = [safe_xml(package.read(name), f"'{package.shown(name)}'") for name in names]
+        elements = (one for root in (own, *others) for one in root.iter() if isinstance(one.tag, str))
+        said = {one.get("version") for one in elements if etree.QName(one).namespace in _NAMESPACES}
+        return said <= {version, None}
+
+    @contextmanager
+    def copied(self, document: bytes) -> Iterator[list[PackageEntry]]:
+        """The files of a copy of the package, with another content of the description.
+
+        Raises:
+            LoadFailed, OSError: the package cannot be read.
+            ConfigurationError: a link, or a file that the description names, leads out of the folder.
+        """
+        if is_file(self.root):
+            with self.root.open("rb") as file, checked_archive(self.root, file, LimitsConfig(), "package") as archive:
+                entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+                yield [
+                    PackageEntry(name, document if name == self.name else ArchiveEntry(archive, entry))
+                    for entry in entries
+                    for name in [entry_name(entry)]
+                ]
+            return
+        if beside := sorted(source for source in _sources(self._tree()) if source.startswith("../")):
+            text = f"'{self.shown}' names '{beside[0]}', which is not in the folder of the package"
+            raise ConfigurationError(text, hint="Copy it into the folder, and name the copy.")
+        names = self._names_in_folder()
+        main = DEFAULT if DEFAULT not in names else self.name
+        others = [PackageEntry(name, self._own_file(name)) for name in names if name != self.name]
+        yield [PackageEntry(main, document), *others]
+
+    def _own_file(self, name: str) -> Path:
+        """The path of a file of a folder; what is copied is given to others, and so must not be somewhere else."""
+        path = self.root / name
+        if not path.resolve().is_relative_to(self.root.resolve()):
+            text = f"'{path}' is a link out of the folder of the package"
+            raise ConfigurationError(text, hint="Put the file itself in its place.")
+        return path
+
+    def lost(self, kept_units: set[str]) -> tuple[Finding, ...]:
+        """What a new description, which defines the units ``kept_units``, does not have; each with its first line."""
+        root = self._tree()
+        found = [*_lost_elements(root, kept_units), *self._lost_files(root)]
+        return tuple(Finding(self.shown, "", f"not in the new package: {text}", "", line=line) for line, text in found)
+
+    def _tree(self) -> XmlNode:
+        return safe_xml(self.document, f"'{self.shown}'")
+
+    def _lost_files(self, root: XmlNode) -> Iterator[tuple[int | None, str]]:
+        """The files that a new package does not have: all but the FMUs."""
+        sources = _sources(root)
+        with Package(self.root) as package:
+            names = package.names() if package.is_archive else self._names_in_folder()
+        fmus = {name for name in names if name in sources and name.lower().endswith(".fmu")}
+        others = [name for name in names if name not in fmus and name != self.name]
+        if others:
+            yield None, f"files ({len(others)}): {listed(others)}"
+
+    def _names_in_folder(self) -> list[str]:
+        """The files in a folder that belong to the package."""
+        with Package(self.root) as package:
+            names, documents = package.names(), package.descriptions
+            sources = {source for name in documents for source in _sources(safe_xml(package.read(name), f"'{name}'"))}
+        return [name for name in names if name in documents or name.startswith(_FOLDERS) or name in sources]
+
+
+def _kept_package(plain: PlainConfig) -> _KeptPackage | None:
+    """The package that a configuration was read from; None if it was not.
+
+    Raises:
+        ConfigurationError: it cannot be read any more.
+    """
+    file = plain.file
+    if file.suffix.lower() != ".ssd":
+        return None
+    root = archive_on_the_way(file) or file.parent
+    name = file.relative_to(root).as_posix()
+    if "/" in name:
+        return None  # of a package inside another archive
+    with Package(root) as package:
+        return _KeptPackage(root, name, package.read(name))
+
+
+def _sources(root: XmlNode) -> set[str]:
+    """The files that a description at the root of a package refers to."""
+    uris = (element.get("source") for element in root.iter() if isinstance(element.tag, str))
+    return {posixpath.normpath(unquote(uri.partition("#")[0])) for uri in uris if uri}
+
+
+def _lost_elements(root: XmlNode, kept_units: set[str]) -> Iterator[tuple[int | None, str]]:
+    """What stands in a description and is not in a new one, with the line of the first one."""
+    groups: dict[str, list[XmlNode]] = {}
+    for element in root.iter():
+        if not isinstance(element.tag, str) or etree.QName(element).namespace not in _NAMESPACES:
+            continue
+        for what in (_kind_of(element, kept_units), "descriptions" if element.get("description") else None):
+            if what is not None:
+                groups.setdefault(what, []).append(element)
+    for what, elements in groups.items():
+        yield elements[0].sourceline, f"{what} ({len(elements)})"
+    head = [f"{key} '{root.get(key)}'" for key in _HEAD if root.get(key)]
+    if head:
+        yield root.sourceline, listed(head)
+
+
+def _kind_of(element: XmlNode, kept_units: set[str]) -> str | None:
+    """What is lost with an element, in words; None if it has a place in a new description."""
+    name, own = etree.QName(element).localname, element.get("name")
+    around = element.getparent()
+    parent = etree.QName(around).localname if around is not None else None
+    special = {
+        "nested systems": (name == "System" and parent != "SystemStructureDescription")
+        or (name == "Component" and "x-ssp" in (element.get("type") or "")),
+        "lists of connectors of systems": name == "Connectors" and parent == "System",
+        f"annotations '{element.get('type')}'": name == "Annotation" and element.get("type") != ANNOTATION_TYPE,
+        f"the unit '{own}', which no FMU defines": name == "Unit" and own not in kept_units,
+        "elements with geometry": name == "GraphicalElements" or name.endswith("Geometry"),
+    }
+    return next((what for what, applies in special.items() if applies), _LOST.get(name))

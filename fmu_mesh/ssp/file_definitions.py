@@ -32,14 +32,10 @@ _BOOLEANS: Final = {"true": "true", "1": "true", "false": "false", "0": "false"}
 def units_of(
     root: XmlElement, tag: str, problems: Problems, around: Mapping[str, Unit] = MappingProxyType({})
 ) -> dict[str, Unit]:
-    """The units of a file, by name; those that it uses and does not define have no base units.
+    """The units of a file by name, or those of a parameter set with the ones of the file ``around`` it.
 
-    Args:
-        root: the root of the file, or of a parameter set inside another file.
-        tag: of the list in it: `ssd:Units`, `ssv:Units` or `ssb:Units`.
-        problems: where a second unit of one name goes, and a unit into which nothing can be converted; such a unit has
-            no base units. There is one warning about all units that are not defined.
-        around: the units of the file around a parameter set.
+    Those that it uses and does not define have no base units; there is one warning about all of them. A second unit of
+    one name is a finding, and so is one into which nothing can be converted, which has no base units, too.
     """
     units = dict(around)
     for element in _unique(root, tag, "ssc:Unit", problems):
@@ -74,23 +70,15 @@ def _defined(name: str, defined: Collection[str], kind: Literal["Unit", "Enumera
     return f"one of its {kind}s: {listed([*defined])}{f' (did you mean {shown(near)}?)' if near is not None else ''}"
 
 
-def unit_named(name: str, units: Mapping[str, Unit]) -> Unit:
-    """The unit that an attribute `unit` names; an empty name is explicitly no unit.
-
-    Args:
-        name: the value of the attribute.
-        units: what `units_of` returned for the file.
-    """
-    return units[name] if name else Unit("")
+def unit_named(name: str | None, units: Mapping[str, Unit]) -> Unit | None:
+    """The unit that an attribute `unit` names; an empty name is explicitly no unit, None is none at all."""
+    return units[name] if name else None if name is None else Unit("")
 
 
 def enumerations_of(root: XmlElement, tag: str, problems: Problems) -> dict[str, Enumeration]:
-    """The enumerations that a file defines, by name.
+    """The enumerations that a file or a parameter set defines, by name.
 
-    Args:
-        root: the root of the file, or of a parameter set inside another file.
-        tag: of the list in it: `ssd:Enumerations`, `ssv:Enumerations` or `ssb:Enumerations`.
-        problems: where a second enumeration or item of one name goes, and numbers of more than 64 bits.
+    A second enumeration or item of one name is a finding, and so is a number of more than 64 bits.
     """
     enumerations: dict[str, Enumeration] = {}
     for element in _unique(root, tag, "ssc:Enumeration", problems):
@@ -110,14 +98,7 @@ def enumerations_of(root: XmlElement, tag: str, problems: Problems) -> dict[str,
 def enumeration_named(
     name: str, enumerations: Mapping[str, Enumeration], place: FilePlace, problems: Problems
 ) -> Enumeration | None:
-    """The enumeration that an attribute `name` of a type names; None after a warning if the file does not define it.
-
-    Args:
-        name: the value of the attribute.
-        enumerations: what `enumerations_of` returned for the file.
-        place: the element with the attribute.
-        problems: where the warning goes.
-    """
+    """The enumeration that an attribute `name` of a type names; None after a warning if the file does not define it."""
     found = enumerations.get(name)
     if found is None and name:  # without a name there is a finding
         found_name = f"the enumeration {shown(name)}, which the file does not define: the items of the FMU count"
@@ -129,10 +110,6 @@ def transformation_of(element: XmlElement, problems: Problems) -> Transformation
     """The transformation of a connection or of an entry of a mapping; None if it has none.
 
     Entries of a mapping whose values are wrong, and all but the first for one source, are findings and left out.
-
-    Args:
-        element: the `ssd:Connection` or `ssm:MappingEntry`.
-        problems: where mistakes go.
     """
     found = [*element.children(*_KINDS)]
     if not found:

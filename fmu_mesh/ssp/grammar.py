@@ -44,19 +44,8 @@ _IN_WORDS: Final = {
 }
 
 _TYPES_OF_1: Final = ("Real", "Integer", "Boolean", "String", "Enumeration", "Binary")
-_TYPES_OF_2: Final = (
-    "Float64",
-    "Float32",
-    "Int8",
-    "UInt8",
-    "Int16",
-    "UInt16",
-    "Int32",
-    "UInt32",
-    "Int64",
-    "UInt64",
-)
-TYPES: Final = (*_TYPES_OF_1, *_TYPES_OF_2, "Clock")
+_INTEGERS_OF_2: Final = tuple(f"{sign}{bits}" for bits in (8, 16, 32, 64) for sign in ("Int", "UInt"))
+TYPES: Final = (*_TYPES_OF_1, "Float64", "Float32", *_INTEGERS_OF_2, "Clock")
 """The elements that say the type of a connector."""
 
 
@@ -102,238 +91,131 @@ class Rule(msgspec.Struct, frozen=True):
     since: str = "1.0"
 
 
-_KINDS = get_args(ConnectorKind)
-_IMPLEMENTATIONS = ("any", "CoSimulation", "ModelExchange", "ScheduledExecution")
-_BASES = ("SSD", "component")
-
-_text, _name, _number, _integer = (
-    Attribute("text"),
-    Attribute("name", required=True),
-    Attribute("number"),
-    Attribute("integer"),
-)
-_boolean, _needed = Attribute("boolean"), Attribute("text", required=True)
-_SELF = {"id": _text, "description": _text}
-_TOP = {
-    **_SELF,
-    "version": _needed,
-    "author": _text,
-    "fileversion": _text,
-    "copyright": _text,
-    "license": _text,
-    "generationTool": _text,
-    "generationDateAndTime": _text,
+_WORDS: Final[dict[str, tuple[str, ...]]] = {
+    "kind": get_args(ConnectorKind),
+    "implementation": ("any", "CoSimulation", "ModelExchange", "ScheduledExecution"),
+    "base": ("SSD", "component"),
 }
-_META = {"ssc:MetaData": True, "ssc:Signature": True}
-_ANYTHING = Rule(anything=True)
-_TRANSFORMATIONS = {
-    "ssc:LinearTransformation": False,
-    "ssc:BooleanMappingTransformation": False,
-    "ssc:IntegerMappingTransformation": False,
-    "ssc:EnumerationMappingTransformation": False,
-}
-_ELEMENT = {
-    "ssd:Connectors": False,
-    "ssd:ElementGeometry": False,
-    "ssd:ParameterBindings": False,
-    **_META,
-    "ssd:Annotations": False,
-}
-_SOURCE = {
-    **_SELF,
-    "type": _text,
-    "source": _text,
-    "sourceBase": Attribute("text", words=_BASES),
-}
+"""The types of attributes that have only some values."""
+
+_ATTRIBUTE: Final = re.compile(r"([\w-]+)(?::(\w+))?([!*2]*)")
+_CHILD: Final = re.compile(r"(\w+:\w+)([!*|]*)")
 
 
-def _since(name: str) -> str:
-    return "1.0" if name in _TYPES_OF_1 else "2.0"
+def _rule(attributes: str = "", children: str = "", since: str = "1.0") -> Rule:
+    """A rule in short.
+
+    An attribute is `name:type`, or the name alone for a text; then `!` if it is required, `*` for a list, `2` if it is
+    one of SSP 2.0. A child is its tag; then `*` if there may be several, `!` if it is required, `|` if one of these is.
+    """
+    own: dict[str, Attribute] = {}
+    for name, type_, marks in _ATTRIBUTE.findall(attributes):
+        words, since_own = _WORDS.get(type_, ()), "2.0" if "2" in marks else "1.0"
+        own[name] = Attribute("text" if words else type_ or "text", "!" in marks, words, "*" in marks, since_own)
+    found = _CHILD.findall(children)
+    required, choice = (tuple(tag for tag, marks in found if sign in marks) for sign in "!|")
+    return Rule(own, {tag: "*" in marks for tag, marks in found}, required, choice, since=since)
 
 
-def _connector_types() -> dict[str, Rule]:
-    """The type elements of connectors and of signals."""
-    rules = {f"ssc:{name}": Rule(since=_since(name)) for name in TYPES}
-    for name in ("Real", "Float64", "Float32"):
-        rules[f"ssc:{name}"] = Rule({"unit": _text}, since=_since(name))
-    rules["ssc:Enumeration"] = Rule({"name": _name, **_SELF}, {"ssc:Item": True, "ssc:Annotations": False})
-    rules["ssc:Binary"] = Rule({"mime-type": _text})
-    rules["ssc:Clock"] = Rule(anything=True, since="2.0")
-    return rules
-
-
-def _value_types() -> dict[str, Rule]:
-    """The type elements of parameters."""
-    rules = {}
-    for name in (*_TYPES_OF_1, *_TYPES_OF_2):
-        has_values = name in ("String", "Enumeration", "Binary")
-        own = {"value": Attribute("text", required=not has_values)}
-        if name in ("Real", "Float64", "Float32"):
-            own["unit"] = _text
-        if name == "Enumeration":
-            own["name"] = _text
-        if name == "Binary":
-            own["mime-type"] = _text
-        rules[f"ssv:{name}"] = Rule(own, {"ssv:Value": True} if has_values else {}, since=_since(name))
-    return rules
-
-
-_CONNECTOR_TYPES = {f"ssc:{name}": False for name in TYPES}
-_VALUE_TYPES = {f"ssv:{name}": False for name in (*_TYPES_OF_1, *_TYPES_OF_2)}
-_DIMENSIONS = {"ssc:Dimension": True}
+_SINCE: Final = {**dict.fromkeys(_TYPES_OF_1, "1.0"), **dict.fromkeys(TYPES[len(_TYPES_OF_1) :], "2.0")}
+_FLOATS: Final = ("Real", "Float64", "Float32")
+_MAPPED: Final = ("Boolean", "Integer", "Enumeration")
+_SELF = "id description"
+_NAMED = f"{_SELF} name:name!"
+_TOP = f"{_SELF} version! author fileversion copyright license generationTool generationDateAndTime"
+_META = "ssc:MetaData* ssc:Signature*"
+_SOURCE = f"{_SELF} type source sourceBase:base"
+_ELEMENT = f"ssd:Connectors ssd:ElementGeometry ssd:ParameterBindings {_META} ssd:Annotations"
+_CONNECTOR_TYPES = " ".join(f"ssc:{name}" for name in TYPES)
+_ONE_OF_THE_TYPES = " ".join(f"ssc:{name}|" for name in TYPES)
+_VALUE_TYPES = " ".join(f"ssv:{name}|" for name in TYPES if name != "Clock")
+_TRANSFORMATIONS = " ".join(f"ssc:{kind}Transformation" for kind in ("Linear", *(f"{one}Mapping" for one in _MAPPED)))
 
 GRAMMAR: Final[dict[str, Rule]] = {
     # --- system structure descriptions
-    "ssd:SystemStructureDescription": Rule(
-        {**_TOP, "name": _needed},
-        {
-            "ssd:System": False,
-            "ssd:Enumerations": False,
-            "ssd:Units": False,
-            "ssd:DefaultExperiment": False,
-            **_META,
-            "ssd:Annotations": False,
-        },
-        ("ssd:System",),
+    "ssd:SystemStructureDescription": _rule(
+        f"{_TOP} name!",
+        f"ssd:System! ssd:Enumerations ssd:Units ssd:DefaultExperiment {_META} ssd:Annotations",
     ),
-    "ssd:System": Rule(
-        {**_SELF, "name": _name},
-        {
-            **_ELEMENT,
-            "ssd:Elements": False,
-            "ssd:Connections": False,
-            "ssd:SignalDictionaries": False,
-            "ssd:SystemGeometry": False,
-            "ssd:GraphicalElements": False,
-        },
+    "ssd:System": _rule(
+        _NAMED,
+        f"{_ELEMENT} ssd:Elements ssd:Connections ssd:SignalDictionaries ssd:SystemGeometry ssd:GraphicalElements",
     ),
-    "ssd:Component": Rule(
-        {
-            **_SELF,
-            "name": _name,
-            "type": _text,
-            "source": _text,
-            "implementation": Attribute("text", words=_IMPLEMENTATIONS),
-        },
-        _ELEMENT,
+    "ssd:Component": _rule(f"{_NAMED} type source implementation:implementation", _ELEMENT),
+    "ssd:SignalDictionaryReference": _rule(f"{_NAMED} dictionary:name!", _ELEMENT),
+    "ssd:Elements": _rule("", "ssd:Component* ssd:System* ssd:SignalDictionaryReference*"),
+    "ssd:Connectors": _rule("", "ssd:Connector*"),
+    "ssd:Connector": _rule(
+        f"{_NAMED} kind:kind!",
+        f"{_CONNECTOR_TYPES} ssc:Dimension* ssd:Clock* ssd:ConnectorGeometry {_META} ssd:Annotations",
     ),
-    "ssd:SignalDictionaryReference": Rule({**_SELF, "name": _name, "dictionary": _name}, _ELEMENT),
-    "ssd:Elements": Rule({}, {"ssd:Component": True, "ssd:System": True, "ssd:SignalDictionaryReference": True}),
-    "ssd:Connectors": Rule({}, {"ssd:Connector": True}),
-    "ssd:Connector": Rule(
-        {**_SELF, "name": _name, "kind": Attribute("text", required=True, words=_KINDS)},
-        {
-            **_CONNECTOR_TYPES,
-            **_DIMENSIONS,
-            "ssd:Clock": True,
-            "ssd:ConnectorGeometry": False,
-            **_META,
-            "ssd:Annotations": False,
-        },
+    "ssd:Clock": _rule("name:name!", since="2.0"),
+    "ssd:Connections": _rule("", "ssd:Connection*"),
+    "ssd:Connection": _rule(
+        f"{_SELF} startElement startConnector:name! endElement endConnector:name! startIndices:size*2 "
+        "endIndices:size*2 suppressUnitConversion:boolean",
+        f"{_TRANSFORMATIONS} ssd:ConnectionGeometry {_META} ssd:Annotations",
     ),
-    "ssd:Clock": Rule({"name": _name}, since="2.0"),
-    "ssd:Connections": Rule({}, {"ssd:Connection": True}),
-    "ssd:Connection": Rule(
-        {
-            **_SELF,
-            "startElement": _text,
-            "startConnector": _name,
-            "endElement": _text,
-            "endConnector": _name,
-            "startIndices": Attribute("size", is_list=True, since="2.0"),
-            "endIndices": Attribute("size", is_list=True, since="2.0"),
-            "suppressUnitConversion": _boolean,
-        },
-        {**_TRANSFORMATIONS, "ssd:ConnectionGeometry": False, **_META, "ssd:Annotations": False},
+    "ssd:ParameterBindings": _rule("", "ssd:ParameterBinding*"),
+    "ssd:ParameterBinding": _rule(
+        f"{_SOURCE} prefix", f"ssd:ParameterValues ssd:ParameterMapping {_META} ssd:Annotations"
     ),
-    "ssd:ParameterBindings": Rule({}, {"ssd:ParameterBinding": True}),
-    "ssd:ParameterBinding": Rule(
-        {**_SOURCE, "prefix": _text},
-        {"ssd:ParameterValues": False, "ssd:ParameterMapping": False, **_META, "ssd:Annotations": False},
-    ),
-    "ssd:ParameterValues": Rule({}, {"ssv:ParameterSet": False}),
-    "ssd:ParameterMapping": Rule(_SOURCE, {"ssm:ParameterMapping": False, **_META, "ssd:Annotations": False}),
-    "ssd:SignalDictionaries": Rule({}, {"ssd:SignalDictionary": True}),
-    "ssd:SignalDictionary": Rule(
-        {**_SELF, "name": _name, "type": _text, "source": _text},
-        {"ssb:SignalDictionary": False, **_META, "ssd:Annotations": False},
-    ),
-    "ssd:DefaultExperiment": Rule(
-        {**_SELF, "startTime": _number, "stopTime": _number}, {**_META, "ssd:Annotations": False}
-    ),
-    "ssd:Enumerations": Rule({}, {"ssc:Enumeration": True}),
-    "ssd:Units": Rule({}, {"ssc:Unit": True}),
-    "ssd:Annotations": Rule({}, {"ssc:Annotation": True}),
-    **dict.fromkeys(
-        (
-            "ssd:ConnectorGeometry",
-            "ssd:ElementGeometry",
-            "ssd:ConnectionGeometry",
-            "ssd:SystemGeometry",
-            "ssd:GraphicalElements",
-            "ssc:MetaData",
-            "ssc:Signature",
-            "ssc:Annotation",
-        ),
-        _ANYTHING,
-    ),
+    "ssd:ParameterValues": _rule("", "ssv:ParameterSet"),
+    "ssd:ParameterMapping": _rule(_SOURCE, f"ssm:ParameterMapping {_META} ssd:Annotations"),
+    "ssd:SignalDictionaries": _rule("", "ssd:SignalDictionary*"),
+    "ssd:SignalDictionary": _rule(f"{_NAMED} type source", f"ssb:SignalDictionary {_META} ssd:Annotations"),
+    "ssd:DefaultExperiment": _rule(f"{_SELF} startTime:number stopTime:number", f"{_META} ssd:Annotations"),
+    **{f"ssd:{name}Geometry": Rule(anything=True) for name in ("Connector", "Element", "Connection", "System")},
+    "ssd:GraphicalElements": Rule(anything=True),
     # --- common
-    **_connector_types(),
-    "ssc:Dimension": Rule({"size": Attribute("size"), "sizeConnector": _text}, since="2.0"),
-    "ssc:Item": Rule({"name": _needed, "value": Attribute("integer", required=True)}),
-    "ssc:Unit": Rule({**_SELF, "name": _needed}, {"ssc:BaseUnit": False, "ssc:Annotations": False}, ("ssc:BaseUnit",)),
-    "ssc:BaseUnit": Rule(
-        {
-            **dict.fromkeys(("kg", "m", "s", "A", "K", "mol", "cd", "rad"), _integer),
-            "factor": _number,
-            "offset": _number,
-        }
-    ),
-    "ssc:Annotations": Rule({}, {"ssc:Annotation": True}),
-    "ssc:LinearTransformation": Rule({"factor": _number, "offset": _number}),
+    **{f"ssc:{name}": Rule(anything=True) for name in ("MetaData", "Signature", "Annotation")},
     **{
-        f"ssc:{kind}MappingTransformation": Rule({}, {"ssc:MapEntry": True}, ("ssc:MapEntry",))
-        for kind in ("Boolean", "Integer", "Enumeration")
+        f"{prefix}:{name}s": _rule("", f"ssc:{name}*")
+        for prefix, names in (
+            ("ssd", ("Enumeration", "Unit", "Annotation")),
+            ("ssv", ("Enumeration", "Unit", "Annotation")),
+            ("ssb", ("Enumeration", "Unit", "Annotation")),
+            ("ssm", ("Annotation",)),
+            ("ssc", ("Annotation",)),
+        )
+        for name in names
     },
-    "ssc:MapEntry": Rule({"source": _needed, "target": _needed}),
+    **{f"ssc:{name}": _rule("unit" if name in _FLOATS else "", since=_SINCE[name]) for name in TYPES},
+    "ssc:Enumeration": _rule(f"name:name! {_SELF}", "ssc:Item* ssc:Annotations"),
+    "ssc:Binary": _rule("mime-type"),
+    "ssc:Clock": Rule(anything=True, since="2.0"),
+    "ssc:Dimension": _rule("size:size sizeConnector", since="2.0"),
+    "ssc:Item": _rule("name! value:integer!"),
+    "ssc:Unit": _rule(f"{_SELF} name!", "ssc:BaseUnit! ssc:Annotations"),
+    "ssc:BaseUnit": _rule(
+        "kg:integer m:integer s:integer A:integer K:integer mol:integer cd:integer rad:integer "
+        "factor:number offset:number"
+    ),
+    "ssc:LinearTransformation": _rule("factor:number offset:number"),
+    **{f"ssc:{kind}MappingTransformation": _rule("", "ssc:MapEntry*!") for kind in _MAPPED},
+    "ssc:MapEntry": _rule("source! target!"),
     # --- parameter values
-    "ssv:ParameterSet": Rule(
-        {**_TOP, "name": _needed},
-        {"ssv:Parameters": False, "ssv:Enumerations": False, "ssv:Units": False, **_META, "ssv:Annotations": False},
-        ("ssv:Parameters",),
-    ),
-    "ssv:Parameters": Rule({}, {"ssv:Parameter": True}),
-    "ssv:Parameter": Rule(
-        {**_SELF, "name": _name},
-        {**_VALUE_TYPES, **_DIMENSIONS, **_META, "ssv:Annotations": False},
-        choice=tuple(_VALUE_TYPES),
-    ),
-    **_value_types(),
-    "ssv:Value": Rule({"value": _needed}, since="2.0"),
-    "ssv:Enumerations": Rule({}, {"ssc:Enumeration": True}),
-    "ssv:Units": Rule({}, {"ssc:Unit": True}),
-    "ssv:Annotations": Rule({}, {"ssc:Annotation": True}),
+    "ssv:ParameterSet": _rule(f"{_TOP} name!", f"ssv:Parameters! ssv:Enumerations ssv:Units {_META} ssv:Annotations"),
+    "ssv:Parameters": _rule("", "ssv:Parameter*"),
+    "ssv:Parameter": _rule(_NAMED, f"{_VALUE_TYPES} ssc:Dimension* {_META} ssv:Annotations"),
+    **{
+        f"ssv:{name}": _rule("value! unit" if name in _FLOATS else "value!", since=_SINCE[name])
+        for name in TYPES
+        if name != "Clock"
+    },
+    "ssv:String": _rule("value", "ssv:Value*"),
+    "ssv:Enumeration": _rule("value name", "ssv:Value*"),
+    "ssv:Binary": _rule("value mime-type", "ssv:Value*"),
+    "ssv:Value": _rule("value!", since="2.0"),
     # --- parameter mappings
-    "ssm:ParameterMapping": Rule(_TOP, {"ssm:MappingEntry": True, **_META, "ssm:Annotations": False}),
-    "ssm:MappingEntry": Rule(
-        # Tools write entries without a source for parameters that they do not map.
-        {**_SELF, "source": _needed, "target": _name, "suppressUnitConversion": _boolean},
-        {**_TRANSFORMATIONS, "ssm:Annotations": False},
+    "ssm:ParameterMapping": _rule(_TOP, f"ssm:MappingEntry* {_META} ssm:Annotations"),
+    # Tools write entries without a source for parameters that they do not map: it may be an empty text.
+    "ssm:MappingEntry": _rule(
+        f"{_SELF} source! target:name! suppressUnitConversion:boolean", f"{_TRANSFORMATIONS} ssm:Annotations"
     ),
-    "ssm:Annotations": Rule({}, {"ssc:Annotation": True}),
     # --- signal dictionaries
-    "ssb:SignalDictionary": Rule(
-        _TOP,
-        {"ssb:DictionaryEntry": True, "ssb:Enumerations": False, "ssb:Units": False, **_META, "ssb:Annotations": False},
-    ),
-    "ssb:DictionaryEntry": Rule(
-        {**_SELF, "name": _name},
-        {**_CONNECTOR_TYPES, **_DIMENSIONS, **_META, "ssb:Annotations": False},
-        choice=tuple(_CONNECTOR_TYPES),
-    ),
-    "ssb:Enumerations": Rule({}, {"ssc:Enumeration": True}),
-    "ssb:Units": Rule({}, {"ssc:Unit": True}),
-    "ssb:Annotations": Rule({}, {"ssc:Annotation": True}),
+    "ssb:SignalDictionary": _rule(_TOP, f"ssb:DictionaryEntry* ssb:Enumerations ssb:Units {_META} ssb:Annotations"),
+    "ssb:DictionaryEntry": _rule(_NAMED, f"{_ONE_OF_THE_TYPES} ssc:Dimension* {_META} ssb:Annotations"),
 }
 """By tag with the usual prefix."""
 

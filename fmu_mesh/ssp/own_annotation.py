@@ -29,7 +29,6 @@ __all__ = [
     "Merged",
     "merged",
     "names_in",
-    "without",
     "written",
 ]
 
@@ -77,12 +76,7 @@ _LARGEST_TEXT: Final = 4 * 2**20
 
 
 class AnnotationRefused(ValueError):
-    """The text of an annotation is none of ours.
-
-    Args:
-        found: what there is.
-        expected: what should be there.
-    """
+    """The text of an annotation is none of ours: there is something else ``found`` than ``expected``."""
 
     def __init__(self, found: str, expected: str) -> None:
         super().__init__(f"{found}; expected {expected}")
@@ -94,7 +88,6 @@ class Merged(NamedTuple):
     """A configuration with what an annotation says.
 
     Attributes:
-        data: the values of the configuration.
         paths: what the annotation says of it, such as `simulation.step_size`.
         gone: what the annotation says about instances and connections that there are not.
     """
@@ -115,7 +108,7 @@ def written(
 
     Args:
         data: the values, with a scenario in the place of the path of one.
-        described: what the description says without an annotation of ours, with the same names.
+        described: what the description says but for its annotation of ours, with the same names.
         names: the instances whose names do not follow from those of their elements, by the names that would follow.
         moved: from the path of a result file to one for the folder of the package. The annotation gets it without what
             leads out of that folder, because a package is given to others.
@@ -140,26 +133,6 @@ def written(
     return json.dumps({"version": _VERSION, **content}, indent=2, allow_nan=False) if content else None
 
 
-def without(data: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """A configuration without the keys that its annotation has set: what the description itself says.
-
-    Raises:
-        AnnotationRefused: the text is no annotation of ours.
-    """
-    content = _parsed(text)
-    sections = _mapping(content, "instances")
-    connections = {(entry.get("from"), entry.get("to")): entry for entry in content.get("connections", [])}
-    return {
-        **{key: value for key, value in data.items() if key not in content},
-        "simulation": _without(data["simulation"], _mapping(content, "simulation")),
-        "instances": {name: _without(own, sections.get(name, {})) for name, own in data["instances"].items()},
-        "connections": [
-            {**_without(one, connections.get(_ends(one), {})), "from": one["from"], "to": one["to"]}
-            for one in data.get("connections", ())
-        ],
-    }
-
-
 def names_in(text: str) -> dict[str, str]:
     """The names of the instances that do not follow from those of their elements, by the names that would follow.
 
@@ -173,11 +146,7 @@ def names_in(text: str) -> dict[str, str]:
 
 
 def chosen_names(defaults: Sequence[str], text: str) -> dict[str, str]:
-    """The name of each instance, by the name that follows from its element.
-
-    Args:
-        defaults: the names that follow from the elements of the description.
-        text: the text of the annotation.
+    """The name of each instance, by the one that follows from its element; those are the ``defaults``.
 
     Raises:
         AnnotationRefused: the text is no annotation of ours, or gives one name to two instances.
@@ -250,10 +219,6 @@ def _mapping(content: Mapping[str, Any], key: str) -> dict[str, Any]:
     if not isinstance(section, dict):
         raise AnnotationRefused(f"no mapping in '{key}'", "a mapping")
     return section
-
-
-def _without(section: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in section.items() if key not in keys}
 
 
 def _ends(connection: Mapping[str, Any]) -> tuple[str, str]:

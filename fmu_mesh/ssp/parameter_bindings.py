@@ -56,12 +56,8 @@ def resolve_parameters(
 ) -> ResolvedParameters:
     """The value of every variable and of every connector of a system that bindings give one.
 
-    Names that match nothing have no effect and are warnings. Only the value that counts is converted.
-
-    Args:
-        system: the root system.
-        describe: the model description of the component at a path; None if it cannot be read.
-        problems: where values go that do not fit.
+    Names that match nothing have no effect and are warnings. Only the value that counts is converted. ``describe``
+    gives the model description of the component at a path; None if it cannot be read.
     """
     resolution = _Resolution(describe, problems)
     resolution.collect(system, ())

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ..text import listed, shown
-from ..variables.value_types import INTEGERS, VariableType
+from ..variables.value_types import FMI2_TYPES, INTEGERS, TYPES, VariableType
 from .file_definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
 from .grammar import PATTERNS, number_of
 from .problems import Problems
@@ -24,24 +24,7 @@ from .xml_reading import XmlElement
 
 __all__ = ["VARIABLE_TYPES", "parameter_mapping", "parameter_set", "refuse_ambiguous"]
 
-VARIABLE_TYPES: Final[dict[str, VariableType]] = {
-    "Real": "Float64",
-    "Float64": "Float64",
-    "Float32": "Float32",
-    "Integer": "Int32",
-    "Int8": "Int8",
-    "UInt8": "UInt8",
-    "Int16": "Int16",
-    "UInt16": "UInt16",
-    "Int32": "Int32",
-    "UInt32": "UInt32",
-    "Int64": "Int64",
-    "UInt64": "UInt64",
-    "Boolean": "Boolean",
-    "String": "String",
-    "Enumeration": "Enumeration",
-    "Binary": "Binary",
-}
+VARIABLE_TYPES: Final[dict[str, VariableType]] = {**{name: name for name in TYPES}, **FMI2_TYPES}
 """The types of variables by the names of the elements for types (SSP 2.0, 4.5.1)."""
 
 _TYPES: Final = tuple(f"ssv:{name}" for name in VARIABLE_TYPES)
@@ -63,13 +46,8 @@ def parameter_set(
     """The parameters of an SSV file, or of a set inside a system structure description.
 
     A parameter whose values are wrong is a finding and has no values. A second one of the same name, which tools write,
-    is a warning; if its value is another one, to apply it is a finding.
-
-    Args:
-        element: the `ssv:ParameterSet`.
-        problems: where mistakes go.
-        units: those of the file around it, which a set inside a description may use; its own ones come first.
-        enumerations: as ``units``.
+    is a warning; if its value is another one, to apply it is a finding. The ``units`` and ``enumerations`` are those of
+    the file around it, which a set inside a description may use; its own ones come first.
     """
     own_units = units_of(element, "ssv:Units", problems, units)
     own_enumerations = {**enumerations, **enumerations_of(element, "ssv:Enumerations", problems)}
@@ -87,18 +65,15 @@ def parameter_set(
         more = f", and other names again in line{'s' if len(lines) > 1 else ''} {listed(lines)}" if lines else ""
         found = f"a second parameter of this name{more}"
         problems.warn(repeated[0].place, found, f"one of each name (first: line {first})")
-    others = {one.name: one.place for one in repeated if not _is_same(one, parameters[one.name])}
+    firsts = {one.name: parameters[one.name] for one in repeated}
+    others = {one.name: one.place for one in repeated if replace(one, place=firsts[one.name].place) != firsts[one.name]}
     return ParameterSet(element.text("name"), tuple(parameters.values()), element.place, others)
 
 
 def parameter_mapping(element: XmlElement, problems: Problems) -> ParameterMapping:
     """The entries of an SSM file, or of a mapping inside a system structure description.
 
-    Entries with an empty source are left out, because they map nothing.
-
-    Args:
-        element: the `ssm:ParameterMapping`.
-        problems: where two entries with one target go, and wrong transformations.
+    Entries with an empty source are left out, because they map nothing; a second entry with one target is a finding.
     """
     lines: dict[str, int] = {}
     entries: list[MappingEntry] = []
@@ -126,13 +101,7 @@ def parameter_mapping(element: XmlElement, problems: Problems) -> ParameterMappi
 
 
 def refuse_ambiguous(values: ParameterSet, names: Iterable[str], problems: Problems) -> None:
-    """Add a finding for each of some parameters of which the set has a second one with another value.
-
-    Args:
-        values: the set.
-        names: the parameters that are applied.
-        problems: where the findings go.
-    """
+    """Add a finding for each of the applied ``names`` of which the set has a second parameter with another value."""
     for name in names:
         if name in values.ambiguous:
             first = next(one.place.line for one in values.parameters if one.name == name)
@@ -151,7 +120,7 @@ def _parameter(
         if second.tag != types[0].tag:  # of the same element, there is a finding
             problems.add(second.place, f"a second type {_local(second)}", "one type")
     type_ = types[0]
-    kind, unit, enumeration = _local(type_), type_.get("unit"), type_.get("name")
+    kind, enumeration = _local(type_), type_.get("name")
     dimensions, fits = _dimensions(element, problems)
     values = _values(type_, problems)
     if len(values) > 1 and fits and not dimensions:
@@ -167,17 +136,12 @@ def _parameter(
         kind,
         values if fits else (),
         element.place,
-        unit_named(unit, units) if unit is not None else None,
+        unit_named(type_.get("unit"), units),
         enumeration_named(enumeration, enumerations, type_.place, problems)
         if kind == "Enumeration" and enumeration is not None
         else None,
         dimensions,
     )
-
-
-def _is_same(one: ParameterValue, other: ParameterValue) -> bool:
-    """Whether two parameters of one name are the same but for their places."""
-    return replace(one, place=other.place) == other
 
 
 def _dimensions(element: XmlElement, problems: Problems) -> tuple[tuple[int, ...], bool]:
@@ -220,8 +184,10 @@ def _values(element: XmlElement, problems: Problems) -> tuple[str, ...]:
 def _is_value(text: str, kind: str) -> bool:
     """Whether a text is a value of a type."""
     match kind:
-        case "Real" | "Float64" | "Float32":
-            return _is_number(text, kind)
+        case "Real" | "Float64" | "Float32" if text in ("INF", "-INF", "NaN"):
+            return True
+        case "Real" | "Float64" | "Float32":  # digits must not become infinite
+            return bool(PATTERNS["number"].fullmatch(text)) and abs(number_of(text)) <= _LARGEST[kind]
         case "Boolean":
             return bool(PATTERNS["boolean"].fullmatch(text))
         case "Binary":
@@ -230,13 +196,6 @@ def _is_value(text: str, kind: str) -> bool:
             return bool(text) or kind == "String"
         case _:
             return bool(PATTERNS["integer"].fullmatch(text)) and int(text) in INTEGERS[VARIABLE_TYPES[kind]]
-
-
-def _is_number(text: str, kind: str) -> bool:
-    """Whether a text is a floating-point number of a type; one with digits must not become infinite."""
-    if text in ("INF", "-INF", "NaN"):
-        return True
-    return bool(PATTERNS["number"].fullmatch(text)) and abs(number_of(text)) <= _LARGEST[kind]
 
 
 _EXPECTED: Final = {

@@ -80,13 +80,7 @@ class _Misfit(Exception):
 
 
 def target_of_variable(variable: Variable, path: tuple[str, ...], connector: Connector | None = None) -> ValueTarget:
-    """A variable of an FMU as a target.
-
-    Args:
-        variable: the variable.
-        path: of the component.
-        connector: the connector of the component for it; its unit counts where it has one.
-    """
+    """A variable of a component as a target; the unit of its connector counts where it has one."""
     unit = connector.unit if connector is not None else None
     if unit is None and variable.unit:
         unit = Unit(variable.unit, variable.base_unit)
@@ -95,12 +89,7 @@ def target_of_variable(variable: Variable, path: tuple[str, ...], connector: Con
 
 
 def target_of_connector(connector: Connector, path: tuple[str, ...]) -> ValueTarget:
-    """A connector of a system as a target.
-
-    Args:
-        connector: the connector.
-        path: of the system; empty for the root system.
-    """
+    """A connector of the system at ``path`` as a target."""
     sizes = tuple(size for size in connector.dimensions if isinstance(size, int))
     shape = None if len(sizes) < len(connector.dimensions) or connector.type is None else sizes
     items = connector.enumeration.items if connector.enumeration is not None else {}
@@ -112,13 +101,9 @@ def target_of_connector(connector: Connector, path: tuple[str, ...]) -> ValueTar
 def converted(
     parameter: ParameterValue, entry: MappingEntry | None, target: ValueTarget, problems: Problems
 ) -> AppliedValue | None:
-    """The value of a parameter as one for a target; None after a finding.
+    """The value of a parameter as one for a target; None after a finding: the value does not fit.
 
-    Args:
-        parameter: with at least one value.
-        entry: the entry of the mapping that led to the target; None without a mapping.
-        target: what it is for.
-        problems: where a finding goes if the value does not fit, and a warning about undefined units.
+    The parameter has at least one value, and ``entry`` is that of the mapping that led to the target.
     """
     type_ = VARIABLE_TYPES[parameter.type]
     items = parameter.enumeration.items if parameter.enumeration is not None else {}
@@ -153,14 +138,9 @@ def converted(
 def changed(
     value: AppliedValue, change: PathChange, variable: Variable | None, path: tuple[str, ...], problems: Problems
 ) -> AppliedValue | None:
-    """A value of a connector as that of a variable that it leads to; None after a finding.
+    """A value of a connector of a system as that of the variable of a component that it leads to.
 
-    Args:
-        value: of the connector of a system.
-        change: what happens on the way.
-        variable: of the FMU; None if it is not known.
-        path: of the component.
-        problems: where a finding goes if the value does not fit.
+    None after a finding: the value does not fit. The variable is None if it is not known.
     """
     target = ValueTarget(f"'{'.'.join(path)}'", None, None)
     if variable is not None:
@@ -170,7 +150,6 @@ def changed(
         elements = [number_of(one) if isinstance(one, str) else one for one in elements]
     try:
         value, elements, steps = _connected(value, elements, change)
-        _check_shape(value, target)
         return _as_target(value, elements, target, ", ".join(steps))
     except _Misfit as misfit:
         found = f"the {value.type} value {shown(value.value)} for {target.words}"
@@ -277,17 +256,14 @@ def _connected(
     return value, elements, steps
 
 
-def _check_shape(value: AppliedValue, target: ValueTarget) -> None:
-    if target.shape is not None and target.shape != value.shape:
-        raise _Misfit(_number_of_values(target.shape))
-
-
 def _as_target(value: AppliedValue, elements: list[Any], target: ValueTarget, how: str) -> AppliedValue:
     """A value with the type and the shape of a target.
 
     Raises:
-        _Misfit: it is none of this type.
+        _Misfit: it has another shape, or is none of this type.
     """
+    if target.shape is not None and target.shape != value.shape:
+        raise _Misfit(_number_of_values(target.shape))
     plain = to_plain(nested([_element(one, value, target) for one in elements], value.shape))
     return replace(value, value=plain, type=target.type or value.type, how=how, items=target.items or value.items)
 

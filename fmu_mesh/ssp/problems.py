@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 
 from msgspec.structs import replace
 
-from ..errors import ConfigurationError, Finding
-from ..text import printable
+from ..errors import Finding
+from ..text import listed, nearest, printable
 from .system_structure import FilePlace
 
 __all__ = ["Problems"]
@@ -30,6 +30,11 @@ class Problems:
         """Add a finding: there is ``found`` instead of ``expected``."""
         self._add(self.findings, _finding(place, found, expected, suggestion))
 
+    def unknown(self, place: FilePlace, found: str, name: str, names: Iterable[str]) -> None:
+        """Add a finding about a ``name`` that is none of ``names``; suggests the nearest one."""
+        known = [*names]
+        self.add(place, found, f"one of {listed(known)}", nearest(name, known))
+
     def warn(self, place: FilePlace, found: str, expected: str = "") -> None:
         """Add a warning."""
         self._add(self.warnings, _finding(place, found, expected))
@@ -37,11 +42,7 @@ class Problems:
     def warn_once(self, like: Hashable, place: FilePlace, found: str, what: str) -> None:
         """Add a warning, or let the first one of its kind say how many others there are.
 
-        Args:
-            like: equal for all warnings of one kind.
-            place: where it is.
-            found: what there is.
-            what: the warnings of this kind are about, such as `value`.
+        The warnings of one kind have equal values of ``like``, and are about ``what``, such as `value`.
         """
         finding = _finding(place, found)
         index, alike = self._alike.setdefault(like, (len(self.warnings), []))
@@ -53,18 +54,6 @@ class Problems:
         else:
             more = f"one more {what}" if len(alike) == 2 else f"{len(alike) - 1} more {what}s"
             self.warnings[index] = replace(alike[0], found=f"{alike[0].found}; {more} likewise")
-
-    def raise_any(self, file: str) -> None:
-        """Raise one error with all findings in the order of their files and lines; do nothing if there are none.
-
-        Raises:
-            ConfigurationError: there is at least one finding.
-        """
-        if self.findings:
-            files = {finding.file: number for number, finding in reversed(list(enumerate(self.findings)))}
-            ordered = sorted(self.findings, key=lambda finding: (files[finding.file], finding.line or 0))
-            text = f"{file}: {len(ordered)} problems" if len(ordered) > 1 else str(ordered[0])
-            raise ConfigurationError(text, findings=tuple(ordered))
 
     @staticmethod
     def _add(found_so_far: list[Finding], finding: Finding) -> None:

@@ -58,16 +58,7 @@ _MAXIMUM_NESTED: Final = 1000
 
 
 def read_structure(package: Package, name: str, problems: Problems) -> Structure | None:
-    """Read one system structure description of a package.
-
-    Args:
-        package: the package.
-        name: the file in it.
-        problems: collects what is wrong.
-
-    Returns:
-        The description with everything in it that is right; None if there is nothing to go on with.
-    """
+    """A system structure description of a package with everything in it that is right; None if there is nothing."""
     return _Reader(package, problems).structure(name, 0)
 
 
@@ -85,12 +76,9 @@ class _File(NamedTuple):
 
 
 def read_values(package: Package, name: str, problems: Problems) -> Binding | None:
-    """The values of an SSV file as a binding without a mapping; None after a finding.
+    """The values of an SSV file, in the package or else on the disk, as a binding without a mapping.
 
-    Args:
-        package: where the file is looked for first.
-        name: of the file in the package, or else its path on the disk.
-        problems: collects what is wrong in it.
+    None after a finding.
 
     Raises:
         ConfigurationError: there is no such file, or it cannot be read.
@@ -131,17 +119,16 @@ class _Reader:
         top = root.child("ssd:System")
         if top is None:
             return None
-        experiment = root.child("ssd:DefaultExperiment")
-        times: dict[str, float | None] = {"start_time": None, "stop_time": None}
-        annotations = root.annotations()
-        if experiment is not None:
-            times = {
-                "start_time": experiment.optional_number("startTime"),
-                "stop_time": experiment.optional_number("stopTime"),
-            }
-            annotations += experiment.annotations()
         system = self._system(top, file, depth)
-        return Structure(root.text("name"), root.version, system, root.place, annotations=annotations, **times)
+        structure = Structure(root.text("name"), root.version, system, root.place, annotations=root.annotations())
+        if (experiment := root.child("ssd:DefaultExperiment")) is None:
+            return structure
+        return replace(
+            structure,
+            start_time=experiment.optional_number("startTime"),
+            stop_time=experiment.optional_number("stopTime"),
+            annotations=(*structure.annotations, *experiment.annotations()),
+        )
 
     def _root(self, name: str, tag: str) -> XmlElement | None:
         """The root element of a file; None after a finding."""
@@ -278,8 +265,7 @@ class _Reader:
         place, unit, enumeration, name = element.place, None, None, None
         if type_ is not None:
             name = type_.tag.partition(":")[2]
-            written = type_.get("unit")
-            unit = unit_named(written, file.units) if written is not None else None
+            unit = unit_named(type_.get("unit"), file.units)
             if name == "Enumeration" and (wanted := type_.text("name")):
                 enumeration = enumeration_named(wanted, file.enumerations, place, self._problems)
             if name == "Binary" and (type_.get("mime-type") or "").startswith(_MODELICA):

@@ -1,29 +1,30 @@
-"""From a mesh to the XML of a system structure description, of SSP 1.0 or 2.0.
+"""From a mesh to the XML of a system structure description, of SSP 1.0 or 2.0; our annotation in one of another tool.
 
-Owns which elements and attributes stand for what, and what a version cannot say. Which files go into the package is
-`exporting`, and what no version can say is `own_annotation`.
+Owns which elements and attributes stand for what, how values become text, and what a version cannot say. Which files go
+into the package is `exporting`, and what no version can say is `own_annotation`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import msgspec
 from lxml import etree
 
+from ..archives.safe_xml import safe_xml
 from ..config.findings import Findings
 from ..config.mesh import ConnectionConfig
 from ..system.system import Connection, ResolvedSystem
 from ..system.value_map import map_words
 from ..variables.model_description import Kind, ModelDescription, Value, Variable
 from ..variables.units import BaseUnit
-from ..variables.value_conversion import to_value
-from ..variables.value_types import flattened
+from ..variables.value_conversion import to_plain, to_value
+from ..variables.value_types import FMI2_TYPES, flattened
 from .grammar import NAMESPACES
-from .xml_writing import XmlNode, annotations_element, child, is_xml_text, number_text, tag_of, write_units
+from .own_annotation import ANNOTATION_ELEMENT, ANNOTATION_TYPE
 
-__all__ = ["ElementNames", "NewDocument", "SspVersion", "ssd_of"]
+__all__ = ["ElementNames", "SspVersion", "XmlNode", "is_xml_text", "own_annotation_in", "ssd_of", "with_own_annotation"]
 
 SspVersion = Literal["1.0", "2.0"]
 
@@ -31,19 +32,18 @@ _KINDS_OF_1: Final = ("input", "output", "parameter", "calculatedParameter")
 _KINDS: Final = (*_KINDS_OF_1, "structuralParameter")
 """The connectors that are written even if nothing uses them."""
 
-_TYPES_OF_1: Final = {
-    "Float64": "Real",
-    "Int32": "Integer",
-    "Boolean": "Boolean",
-    "String": "String",
-    "Enumeration": "Enumeration",
-    "Binary": "Binary",
-}
+_TYPES_OF_1: Final = {**{type_: name for name, type_ in FMI2_TYPES.items()}, "Binary": "Binary"}
 """The names in SSP 1.0 of the types that it has."""
 
 _IMPLEMENTATIONS: Final[dict[Kind, str]] = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
 _INT_32: Final = range(-(2**31), 2**31)
 _SOURCES_OF_PARAMETERS: Final = ("constant", "calculatedParameter")
+
+XmlNode = Any
+"""An element of lxml, which ships no types."""
+
+_OWN: Final = f"ssd:System/ssd:Annotations/ssc:Annotation[@type='{ANNOTATION_TYPE}']"
+"""The path of our annotation in a description."""
 
 
 class ElementNames(msgspec.Struct, frozen=True):
@@ -60,71 +60,50 @@ class ElementNames(msgspec.Struct, frozen=True):
     kinds: Mapping[str, Kind]
 
 
-class NewDocument(NamedTuple):
-    """A system structure description.
-
-    Attributes:
-        units: the names of the units that it defines.
-    """
-
-    xml: bytes
-    units: set[str]
-
-
 def ssd_of(
     system: ResolvedSystem, names: ElementNames, version: SspVersion, annotation: str | None, findings: Findings
-) -> NewDocument:
-    """A system structure description.
+) -> tuple[bytes, set[str]]:
+    """A system structure description of a mesh whose instances are FMUs, and the names of the units that it defines.
 
-    Args:
-        system: the mesh; all of its instances are FMUs.
-        names: how the components are called, and where their FMUs are.
-        version: the version of SSP.
-        annotation: the text of our annotation; None: there is none.
-        findings: gets what this version, or no version, can say. Then the document is useless.
+    What this version of SSP, or no version, can say is a finding. Then the document is useless.
     """
     writer = _Writer(system, names, version, findings)
-    return NewDocument(writer.document(annotation), writer.units)
+    return writer.document(annotation), {*writer.units}
 
 
 class _Writer:
-    """Writes one document; units and enumerations are collected on the way."""
+    """Writes one document; ``units`` by name and enumerations are collected on the way."""
 
     def __init__(self, system: ResolvedSystem, names: ElementNames, version: SspVersion, findings: Findings) -> None:
         self._system = system
         self._names = names
         self._version: SspVersion = version
         self._findings = findings
-        self._units: dict[str, BaseUnit] = {}
+        self.units: dict[str, BaseUnit] = {}
         self._enumerations: dict[tuple[tuple[str, int], ...], str] = {}
-
-    @property
-    def units(self) -> set[str]:
-        """The names of the units that the document defines."""
-        return {*self._units}
 
     def document(self, annotation: str | None) -> bytes:
         config = self._system.config
         root = etree.Element(
-            tag_of("ssd:SystemStructureDescription"),
+            _tag_of("ssd:SystemStructureDescription"),
             {"version": self._version, "name": config.mesh, "generationTool": "fmu_mesh"},
             nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc", "ssv")},
         )
-        own = child(root, "ssd:System", name=config.mesh)
-        elements = child(own, "ssd:Elements")
+        own = _child(root, "ssd:System", name=config.mesh)
+        elements = _child(own, "ssd:Elements")
         for name in self._system.instances:
             self._component(elements, name)
         if self._system.connections:
-            connections = child(own, "ssd:Connections")
+            connections = _child(own, "ssd:Connections")
             for connection in self._system.connections:
                 self._connection(connections, connection)
         if annotation is not None:
-            own.append(annotations_element(annotation))
+            own.append(_annotations_element(annotation))
         self._definitions(root)
-        experiment = {"startTime": number_text(config.simulation.start_time)}
+        experiment = {"startTime": _number_text(config.simulation.start_time)}
         if config.simulation.stop_time is not None:
-            experiment["stopTime"] = number_text(config.simulation.stop_time)
-        child(root, "ssd:DefaultExperiment", **experiment)
+            experiment["stopTime"] = _number_text(config.simulation.stop_time)
+        _child(root, "ssd:DefaultExperiment", **experiment)
         etree.indent(root)
         return bytes(etree.tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
 
@@ -137,31 +116,25 @@ class _Writer:
         start_values = {variable.name: resolved[variable.name] for variable in named if variable is not None}
         # The type is the default of the standard, but OMSimulator leaves out components of SSP 2.0 without one.
         source, type_ = self._names.sources[name], "application/x-fmu-sharedlibrary"
-        component = child(parent, "ssd:Component", name=self._names.elements[name], type=type_, source=source)
+        component = _child(parent, "ssd:Component", name=self._names.elements[name], type=type_, source=source)
         if name in self._names.kinds:
             component.set("implementation", _IMPLEMENTATIONS[self._names.kinds[name]])
-        connected = self._connected(name)
+        connected = {one.source.name for one in self._system.connections if one.source_instance == name}
+        connected |= {one.target.name for one in self._system.connections if one.target_instance == name}
+        # One that is not connected is shown to other tools if they can connect or set it, and it has a type.
         connectors = [
             variable
             for variable in description.variables
-            if variable.name in connected or self._has_connector(variable, start_values)
+            if variable.name in connected
+            or ((variable.causality in _KINDS or variable.name in start_values) and self._is_known(variable))
         ]
         if connectors:
-            parent = child(component, "ssd:Connectors")
+            parent = _child(component, "ssd:Connectors")
             for variable in connectors:
                 self._connector(parent, variable, description)
         variables = {variable.name: variable for variable in description.variables}
         if start_values:
             self._binding(component, name, [(variables[key], value) for key, value in start_values.items()])
-
-    def _connected(self, name: str) -> set[str]:
-        """The variables of an instance that are ends of connections."""
-        sources = {one.source.name for one in self._system.connections if one.source_instance == name}
-        return sources | {one.target.name for one in self._system.connections if one.target_instance == name}
-
-    def _has_connector(self, variable: Variable, start_values: Mapping[str, Any]) -> bool:
-        """Whether an unconnected variable is shown to other tools: it can be connected or set, and has a type."""
-        return (variable.causality in _KINDS or variable.name in start_values) and self._is_known(variable)
 
     def _is_known(self, variable: Variable) -> bool:
         """Whether this version of SSP has the kind and the type of a variable."""
@@ -176,7 +149,7 @@ class _Writer:
         return variable.declared_type or variable.type
 
     def _connector(self, parent: XmlNode, variable: Variable, description: ModelDescription) -> None:
-        connector = child(parent, "ssd:Connector", name=variable.name, kind=variable.causality)
+        connector = _child(parent, "ssd:Connector", name=variable.name, kind=variable.causality)
         attributes: dict[str, str] = {}
         if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
             attributes["unit"] = unit
@@ -185,23 +158,23 @@ class _Writer:
             if enumeration is None:
                 return  # the type of the FMU's variable counts
             attributes["name"] = enumeration
-        child(connector, f"ssc:{self._type(variable)}", **attributes)
+        _child(connector, f"ssc:{self._type(variable)}", **attributes)
         self._dimensions(connector, variable)
 
     def _dimensions(self, parent: XmlNode, variable: Variable) -> None:
         for dimension, size in zip(variable.dimensions, variable.shape, strict=True):
-            if isinstance(dimension, str) and parent.tag == tag_of("ssd:Connector"):
-                child(parent, "ssc:Dimension", sizeConnector=dimension)
+            if isinstance(dimension, str) and parent.tag == _tag_of("ssd:Connector"):
+                _child(parent, "ssc:Dimension", sizeConnector=dimension)
             else:
-                child(parent, "ssc:Dimension", size=str(size))
+                _child(parent, "ssc:Dimension", size=str(size))
 
     # --- start values
 
     def _binding(self, component: XmlNode, name: str, written: Sequence[tuple[Variable, Any]]) -> None:
-        binding = child(child(component, "ssd:ParameterBindings"), "ssd:ParameterBinding")
-        values = child(binding, "ssd:ParameterValues")
-        own = child(values, "ssv:ParameterSet", version=self._version, name=self._names.elements[name])
-        parameters = child(own, "ssv:Parameters")
+        binding = _child(_child(component, "ssd:ParameterBindings"), "ssd:ParameterBinding")
+        values = _child(binding, "ssd:ParameterValues")
+        own = _child(values, "ssv:ParameterSet", version=self._version, name=self._names.elements[name])
+        parameters = _child(own, "ssv:Parameters")
         units: dict[str, BaseUnit] = {}
         for variable, plain in written:
             place = f"instances.{name}.start_values.{variable.name}"
@@ -214,25 +187,25 @@ class _Writer:
                 found = f"a control character in the start value of '{variable.name}'"
                 self._findings.add(place, found, "text without control characters: XML has no place for them")
                 continue
-            parameter = child(parameters, "ssv:Parameter", name=variable.name)
+            parameter = _child(parameters, "ssv:Parameter", name=variable.name)
             self._value(parameter, variable, texts)
             if variable.type in ("Float64", "Float32") and (unit := self._unit(variable)) is not None:
                 parameter[0].set("unit", unit)
-                units[unit] = self._units[unit]
+                units[unit] = self.units[unit]
             self._dimensions(parameter, variable)
         if units:
-            write_units(child(own, "ssv:Units"), units)
+            _write_units(_child(own, "ssv:Units"), units)
 
     def _value(self, parameter: XmlNode, variable: Variable, texts: Sequence[str]) -> None:
         type_ = self._type(variable)
         if variable.type == "Enumeration" and not variable.items:
             type_ = "Integer"  # there are no names of items
-        node = child(parameter, f"ssv:{type_}")
+        node = _child(parameter, f"ssv:{type_}")
         if not variable.shape:
             node.set("value", texts[0])
         elif type_ in ("String", "Enumeration", "Binary"):
             for text in texts:
-                child(node, "ssv:Value", value=text)
+                _child(node, "ssv:Value", value=text)
         else:
             node.set("value", " ".join(texts))
 
@@ -251,13 +224,13 @@ class _Writer:
             "endIndices": " ".join(str(number + 1) for number in connection.target_index),
             "suppressUnitConversion": "true" if config.ignore_units else "",
         }
-        node = child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
+        node = _child(parent, "ssd:Connection", **{name: text for name, text in attributes.items() if text})
         self._transformation(node, connection, config)
 
     def _transformation(self, node: XmlNode, connection: Connection, config: ConnectionConfig) -> None:
         if (config.factor, config.offset) != (1.0, 0.0):
-            child(
-                node, "ssc:LinearTransformation", factor=number_text(config.factor), offset=number_text(config.offset)
+            _child(
+                node, "ssc:LinearTransformation", factor=_number_text(config.factor), offset=_number_text(config.offset)
             )
         if not connection.map:
             return
@@ -273,9 +246,9 @@ class _Writer:
             pairs = map_words(connection.map, source, target)
         elif self._version == "1.0" and not all(number in _INT_32 for pair in connection.map for number in pair):
             self._needs_2(place, "a number of more than 32 bits")
-        parent = child(node, f"ssc:{kind}MappingTransformation")
+        parent = _child(node, f"ssc:{kind}MappingTransformation")
         for have, want in pairs.items():
-            child(parent, "ssc:MapEntry", source=have, target=want)
+            _child(parent, "ssc:MapEntry", source=have, target=want)
 
     def _check_ends(self, connection: Connection) -> None:
         source, target = connection.source, connection.target
@@ -305,7 +278,7 @@ class _Writer:
         name, base = variable.unit, variable.base_unit
         if name is None or base is None or not base.usable:
             return None
-        return name if self._units.setdefault(name, base) == base else None
+        return name if self.units.setdefault(name, base) == base else None
 
     def _enumeration(self, variable: Variable, description: ModelDescription) -> str | None:
         """The name of an enumeration in the document; None if it cannot be defined there."""
@@ -322,13 +295,13 @@ class _Writer:
 
     def _definitions(self, root: XmlNode) -> None:
         if self._enumerations:
-            parent = child(root, "ssd:Enumerations")
+            parent = _child(root, "ssd:Enumerations")
             for items, name in self._enumerations.items():
-                enumeration = child(parent, "ssc:Enumeration", name=name)
+                enumeration = _child(parent, "ssc:Enumeration", name=name)
                 for item, number in items:
-                    child(enumeration, "ssc:Item", name=item, value=str(number))
-        if self._units:
-            write_units(child(root, "ssd:Units"), self._units)
+                    _child(enumeration, "ssc:Item", name=item, value=str(number))
+        if self.units:
+            _write_units(_child(root, "ssd:Units"), self.units)
 
 
 def _map_kind(source: Variable, target: Variable) -> str | None:
@@ -347,9 +320,78 @@ def _text_of(value: Value, variable: Variable) -> str:
         case bool():
             return "true" if value else "false"
         case float():
-            return number_text(value)
+            return _number_text(value)
         case bytes():
             return value.hex().upper()
         case int() if variable.type == "Enumeration":
             return next((item for item, number in variable.items if number == value), str(value))
     return str(value)
+
+
+def _number_text(value: float) -> str:
+    """A number as xs:double, which gives back the same one: its words for NaN and infinity are those of FMI."""
+    return str(to_plain(float(value)))
+
+
+def _tag_of(name: str) -> str:
+    """The name of an element with its namespace, from a name with the usual prefix: `ssd:System`."""
+    prefix, _, local = name.partition(":")
+    return f"{{{NAMESPACES[prefix]}}}{local}"
+
+
+def _child(parent: XmlNode, name: str, /, **attributes: str) -> XmlNode:
+    """Add an element to another one; ``name`` has the usual prefix."""
+    return etree.SubElement(parent, _tag_of(name), attributes)
+
+
+def _write_units(parent: XmlNode, units: Mapping[str, BaseUnit]) -> None:
+    """Add the definitions of units to the element `Units` of a document."""
+    for name, base in sorted(units.items()):
+        fields = {
+            key: value for key, value in msgspec.structs.asdict(base).items() if value != getattr(BaseUnit(), key)
+        }
+        texts = {key: str(value) if isinstance(value, int) else _number_text(value) for key, value in fields.items()}
+        _child(_child(parent, "ssc:Unit", name=name), "ssc:BaseUnit", **texts)
+
+
+def _annotations_element(text: str) -> XmlNode:
+    """The element `ssd:Annotations` of a root system, with our annotation and no other."""
+    parent = etree.Element(_tag_of("ssd:Annotations"), nsmap={prefix: NAMESPACES[prefix] for prefix in ("ssd", "ssc")})
+    entry = _child(parent, "ssc:Annotation", type=ANNOTATION_TYPE)
+    namespace = etree.QName(ANNOTATION_ELEMENT).namespace
+    etree.SubElement(entry, ANNOTATION_ELEMENT, nsmap={None: namespace}).text = text
+    return parent
+
+
+def own_annotation_in(document: bytes) -> str | None:
+    """The text of our annotation in a system structure description; None if the root system has none."""
+    element = safe_xml(document, "the description").find(f"{_OWN}/*", NAMESPACES)
+    return None if element is None else element.text or ""
+
+
+def with_own_annotation(document: bytes, text: str | None) -> bytes:
+    """A system structure description with another text of our annotation; None: without an annotation of ours.
+
+    The document is written again, and says the same as before: elements, attributes, comments and the blanks between
+    them stay, also those of other tools. Quotes, character references and blanks inside of tags may change.
+    """
+    root = safe_xml(document, "the description")
+    for old in root.findall(_OWN, NAMESPACES):
+        old.getparent().remove(old)
+    if text is not None:
+        made, system = _annotations_element(text), root.find("ssd:System", NAMESPACES)
+        there = system.find("ssd:Annotations", NAMESPACES)
+        if there is None:
+            system.append(made)
+        else:
+            there.append(made[0])
+    tree = root.getroottree()
+    return bytes(etree.tostring(tree, encoding=tree.docinfo.encoding or "UTF-8", xml_declaration=True))
+
+
+def is_xml_text(text: str) -> bool:
+    """Whether XML can hold a text: it has no place for most control characters (XML 1.0, 2.2)."""
+    return all(
+        character in "\t\n\r" or " " <= character < "\ud800" or "\ue000" <= character < "\ufffe" or character > "\uffff"
+        for character in text
+    )

@@ -6,6 +6,7 @@ configuration came from which line.
 
 from __future__ import annotations
 
+import math
 import posixpath
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,25 +15,25 @@ from typing import Final, Literal
 
 from msgspec.structs import replace
 
-from ..config.loading import PlainConfig, ValueOrigin
+from ..config.findings import Findings, ValueOrigin
+from ..config.loading import PlainConfig
 from ..config.mesh import LimitsConfig
 from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
 from ..system.graph import feedback_edges, fewest_feedback_edges
-from ..text import listed, nearest
+from ..text import listed, meant, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable
-from .annotations import OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, base_step_size, common_solvers, step_size_hint
-from .configuration_files import RESULT_BESIDE_PACKAGE
-from .flattening import FlatConnection, FlatValue, flatten
+from .flattening import FlatConnection, flatten
+from .grammar import PATTERNS, number_of
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
-from .package import DEFAULT, Package
+from .package import DEFAULT, RESULT_BESIDE_PACKAGE, Package
 from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure, read_values
-from .system_structure import FilePlace, Structure, StructureComponent, StructureSystem, components_of
+from .system_structure import Annotation, FilePlace, Structure, StructureComponent, StructureSystem, components_of
 
 __all__ = ["NEEDED", "chosen_description", "read_system"]
 
@@ -47,18 +48,26 @@ _KINDS: Final[Mapping[str, Kind]] = {
     "CoSimulation": "co_simulation",
     "ModelExchange": "model_exchange",
 }
-_KNOWN: Final = {OPEN_MODELICA, OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
+# SSP has no step size and no algorithm. OMSimulator and libcosim write their own, and both exchange values between
+# steps of equal length: all components step with the values of the last communication point, which is `jacobi`.
+_OPEN_MODELICA: Final = "org.openmodelica"
+_OPEN_SIMULATION_PLATFORM: Final = "com.opensimulationplatform"
+_STEP_SIZES: Final = {
+    _OPEN_MODELICA: ("FixedStepMaster", "stepSize"),
+    _OPEN_SIMULATION_PLATFORM: ("FixedStepAlgorithm", "baseStepSize"),
+}
+_HINTS: Final = {_OPEN_SIMULATION_PLATFORM: ("StepSizeHint", "value")}
+_KNOWN: Final = {_OPEN_MODELICA, _OPEN_SIMULATION_PLATFORM, ANNOTATION_TYPE}
 
 
-def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> PlainConfig:
+def read_system(
+    path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = (), *, annotated: bool = True
+) -> PlainConfig:
     """Read a package as the values of a configuration.
 
-    What the configuration means is checked with everything else before a run; so are the findings of the package.
-
-    Args:
-        path: an .ssp file, a folder that was one, or an .ssd file.
-        ssd: which description of the package: the name of its file, or the name that it has; None: the default one.
-        ssv: files with values, in the package or else on the disk; each is a last binding of the root system.
+    What the configuration means is checked with everything else before a run; so are the findings of the package. The
+    arguments are those of `read_configuration`; each file with values is a last binding of the root system. If it is
+    not ``annotated``, our annotation says the names of the instances only.
 
     Raises:
         ConfigurationError: there is no such package, description or file with values, or it has no system.
@@ -68,12 +77,12 @@ def read_system(path: Path, ssd: str | None = None, ssv: Sequence[str | Path] = 
         name = chosen_description(package, ssd)
         structure = read_structure(package, name, problems)
         if structure is None:
-            problems.raise_any(package.shown(name))
+            Findings(package.shown(name), first=problems.findings).raise_any()
         assert structure is not None  # otherwise there is a finding
         chosen = [read_values(package, str(name), problems) for name in ssv]
         bindings = (*structure.system.bindings, *(binding for binding in chosen if binding is not None))
         structure = replace(structure, system=replace(structure.system, bindings=bindings))
-        return _Configuration(package, name, structure, problems).plain()
+        return _Configuration(package, name, structure, problems).plain(annotated=annotated)
 
 
 def chosen_description(package: Package, ssd: str | None) -> str:
@@ -104,8 +113,9 @@ def chosen_description(package: Package, ssd: str | None) -> str:
     if ssd in titles:
         return titles[ssd]
     near = nearest(ssd, [*names, *(posixpath.splitext(name)[0] for name in names), *titles])
-    hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(names)}."
-    raise ConfigurationError(f"'{package.root}' has no description '{ssd}'", hint=hint)
+    raise ConfigurationError(
+        f"'{package.root}' has no description '{ssd}'", hint=meant(near, f"It has {listed(names)}.")
+    )
 
 
 class _Configuration:
@@ -126,8 +136,8 @@ class _Configuration:
         self._annotation = next(own, None)
         self._names = self._chosen_names()
 
-    def plain(self) -> PlainConfig:
-        """All of it."""
+    def plain(self, *, annotated: bool) -> PlainConfig:
+        """All of it, with what our annotation says."""
         system = self._structure.system
         parameters = resolve_parameters(system, self._describe, self._problems)
         units = {node: value.unit for node, value in parameters.of_systems.items() if value.unit is not None}
@@ -149,7 +159,8 @@ class _Configuration:
         }
         if self._package.is_archive:
             data["record"] = {"file": RESULT_BESIDE_PACKAGE}
-        data = self._with_annotation(data)
+        if annotated and self._annotation is not None:
+            data = self._with_annotation(data, self._annotation)
         times = data["simulation"]
         assert isinstance(times, dict)  # `merged` adds to a mapping
         self._place("", self._structure.place)
@@ -177,26 +188,24 @@ class _Configuration:
                 self._annotation = None
         return {name: name for name in defaults}
 
-    def _with_annotation(self, data: dict[str, Plain]) -> dict[str, Plain]:
+    def _with_annotation(self, data: dict[str, Plain], own: Annotation) -> dict[str, Plain]:
         """The values with what our annotation says."""
-        if self._annotation is None:
-            return data
         folder = ".." if self._package.is_archive else ""
         try:
-            result = merged(data, self._annotation.text, moved=lambda path: posixpath.join(folder, path))
+            result = merged(data, own.text, moved=lambda path: posixpath.join(folder, path))
         except AnnotationRefused as refused:
-            self._problems.add(self._annotation.place, refused.found, refused.expected)
+            self._problems.add(own.place, refused.found, refused.expected)
             return data
         record = result.data.get("record")
         if self._package.is_archive and isinstance(record, dict) and "file" not in record:
             result.data["record"] = {**record, "file": RESULT_BESIDE_PACKAGE}
         for path in result.paths:
-            self._place(path, self._annotation.place)
+            self._place(path, own.place)
         if "zenoh" in result.paths:
             found = f"the package says how the mesh connects: {str(result.data['zenoh'])[:200]}"
-            self._problems.warn(self._annotation.place, found, "`connect=...` and `listen=...`, if you do not trust it")
+            self._problems.warn(own.place, found, "`connect=...` and `listen=...`, if you do not trust it")
         for gone in result.gone:
-            self._problems.warn(self._annotation.place, f"{gone} is not there any more")
+            self._problems.warn(own.place, f"{gone} is not there any more")
         return result.data
 
     def _describe(self, path: tuple[str, ...]) -> ModelDescription | None:
@@ -218,33 +227,31 @@ class _Configuration:
     def _settle(
         self,
         connections: Iterable[FlatConnection],
-        values: Iterable[FlatValue],
+        values: Iterable[FlatConnection],
         of_components: dict[tuple[str, ...], dict[str, AppliedValue]],
         of_systems: Mapping[tuple[tuple[str, ...], str], AppliedValue],
     ) -> None:
         """Give components the values of connectors of systems; a connected variable takes that of the connection."""
         for value in values:
-            applied = of_systems.get(value.connector)
             path, variable = value.target
-            if applied is not None:
-                description = self._describe(path)
-                target = description.variable_of(variable) if description is not None else None
-                given = changed(applied, value.change, target, path, self._problems)
+            if (applied := of_systems.get(value.source)) is not None:
+                given = changed(applied, value.change, self._variable(value.target), path, self._problems)
                 if given is not None:
                     of_components.setdefault(path, {})[variable] = given
         for connection in connections:
             path, variable = connection.target
-            bound = of_components.get(path, {}).get(variable)
-            if bound is None or self._is_input(path, variable):
+            bound, target = of_components.get(path, {}).get(variable), self._variable(connection.target)
+            if bound is None or (target is not None and target.causality == "input"):
                 continue  # an input has it before the first value of the connection
             found = f"a value for '{'.'.join((*path, variable))}', which a connection gives its value"
             self._problems.warn(bound.origin, found)
             del of_components[path][variable]
 
-    def _is_input(self, path: tuple[str, ...], name: str) -> bool:
+    def _variable(self, end: tuple[tuple[str, ...], str]) -> Variable | None:
+        """The variable of a component at an end of a connection; None if it is not known."""
+        path, name = end
         description = self._describe(path)
-        variable = description.variable_of(name) if description is not None else None
-        return variable is not None and variable.causality == "input"
+        return description.variable_of(name) if description is not None else None
 
     # --- sections
 
@@ -256,7 +263,7 @@ class _Configuration:
         if structure.stop_time is not None:
             simulation["stop_time"] = structure.stop_time
         before = len(self._problems.findings)
-        found = base_step_size(annotations_of(structure), self._problems)
+        found = _base_step_size(annotations_of(structure), self._problems)
         if len(self._problems.findings) > before:
             self._explained += ("simulation.step_size", "simulation.algorithm")
         if found is not None:
@@ -292,7 +299,8 @@ class _Configuration:
 
     def _step_size(self, component: StructureComponent, simulation: Mapping[str, Plain]) -> float | None:
         """The step size that libcosim takes for a component: a multiple of the base step size, in whole nanoseconds."""
-        hint, base = step_size_hint(component.annotations, self._problems), simulation.get("step_size")
+        hint = _step_size(component.annotations, _HINTS, "{0} '{2}'", self._problems)
+        base = simulation.get("step_size")
         if hint is None or not isinstance(base, float):
             return None
         points = max(1, _nanoseconds(hint[0]) // max(1, _nanoseconds(base)))
@@ -306,7 +314,9 @@ class _Configuration:
 
         Nobody has chosen the order in a document. If no other order has fewer delays, it stays.
         """
-        stepped = [one for one in connections if not self._sets_parameter(one)]
+        targets = [self._variable(one.target) for one in connections]
+        pairs = zip(connections, targets, strict=True)
+        stepped = [one for one, target in pairs if target is None or target.causality != "parameter"]
         edges = [(one.source[0], one.target[0], True) for one in stepped]
         paths = dict.fromkeys(path for source, target, _ in edges for path in (source, target))
         fewest = fewest_feedback_edges(paths, edges)
@@ -314,11 +324,6 @@ class _Configuration:
             return connections
         last = {stepped[index].target for index in fewest}
         return sorted(connections, key=lambda one: one.target in last)
-
-    def _sets_parameter(self, connection: FlatConnection) -> bool:
-        description = self._describe(connection.target[0])
-        variable = description.variable_of(connection.target[1]) if description is not None else None
-        return variable is not None and variable.causality == "parameter"
 
     def _connection(self, number: int, connection: FlatConnection) -> dict[str, Plain]:
         """A connection as a configuration has it."""
@@ -334,9 +339,7 @@ class _Configuration:
         if connection.change.ignore_units:
             written["ignore_units"] = True
         if connection.change.mapping:
-            path, name = connection.target
-            description = self._describe(path)
-            target = description.variable_of(name) if description is not None else None
+            target = self._variable(connection.target)
             entries = connection.change.mapping.items()
             written["map"] = {have: _map_value(want, target) for have, want in entries}
         if connection.change.place is not None:
@@ -354,11 +357,12 @@ class _Configuration:
     def _note_annotations(self, system: StructureSystem, step_size: Plain) -> None:
         """Note which annotations of a system, and of those in it, have no effect."""
         annotations = annotations_of(self._structure) if system is self._structure.system else system.annotations
-        own = base_step_size(system.annotations, Problems())
+        own = _base_step_size(system.annotations, Problems())
         if own is not None and own[0] != step_size:
             found = f"a step size of {own[0]:g} s for the system '{system.name}'"
             self._problems.warn(own[1].place, found, "that of the root system, which all its instances have")
-        for solver, annotation in common_solvers(annotations):
+        solvers = [(name, one) for one in annotations if one.type == _OPEN_MODELICA for name, _ in one.elements]
+        for solver, annotation in (both for both in solvers if both[0] in {"VariableStepSolver", "FixedStepSolver"}):
             found = (
                 f"the {solver} for the whole system '{system.name}' is not used: an FMU for co-simulation has its own "
                 "solver, and one for model exchange gets one of its own, see `solver`"
@@ -391,3 +395,26 @@ def _map_value(text: str, target: Variable | None) -> bool | int | str:
         return text == "true"
     names = [item for item, _ in target.items] if target is not None else []
     return int(text) if text not in names and re.fullmatch(r"-?[0-9]+", text) else text
+
+
+def _base_step_size(annotations: Iterable[Annotation], problems: Problems) -> tuple[float, Annotation] | None:
+    """The step size of a whole system in s, and the annotation that says it; None if none does.
+
+    The annotations are those of the root system, of its default experiment and of its description.
+    """
+    return _step_size(annotations, _STEP_SIZES, "{0} with {1} '{2}'", problems)
+
+
+def _step_size(
+    annotations: Iterable[Annotation], places: Mapping[str, tuple[str, str]], words: str, problems: Problems
+) -> tuple[float, Annotation] | None:
+    """The first step size at one of the places: element and attribute by type of annotation. Others are findings."""
+    for annotation in annotations:
+        wanted, attribute = places.get(annotation.type, ("", ""))
+        for text in (attributes.get(attribute) for name, attributes in annotation.elements if name == wanted):
+            number = (text or "").strip()
+            value = number_of(number) if PATTERNS["number"].fullmatch(number) else math.nan
+            if math.isfinite(value) and value > 0.0:
+                return value, annotation
+            problems.add(annotation.place, words.format(wanted, attribute, text), "a step size > 0 in s")
+    return None

@@ -214,12 +214,12 @@ class Annotation(msgspec.Struct, frozen=True):
 
     Attributes:
         type: its namespace, such as `org.openmodelica`.
-        xml: the XML of its content.
+        elements: all elements inside it, with their names without the namespace, and their attributes.
         text: the text of the first element inside it, without those in that element; empty if there is none.
     """
 
     type: str
-    xml: bytes
+    elements: tuple[tuple[str, dict[str, str]], ...]
     place: FilePlace
     text: str = ""
 

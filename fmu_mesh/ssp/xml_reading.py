@@ -62,7 +62,7 @@ class XmlElement:
     def __init__(self, element: Any, document: _Document, version: str) -> None:  # noqa: ANN401  lxml ships no types
         self._element = element
         self._document = document
-        self.tag = _name_of(element)
+        self.tag = _with_prefix(element.tag)
         self.version = version
 
     @property
@@ -105,9 +105,9 @@ class XmlElement:
     def children(self, *tags: str) -> Iterator[XmlElement]:
         """The children with one of these tags, in their order; all of them if no tag is given."""
         for child in self._element:
-            if isinstance(child.tag, str) and (not tags or _name_of(child) in tags):
+            if isinstance(child.tag, str) and (not tags or _with_prefix(child.tag) in tags):
                 # A parameter set or a mapping inside a description has a version of its own.
-                own = child.get("version") if _name_of(child) in _INLINE else None
+                own = child.get("version") if _with_prefix(child.tag) in _INLINE else None
                 yield XmlElement(child, self._document, (own or self.version).strip())
 
     def child(self, *tags: str) -> XmlElement | None:
@@ -133,9 +133,9 @@ class XmlElement:
 
     def as_annotation(self) -> Annotation:
         """This element, an `ssc:Annotation`, as a value."""
-        content = b"".join(etree.tostring(child) for child in self._element)
+        inside = [(etree.QName(one).localname, dict(one.attrib)) for one in self._element.iterdescendants("*")]
         text = next((child.text or "" for child in self._element if isinstance(child.tag, str)), "")
-        return Annotation(self.text("type"), content, self.place, text)
+        return Annotation(self.text("type"), tuple(inside), self.place, text)
 
     def with_id(self, identifier: str) -> XmlElement | None:
         """The element of the whole file with this `id`; None if there is none."""
@@ -161,7 +161,7 @@ class XmlElement:
         for child in self.children():
             if child.tag not in rule.children:
                 names = [name.partition(":")[2] for name in rule.children]
-                own = child.tag.rpartition("}")[2].rpartition(":")[2]
+                own = _kind(child.tag)
                 near = nearest(own, names)
                 namespace = _wrong_namespace(child.tag, near, rule)
                 expected = f"one of {listed(names)}" if names else "nothing inside it"
@@ -202,16 +202,9 @@ class XmlElement:
 
 
 def read_xml(data: bytes, file: str, tag: str, problems: Problems) -> XmlElement | None:
-    """Parse and check one file.
+    """The root of one file, whose content was checked; None if it is no such file at all, for which there is a finding.
 
-    Args:
-        data: its bytes.
-        file: the file as messages name it.
-        tag: what its root must be, such as `ssd:SystemStructureDescription`.
-        problems: collects what is wrong.
-
-    Returns:
-        The root; None if it is no such file at all, for which there is a finding.
+    The ``file`` is as messages name it; ``tag`` is what its root must be, such as `ssd:SystemStructureDescription`.
     """
     try:
         root = safe_xml(data, f"'{file}'")
@@ -280,15 +273,14 @@ def _check_value(element: XmlElement, name: str, text: str, attribute: Attribute
     for word in words:
         if attribute.words:
             if word not in attribute.words:
-                near = nearest(word, attribute.words)
-                problems.add(element.place, f"{name} {shown(word)}", attribute.expected, near)
+                problems.add(element.place, f"{name} {shown(word)}", attribute.expected, nearest(word, attribute.words))
         elif not PATTERNS[attribute.type].fullmatch(word):
             problems.add(element.place, f"{name} {shown(word)}", attribute.expected)
 
 
 def _wrong_namespace(tag: str, near: str | None, rule: Rule) -> str | None:
     """A name with its namespace, where the name without it would be right."""
-    local = tag.rpartition("}")[2].rpartition(":")[2]
+    local = _kind(tag)
     if near != local or not any(own.partition(":")[2] == local for own in rule.children):
         return None
     if tag.startswith("{"):
@@ -299,10 +291,6 @@ def _wrong_namespace(tag: str, near: str | None, rule: Rule) -> str | None:
     )
 
 
-def _name_of(element: Any) -> str:  # noqa: ANN401  lxml ships no types
-    return _with_prefix(element.tag)
-
-
 @lru_cache(maxsize=256)
 def _with_prefix(tag: str) -> str:
     """A tag with the usual prefix in the place of its namespace."""
@@ -311,6 +299,7 @@ def _with_prefix(tag: str) -> str:
 
 
 def _kind(tag: str) -> str:
+    """A tag without its namespace or prefix."""
     return tag.rpartition("}")[2].rpartition(":")[2]
 
 

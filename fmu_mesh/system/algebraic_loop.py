@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from ..config.mesh import InitializationConfig
 from ..errors import LoopNotConverged
 from ..variables.model_description import Value, Variable
-from ..variables.value_conversion import to_value
+from ..variables.value_conversion import is_finite, to_value
 from .initialization_plan import Loop, Tear
 
 __all__ = ["FixedPoint"]
@@ -39,7 +39,6 @@ class FixedPoint:
 
     Attributes:
         assumed: by (instance, input).
-        sweeps: number of sweeps so far.
     """
 
     def __init__(self, loop: Loop, settings: InitializationConfig) -> None:
@@ -62,7 +61,7 @@ class FixedPoint:
         """
         self.sweeps += 1
         pairs = list(zip(self.assumed.values(), brought, strict=True))
-        if not all(_finite(new) for new in brought):
+        if not all(map(is_finite, brought)):
             raise self._not_converged("a value is not finite any more", pairs)
         if all(self._agree(old, new) for old, new in pairs):
             return True
@@ -76,7 +75,7 @@ class FixedPoint:
         if isinstance(old, list) and isinstance(new, list):
             return all(self._agree(one, other) for one, other in zip(old, new, strict=True))
         if isinstance(old, float) and isinstance(new, float):
-            return _finite(new) and abs(new - old) <= self._settings.tolerance * max(1.0, abs(new))
+            return math.isfinite(new) and abs(new - old) <= self._settings.tolerance * max(1.0, abs(new))
         return old == new
 
     def _relaxed(self, old: Value, new: Value) -> Value:
@@ -107,12 +106,6 @@ class FixedPoint:
 
 def _start(tear: Tear) -> Value:
     return to_value(tear.start, Variable(tear.input, 0, tear.type, "input", "discrete", shape=tear.shape))
-
-
-def _finite(value: Value) -> bool:
-    if isinstance(value, list):
-        return all(map(_finite, value))
-    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _residual(old: Value, new: Value) -> str:

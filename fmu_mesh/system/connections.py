@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.system.value_map import checked_items, resolve_map
-from fmu_mesh.text import listed, nearest
+from fmu_mesh.text import listed, nearest, with_article
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from fmu_mesh.variables.units import Linear, conversion
 from fmu_mesh.variables.value_types import (
@@ -43,11 +43,9 @@ Offer = Callable[[str, Variable], bool]
 
 
 class Variables(dict[str, Mapping[str, Variable] | None]):
-    """The variables of every instance by name; None without a model description.
+    """The variables of every instance by name, in the order of the file; None without a model description.
 
-    Args:
-        descriptions: the model descriptions by instance name, arrays in their sizes.
-        names: the instances, in the order of the file.
+    The descriptions are those of the instances by name, with arrays in their sizes.
     """
 
     def __init__(self, descriptions: Mapping[str, ModelDescription], names: Iterable[str]) -> None:
@@ -155,17 +153,9 @@ def resolve_variable(
 ) -> tuple[Variable, tuple[int, ...]] | None:
     """The variable that `instance.variable` names; None after a finding, or without a model description.
 
-    `instance.array[1,2]` names an element of an array, counted from 1, unless a variable has that very name.
-
-    Returns:
-        The variable, and the index of the element, counted from 0; empty for the variable as a whole.
-
-    Args:
-        reference: instance name and FMI variable name; the first dot is between them.
-        path: the place of the reference in the file.
-        variables: all variables of all instances.
-        offer: the causality of the variables that are suggested, or which of them can be set, by instance and variable.
-        findings: where unknown names go.
+    `instance.array[1,2]` names an element of an array, counted from 1, unless a variable has that very name. With the
+    variable comes the index of the element, counted from 0; empty for the variable as a whole. What is suggested
+    instead of an unknown name has the causality ``offer``, or ``offer`` says of a variable that it can be set.
     """
     instance, dot, name = reference.partition(".")
     if not instance or not dot or not name:
@@ -179,21 +169,19 @@ def resolve_variable(
     own = variables[instance]
     if own is None:
         return None
-    if name not in own:
-        if (parts := split_element(name)) is not None and parts[0] in own:
-            return element_of(own[parts[0]], parts[1], path, reference, findings)
+    if name in own:
+        return own[name], ()
+    if (parts := split_element(name)) is not None and parts[0] in own:
+        return element_of(own[parts[0]], parts[1], path, reference, findings)
+    if (clock := variables.descriptions[instance].clock(name)) is not None:
+        findings.add(path, clock, "")
+    else:
         names = offered(instance, variables, offer)
-        near, words = nearest(name, names), f"{offer}s of '{instance}'"
-        if not isinstance(offer, str):
-            words = f"variables of '{instance}' that can be set"
-        expected = f"one of the {words}: {listed(sorted(names, key=lambda one: one != near))}"
-        if (clock := variables.descriptions[instance].clock(name)) is not None:
-            findings.add(path, clock, "")
-        else:
-            found = f"the unknown variable '{name}' of instance '{instance}'"
-            findings.add(path, found, expected, near)
-        return None
-    return own[name], ()
+        near = nearest(name, names)
+        what = f"{offer}s of '{instance}'" if isinstance(offer, str) else f"variables of '{instance}' that can be set"
+        expected = f"one of the {what}: {listed(sorted(names, key=lambda one: one != near))}"
+        findings.add(path, f"the unknown variable '{name}' of instance '{instance}'", expected, near)
+    return None
 
 
 def unit_warnings(
@@ -313,11 +301,18 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
         found = f"the wrong way round: '{source_name}' is an input and '{target_name}' an output"
         findings.add(connection.path, found, "output -> input", f"{target_name} -> {source_name}")
         return False
-    is_source = _is_source(source, target)
+    # The value of a source can be read at every point (SSP 2.0, 5.3.2.1).
+    is_source = source.causality in ("output", "local", "calculatedParameter") or (
+        source.causality == "parameter" and (source.variability == "constant" or target.causality == "parameter")
+    )
     if not is_source:
         outputs = _names_of(connection.source_instance, "output", variables)
-        findings.add(f"{connection.path}.from", f"'{source_name}' is {_a(source.causality)}", f"an output{outputs}")
-    is_target = target.causality == "input" or (_is_open_parameter(target) and not source.changes)
+        findings.add(
+            f"{connection.path}.from", f"'{source_name}' is {with_article(source.causality)}", f"an output{outputs}"
+        )
+    # A parameter gets its value in Initialization Mode (FMI 2.0, 2.2.7 and 4.2.4; FMI 3.0, 2.3.3).
+    is_open_parameter = target.causality == "parameter" and target.settable_before_start and not source.changes
+    is_target = target.causality == "input" or is_open_parameter
     if not is_target:
         inputs = _names_of(connection.target_instance, "input", variables)
         expected = f"an input{inputs}"
@@ -325,20 +320,8 @@ def _causality_is_right(connection: Connection, variables: Variables, findings: 
             expected = "an input or a parameter; its value is needed before the initialization, so use `start_values`"
         elif target.causality == "parameter" and source.changes:
             expected += f"; a parameter gets its value once, and '{source_name}' changes"
-        findings.add(f"{connection.path}.to", f"'{target_name}' is {_a(target.causality)}", expected)
+        findings.add(f"{connection.path}.to", f"'{target_name}' is {with_article(target.causality)}", expected)
     return is_source and is_target
-
-
-def _is_source(source: Variable, target: Variable) -> bool:
-    """Whether a connection may begin at a variable: its value can be read at every point (SSP 2.0, 5.3.2.1)."""
-    if source.causality in ("output", "local", "calculatedParameter"):
-        return True
-    return source.causality == "parameter" and (source.variability == "constant" or target.causality == "parameter")
-
-
-def _is_open_parameter(target: Variable) -> bool:
-    """Whether a parameter can be set in Initialization Mode (FMI 2.0, 2.2.7 and 4.2.4; FMI 3.0, 2.3.3)."""
-    return target.causality == "parameter" and target.settable_before_start
 
 
 def _names_of(instance: str, causality: str, variables: Variables) -> str:
@@ -351,11 +334,13 @@ def _check_types(connection: Connection, findings: Findings) -> None:
     items = tuple(number for _, number in source.items)
     have, want = _end(source, connection.source_index), _end(target, connection.target_index)
     if not _fits(target.type, source.type, items):
-        accepted = [_name_of(type_, target) for type_ in _sources_for(target.type, source)]
-        found = f"{connection} connects {_a(have)} to {_a(want)}"
+        known = TYPES if source.declared_type is None else FMI2_TYPES.values()  # in the FMI version of the source
+        others = (type_ for type_ in known if type_ != target.type and _fits(target.type, type_))
+        accepted = [_name_of(type_, target) for type_ in (target.type, *others)]
+        found = f"{connection} connects {with_article(have)} to {with_article(want)}"
         findings.add(connection.path, found, f"a source of type {' or '.join(dict.fromkeys(accepted))}")
     elif (source.shape if not connection.source_index else ()) != (target.shape if not connection.target_index else ()):
-        found = f"{connection} connects {_a(have)} to {_a(want)}"
+        found = f"{connection} connects {with_article(have)} to {with_article(want)}"
         expected = "ends of the same shape: two arrays of the same dimensions, or one element as in y[1]"
         findings.add(connection.path, found, expected)
     elif not is_float(target.type) and not _is_identity(connection):
@@ -367,12 +352,6 @@ def _check_types(connection: Connection, findings: Findings) -> None:
 def _fits(target: VariableType, source: VariableType, items: tuple[int, ...] = ()) -> bool:
     """Whether a connection is allowed: an integer for an Enumeration is checked in the run, value by value."""
     return takes(target, source, items) or (target == "Enumeration" and source in INTEGERS)
-
-
-def _sources_for(target: VariableType, source: Variable) -> list[VariableType]:
-    """The types that an input of this type accepts, its own first, of those in the FMI version of the source."""
-    known = TYPES if source.declared_type is None else FMI2_TYPES.values()
-    return [target, *(type_ for type_ in known if type_ != target and _fits(target, type_))]
 
 
 def _name_of(type_: VariableType, like: Variable) -> str:
@@ -414,7 +393,3 @@ def _check_delay(connection: Connection, findings: Findings) -> None:
 
 def _is_identity(connection: Connection) -> bool:
     return connection.factor == 1.0 and connection.offset == 0.0
-
-
-def _a(word: str) -> str:
-    return f"an {word}" if word[0] in "aeiouAEIOU" else f"a {word}"

@@ -29,8 +29,6 @@ class CouplingRule(msgspec.Struct, frozen=True):
         >>> rule = CouplingRule(delay=1, source_points=2, target_points=1)
         >>> [rule.row_for(step) for step in range(5)]
         [0, 0, 1, 1, 2]
-        >>> rule.steps_ready(2)
-        4
 
     Attributes:
         delay: delay of the connection in points: 0 or 1.
@@ -50,10 +48,3 @@ class CouplingRule(msgspec.Struct, frozen=True):
     def row_for(self, step: Steps) -> Steps:
         """The row of the source that feeds own step ``step`` of the target; also for an array of steps."""
         return (step * self.target_points + self.lead) // self.source_points
-
-    def steps_ready(self, rows: int) -> int:
-        """The number of own steps of the target that rows ``0 .. rows - 1`` of the source feed.
-
-        The inverse of `row_for`: the first step that is not ready reads row ``rows`` or a later one.
-        """
-        return max(0, -(-(rows * self.source_points - self.lead) // self.target_points))

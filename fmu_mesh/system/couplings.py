@@ -49,13 +49,9 @@ class _Coupling(msgspec.Struct, frozen=True):
 def coupled_connections(
     config: Config, variables: Variables, explicit: Sequence[Connection], findings: Findings
 ) -> tuple[Connection, ...]:
-    """The connections that follow from the sections of all physics engines.
+    """The connections that follow from the sections of all physics engines, beside the ``explicit`` ones of the file.
 
-    Args:
-        config: the configuration.
-        variables: the variables of every instance by name. An instance without a description gets no connections.
-        explicit: the connections that the file has.
-        findings: where mistakes go.
+    An instance without a model description gets none.
     """
     found: list[Connection] = []
     couplings = [*_couplings(config)]
@@ -71,11 +67,7 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     """The inputs that have a source in the mesh, as `instance.variable`, and for each what can be set instead.
 
     An array has a source if one of its elements has. The effort command of a joint with an actuator counts, too,
-    because the engine does not use it.
-
-    Args:
-        config: the configuration.
-        descriptions: the model descriptions by instance name, arrays in their sizes; some may be missing.
+    because the engine does not use it. Some of the descriptions, with arrays in their sizes, may be missing.
     """
     ignored = Findings("")  # `fmu_mesh.system.system` reports them
     variables = Variables(descriptions, config.instances)
@@ -87,13 +79,12 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     for name, engine in config.instances.items():
         for actuator in engine.actuators if isinstance(engine, PhysicsSection) else ():
             if actuator.enabled:
-                driven.setdefault(f"{name}.{actuator.joint}.effort_command", _instead(actuator))
+                own = actuator.variable_names.get("actuatorInput", "actuatorInput")
+                instead = (
+                    f"'{actuator.instance}.{own}': the joint '{actuator.joint}' has the actuator '{actuator.name}'"
+                )
+                driven.setdefault(f"{name}.{actuator.joint}.effort_command", instead)
     return driven
-
-
-def _instead(actuator: ActuatorConfig) -> str:
-    own = actuator.variable_names.get("actuatorInput", "actuatorInput")
-    return f"'{actuator.instance}.{own}': the joint '{actuator.joint}' has the actuator '{actuator.name}'"
 
 
 def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> None:

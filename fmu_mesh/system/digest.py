@@ -23,22 +23,14 @@ _CONFIGURATION_DIGITS, _MODEL_DIGITS = 16, 12
 def digest_of(configuration: object, models: Mapping[str, tuple[str, str]]) -> str:
     """The digest of a mesh: our version, a hash of the configuration, and one of the model of each instance.
 
-    Args:
-        configuration: what must be equal, as a value that JSON can hold.
-        models: the GUID and the SHA-256 of the content by instance name.
+    A model is the GUID and the SHA-256 of its content; the configuration is what must be equal, as JSON can hold it.
     """
     hashes = [_hash(models[name])[:_MODEL_DIGITS] for name in sorted(models)]
     return " ".join([__version__, _hash(configuration)[:_CONFIGURATION_DIGITS], *hashes])
 
 
 def difference(own: str, other: str, instances: Iterable[str]) -> str:
-    """In words, what is different in a process with the digest ``other``: `another model of 'gain'`.
-
-    Args:
-        own: the digest of this process.
-        other: the different digest.
-        instances: the names of all instances here.
-    """
+    """In words, what is different in a process with the digest ``other``: `another model of 'gain'`."""
     (version, configuration, *models), there = own.split(), other.split()
     if len(there) < 2 or there[0] != version:
         return f"another version of fmu_mesh than {version}"

@@ -26,13 +26,7 @@ class ExecutionOrder(NamedTuple):
 def execution_order(
     names: Collection[str], connections: Sequence[Connection], algorithm: str, findings: Findings
 ) -> ExecutionOrder:
-    """The connections with their delays, the order of the instances, and the cycles.
-
-    Args:
-        names: the instances.
-        connections: between them.
-        algorithm: of the configuration.
-        findings: where cycles without a delay go.
+    """The connections between instances with their delays, the order of the instances, and the cycles.
 
     Raises:
         ConfigurationError: there is one; has all findings.

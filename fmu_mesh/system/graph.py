@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from graphlib import TopologicalSorter
 from typing import Final, TypeVar
 
 __all__ = [
@@ -70,21 +71,18 @@ def topological_order(vertices: Iterable[V], edges: Iterable[tuple[V, V]]) -> li
     Raises:
         ValueError: the graph has a cycle.
     """
-    order = list(vertices)
-    position = {vertex: place for place, vertex in enumerate(order)}
-    missing = {vertex: set[V]() for vertex in order}
+    position = {vertex: place for place, vertex in enumerate(vertices)}
+    sorter = TopologicalSorter[V](dict.fromkeys(position, ()))
     for source, target in edges:
-        missing[target].add(source)
-    done: set[V] = set()
+        sorter.add(target, source)
+    sorter.prepare()  # raises a CycleError, which is a ValueError
+    ready: set[V] = set()
     result: list[V] = []
-    while len(result) < len(order):
-        ready = [vertex for vertex in order if vertex not in done and missing[vertex] <= done]
-        if not ready:
-            msg = "the graph has a cycle"
-            raise ValueError(msg)
-        first = min(ready, key=position.__getitem__)
-        done.add(first)
-        result.append(first)
+    while sorter.is_active():
+        ready.update(sorter.get_ready())
+        result.append(min(ready, key=position.__getitem__))
+        ready.remove(result[-1])
+        sorter.done(result[-1])
     return result
 
 
@@ -179,19 +177,16 @@ def cycle_through(component: Sequence[V], edges: Iterable[tuple[V, V]]) -> list[
         if source in members and target in members:
             successors[source].append(target)
     before: dict[V, V] = {}
-    frontier = [start]
-    while frontier:
-        following = []
-        for vertex in frontier:
-            for target in successors[vertex]:
-                if target == start:
-                    walk = [vertex]
-                    while walk[-1] != start:
-                        walk.append(before[walk[-1]])
-                    return [*reversed(walk), start]
-                if target not in before:
-                    before[target] = vertex
-                    following.append(target)
-        frontier = following
+    found = [start]
+    for vertex in found:  # which grows: near vertices come before far ones
+        for target in successors[vertex]:
+            if target == start:
+                walk = [vertex]
+                while walk[-1] != start:
+                    walk.append(before[walk[-1]])
+                return [*reversed(walk), start]
+            if target not in before:
+                before[target] = vertex
+                found.append(target)
     msg = "no cycle leads through the first vertex"
     raise ValueError(msg)

@@ -8,7 +8,7 @@ levels in the torn graph. These levels are repeated until the torn connections h
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 
 import msgspec
@@ -80,10 +80,8 @@ class InitializationPlan(msgspec.Struct, frozen=True):
 def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection]) -> InitializationPlan:
     """Levels of all connected outputs, and the loops.
 
-    Args:
-        system: the system, for the start values of inputs.
-        connections: all connections, with their delays. In Initialization Mode a delay has no effect, but a connection
-            with a delay is torn before one without: so the values flow in the order of the steps.
+    In Initialization Mode a delay has no effect, but a connection with a delay is torn before one without: so the
+    values flow in the order of the steps.
     """
     outputs = tuple(dict.fromkeys((c.source_instance, c.source.name) for c in connections))
     reached = _reached(system, connections)
@@ -119,12 +117,6 @@ def check_loops(
     plan: InitializationPlan, connections: Sequence[Connection], system: ResolvedSystem, findings: Findings
 ) -> None:
     """Refuse parameters of FMI 1.0 in a loop: they cannot be set again after the initialization.
-
-    Args:
-        plan: what `plan_initialization` returned.
-        connections: all connections.
-        system: the system.
-        findings: where they go.
 
     Raises:
         ConfigurationError: there is one; has all findings.
@@ -196,19 +188,20 @@ def _reached(system: ResolvedSystem, connections: Sequence[Connection]) -> dict[
         outputs.setdefault(c.source_instance, {})[c.source.name] = c.source
         if c.initial_only:
             parameters.setdefault(c.target_instance, []).append(c.target.name)
-    dependents = {
-        instance: _Dependents(
-            (output, _dependencies(output, parameters.get(instance, []), system.instances[instance].description))
-            for output in own.values()
-        )
-        for instance, own in outputs.items()
-    }
-    return {
-        id(c): [(c.target_instance, name) for name in dependents[c.target_instance].of(c.target.name)]
-        if c.target_instance in dependents
-        else []
-        for c in connections
-    }
+    # By instance and known: the outputs that depend on it, with their places; those that may depend on all by None.
+    dependents: dict[tuple[str, str | None], list[tuple[int, str]]] = {}
+    for instance, own in outputs.items():
+        for number, output in enumerate(own.values()):
+            description = system.instances[instance].description
+            declared = _dependencies(output, parameters.get(instance, []), description)
+            for known in dict.fromkeys(declared) if declared is not None else (None,):
+                dependents.setdefault((instance, known), []).append((number, output.name))
+    reached = {}
+    for c in connections:
+        target = c.target_instance
+        both = dependents.get((target, None), []) + dependents.get((target, c.target.name), [])
+        reached[id(c)] = [(target, name) for _, name in sorted(both)]
+    return reached
 
 
 def _dependencies(source: Variable, parameters: Sequence[str], description: ModelDescription) -> tuple[str, ...] | None:
@@ -226,23 +219,6 @@ def _dependencies(source: Variable, parameters: Sequence[str], description: Mode
     if declared is None or version in ("2", "3") or (given and version != "1"):
         return declared
     return (*declared, *parameters)
-
-
-class _Dependents:
-    """Which of the outputs of an instance depend on an input, in the order of the outputs."""
-
-    def __init__(self, outputs: Iterable[tuple[Variable, tuple[str, ...] | None]]) -> None:
-        self._on_all: list[tuple[int, str]] = []
-        self._on: dict[str, list[tuple[int, str]]] = {}
-        for number, (output, dependencies) in enumerate(outputs):
-            if dependencies is None:
-                self._on_all.append((number, output.name))
-            for known in dict.fromkeys(dependencies or ()):
-                self._on.setdefault(known, []).append((number, output.name))
-
-    def of(self, known: str) -> list[str]:
-        """The names of the outputs that depend on ``known``."""
-        return [name for _, name in sorted(self._on_all + self._on.get(known, []))]
 
 
 def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list[list[list[Key]]]:

@@ -76,11 +76,9 @@ class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def map_memory(
     processes: Sequence[str], rings: Mapping[str, tuple[str, int, Layout, int]]
 ) -> tuple[MemoryMap, dict[str, RingPlace]]:
-    """The map, and the place of each ring by instance.
+    """The map, and the place of each ring by instance; the processes are all nodes, then the master.
 
-    Args:
-        processes: the names of all nodes, then the master.
-        rings: node, base points per own step, outputs and number of rows of each instance.
+    A ring is given by its node, base points per own step, outputs and number of rows.
     """
     ends = _Places(_TOKEN_LINES * _LINE)
     counter = _LINE + 8 * len(processes)

@@ -16,7 +16,8 @@ from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, placed
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
-from ..variables.value_conversion import to_plain
+from ..variables.model_description import Variable
+from ..variables.value_conversion import ValueRefused, to_plain
 from ..variables.value_types import PlainValue, is_float
 from .digest import digest_of
 from .execution_order import execution_order
@@ -27,6 +28,7 @@ from .linear_inputs import LinearInput
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
+from .start_values import why_not_settable
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import batch_of, recorder_window, rows_of_ring, window_of
 
@@ -44,7 +46,6 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
-        scenario: what a scenario prescribes for its variables.
         row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario.
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
@@ -75,6 +76,20 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def input_row(self) -> Layout:
         """The inputs that are set in every step."""
         return self.row if self.row is not None else self.inputs
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """The source instance of each input that is connected, or of which an element is."""
+        return {self.inputs.column(own.target).name: feed.source for feed in self.feeds for own in feed.columns}
+
+    def check_settable(self, variable: Variable) -> None:
+        """Check that a variable may be set between two steps.
+
+        Raises:
+            ValueRefused: it may not; the message is the predicate of a sentence whose subject is the variable.
+        """
+        if (why := why_not_settable(variable, self.sources.get(variable.name))) is not None:
+            raise ValueRefused(why)
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -113,9 +128,6 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rings: the output rings of its instances, and of all instances that it has values from.
         loops: the algebraic loops at the start that have instances of this node.
         initialization: how these loops are iterated.
-        links_in: links that end here.
-        links_out: links that start here.
-        restarts: how many times the run was restarted.
         shared_memory: whether processes of one host exchange messages through shared memory.
         records: the result files, if it is the recorder.
     """
@@ -201,13 +213,9 @@ def make_plan(
     findings: Findings | None = None,
     contents: Mapping[str, str] = {},
 ) -> Plan:
-    """Plan a validated system.
+    """Plan a validated system; a ``window`` in points overrides that of the configuration.
 
-    Args:
-        system: the system.
-        window: overrides the window of the configuration, in points.
-        findings: those about this host; an error has them, too.
-        contents: the SHA-256 of the content of each model, by instance name.
+    An error has the ``findings`` about this host, too. The contents are the SHA-256 of each model, by instance name.
 
     Raises:
         ConfigurationError: a cycle has no delay; names the cycle.
@@ -279,6 +287,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
+        shared = any(name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles)
         links_in = tuple(link for link in links if link.target_node == node)
         nodes[node] = NodePlan(
             mesh=config.mesh,
@@ -289,7 +298,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
-            batch=batch_of(plan.window) if not _in_cycle(plan, members, within) else 1,
+            batch=1 if shared else batch_of(plan.window),  # a cycle over several nodes waits for each row
             memory=memory,
             rings=tuple(
                 places[name]
@@ -321,11 +330,6 @@ def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ..
             unit = tuple(name for name in plan.order if name in cycle)
             units.update(dict.fromkeys(unit, unit))
     return units
-
-
-def _in_cycle(plan: Plan, members: list[str], units: dict[str, tuple[str, ...]]) -> bool:
-    """Whether a member of a node belongs to a cycle over several nodes."""
-    return any(name in cycle and len(units[name]) < len(cycle) for name in members for cycle in plan.cycles)
 
 
 def _output_layouts(system: ResolvedSystem, connections: Iterable[Connection]) -> dict[str, Layout]:

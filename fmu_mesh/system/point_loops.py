@@ -26,12 +26,7 @@ Edges = dict[tuple[Vertex, Vertex], Connection | None]
 
 
 def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
-    """Add a warning for each loop at every point, and one for all outputs that may close one.
-
-    Args:
-        plan: what would run, with the delays of its connections.
-        findings: where the warnings go.
-    """
+    """Add a warning for each loop at every point, and one for all outputs that may close one."""
     declared, assumed = _edges(plan.connections) if plan.cycles else ({}, {})
     for loop, inside in _loops(declared):
         walk, more = _walk(loop, inside)

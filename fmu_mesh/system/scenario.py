@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,10 +16,10 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.scenario_section import ScenarioEvent, ScenarioSource, ScenarioValues
+from ..config.scenario_section import ScenarioSource, ScenarioValues
 from ..errors import Finding
 from ..simtime import TimeGrid
-from ..text import listed, shown
+from ..text import listed, shown, with_article
 from ..variables.model_description import Value, Variable
 from ..variables.units import BaseUnit, Linear, conversion
 from ..variables.value_conversion import FINITE, ValueRefused, to_plain, to_value
@@ -26,7 +27,7 @@ from ..variables.value_types import PlainValue, is_float
 from .connections import Variables, offered, resolve_variable
 from .schedule import Course, Schedule, SeriesFile
 from .series_files import SeriesRefused, columns_of, content_of, course_of, read_series
-from .settable import why_not_settable
+from .start_values import why_not_settable
 
 __all__ = [
     "BAG_STAMP_S",
@@ -128,29 +129,21 @@ def resolve_scenario(  # noqa: PLR0913, PLR0917  what a scenario refers to
         grid: the communication points.
         findings: where everything goes that is wrong; its paths are those of the file of the scenario.
     """
-    return _Resolving(scenario, variables, instances, sources, grid, findings).resolved()
+    late = scenario.source.findings()
+    return _Resolving(scenario, variables, instances, sources, grid, findings, late, {}).resolved()
 
 
-class _Resolving:
-    """See `resolve_scenario`."""
+class _Resolving(msgspec.Struct):
+    """See `resolve_scenario`; ``late`` are warnings of times after the last step, ``files`` the hashes of all files."""
 
-    def __init__(  # noqa: PLR0913, PLR0917  those of the function
-        self,
-        scenario: Scenario,
-        variables: Variables,
-        instances: Mapping[str, ScenarioInput],
-        sources: Mapping[str, str],
-        grid: TimeGrid,
-        findings: Findings,
-    ) -> None:
-        self._scenario = scenario
-        self._variables = variables
-        self._instances = instances
-        self._sources = sources
-        self._grid = grid
-        self._findings = findings
-        self._files: dict[str, str] = {}
-        self._late = scenario.source.findings()
+    scenario: Scenario
+    variables: Variables
+    instances: Mapping[str, ScenarioInput]
+    sources: Mapping[str, str]
+    grid: TimeGrid
+    findings: Findings
+    late: Findings
+    files: dict[str, str]
 
     def resolved(self) -> ResolvedScenario:
         """All schedules without a finding."""
@@ -160,9 +153,12 @@ class _Resolving:
             first = entries.get(key)
             if first is not None and first.schedule.linear:
                 found = f"an event for '{'.'.join(key)}', which changes linearly ({first.path})"
-                self._findings.add(event.path, found, "one of the two")
-            elif first is not None:
-                entries[key] = first._replace(schedule=_merged(first.schedule, event.schedule))
+                self.findings.add(event.path, found, "one of the two")
+            elif first is not None:  # at equal times an event counts: it comes behind
+                both = first.schedule, event.schedule
+                pairs = [pair for one in both for pair in zip(one.times, one.values, strict=True)]
+                times, values = zip(*sorted(pairs, key=itemgetter(0)), strict=True)
+                entries[key] = first._replace(schedule=replace(first.schedule, times=times, values=values))
             else:
                 entries[key] = event
         schedules: dict[str, list[Schedule]] = {}
@@ -172,27 +168,28 @@ class _Resolving:
                 continue
             schedules.setdefault(entry.instance, []).append(entry.schedule)
             if entry.schedule.file or not entry.schedule.initial:
-                begin = self._grid.time(course.first_step * self._instances[entry.instance].step_points)
+                begin = self.grid.time(course.first_step * self.instances[entry.instance].step_points)
                 self._tell_late([(entry.path, begin)], entry.instance)
             start = course.value(0) if entry.schedule.initial else None
             if start is not None:
                 start_values.setdefault(entry.instance, {})[entry.variable.name] = start
                 self._check_start(entry)
         by_instance = {name: tuple(own) for name, own in schedules.items()}
-        return ResolvedScenario(by_instance, start_values, self._files, tuple(self._late))
+        return ResolvedScenario(by_instance, start_values, self.files, tuple(self.late))
 
     # --- the parts of the file
 
     def _values(self) -> Iterator[_Entry]:
-        for reference, given in self._scenario.source.config.values.items():
-            path = f"{self._scenario.source.prefix}values.{reference}"
+        for reference, given in self.scenario.source.config.values.items():
+            path = f"{self.scenario.source.prefix}values.{reference}"
             end = self._settable(reference, path)
             if end is None:
                 continue
+            schedule: Schedule | None = None
             if isinstance(given, ScenarioValues):
                 schedule = self._over_time(reference, given, end[1], path)
-            else:
-                schedule = self._constant(given, end[1], path)
+            elif (value := self._value(given, end[1], path)) is not None:  # a constant
+                schedule = Schedule(end[1].name, (self.grid.start_time,), (value,))
             if schedule is not None:
                 yield _Entry(*end, path, schedule)
 
@@ -201,9 +198,10 @@ class _Resolving:
         found: dict[tuple[str, str], list[tuple[float, PlainValue]]] = {}
         ends: dict[tuple[str, str], _Entry] = {}
         given: set[tuple[str, str, float]] = set()
-        events = enumerate(self._scenario.source.config.events)
+        events = enumerate(self.scenario.source.config.events)
         for index, event in sorted(events, key=lambda item: item[1].at):
-            for reference, plain, path in self._of_event(index, event):
+            for reference, plain in event.set.items():
+                path = f"{self.scenario.source.prefix}events[{index}].set.{reference}"
                 end = self._settable(reference, path)
                 value = self._value(plain, end[1], path) if end is not None else None
                 if end is None or value is None or event.at == math.inf:  # its time is wrong
@@ -211,7 +209,7 @@ class _Resolving:
                 key = end[0], end[1].name
                 if (*key, event.at) in given:
                     text = f"'{reference}' at {event.at:g} s a second time"
-                    self._findings.add(path, text, "one event for a variable at a time")
+                    self.findings.add(path, text, "one event for a variable at a time")
                 given.add((*key, event.at))
                 self._tell_late([(path, event.at)], end[0])
                 found.setdefault(key, []).append((event.at, value))
@@ -220,36 +218,30 @@ class _Resolving:
             times, values = zip(*pairs, strict=True)
             yield ends[key]._replace(schedule=Schedule(key[1], times, values))
 
-    def _of_event(self, index: int, event: ScenarioEvent) -> Iterator[tuple[str, PlainInput, str]]:
-        for reference, plain in event.set.items():
-            yield reference, plain, f"{self._scenario.source.prefix}events[{index}].set.{reference}"
-
     def _settable(self, reference: str, path: str) -> tuple[str, Variable] | None:
         """The instance and the variable of a reference that may be set; None after a finding, or without a model."""
-        end = resolve_variable(reference, path, self._variables, self._is_settable, self._findings)
+        end = resolve_variable(reference, path, self.variables, self._is_settable, self.findings)
         if end is None:
             return None
         (variable, index), instance = end, reference.partition(".")[0]
         if index:
             found = f"'{reference}', an element of the array '{variable.name}'"
-            self._findings.add(path, found, f"the whole array: {instance}.{variable.name}")
+            self.findings.add(path, found, f"the whole array: {instance}.{variable.name}")
             return None
-        why = why_not_settable(variable, self._sources.get(f"{instance}.{variable.name}"))
-        if why is not None:
-            names = offered(instance, self._variables, self._is_settable)
+        if (why := self._why_not_settable(instance, variable)) is not None:
+            names = offered(instance, self.variables, self._is_settable)
             expected = f"an input that is not connected, or a tunable parameter of '{instance}': {listed(names)}"
-            self._findings.add(path, f"'{reference}', which {why.partition(';')[0]}", expected)
+            self.findings.add(path, f"'{reference}', which {why.partition(';')[0]}", expected)
             return None
         return instance, variable
 
+    def _why_not_settable(self, instance: str, variable: Variable) -> str | None:
+        return why_not_settable(variable, self.sources.get(f"{instance}.{variable.name}"))
+
     def _is_settable(self, instance: str, variable: Variable) -> bool:
-        return why_not_settable(variable, self._sources.get(f"{instance}.{variable.name}")) is None
+        return self._why_not_settable(instance, variable) is None
 
     # --- one variable
-
-    def _constant(self, plain: PlainInput, variable: Variable, path: str) -> Schedule | None:
-        value = self._value(plain, variable, path)
-        return Schedule(variable.name, (self._grid.start_time,), (value,)) if value is not None else None
 
     def _over_time(self, reference: str, given: ScenarioValues, variable: Variable, path: str) -> Schedule | None:
         can_be_linear = is_float(variable.type) and variable.causality == "input"
@@ -257,7 +249,7 @@ class _Resolving:
         linear = (automatic if given.interpolation == "auto" else given.interpolation) == "linear"
         if linear and not can_be_linear:
             found = f"linear for '{reference}', {_what(variable)}"
-            self._findings.add(f"{path}.interpolation", found, "hold; inputs of type Real may be linear")
+            self.findings.add(f"{path}.interpolation", found, "hold; inputs of type Real may be linear")
             return None
         change = self._unit(given.unit, variable, path)
         if change is None or not self._keys_fit(given, path):
@@ -274,34 +266,34 @@ class _Resolving:
 
     def _keys_fit(self, given: ScenarioValues, path: str) -> bool:
         """Whether the keys go together: either a file, or times with values."""
-        before = len(self._findings)
+        before = len(self.findings)
         if given.file is None:
             for key in (*_OF_TABLES, *_OF_BAGS):
                 if getattr(given, key) is not None:
-                    self._findings.add(f"{path}.{key}", f"'{key}' without a file", "file: with the values")
-            if len(self._findings) == before and (given.times is None or given.values is None):
+                    self.findings.add(f"{path}.{key}", f"'{key}' without a file", "file: with the values")
+            if len(self.findings) == before and (given.times is None or given.values is None):
                 missing = "times" if given.times is None else "values"
-                self._findings.add(f"{path}.{missing}", "missing", "times: and values:, or file: with both")
+                self.findings.add(f"{path}.{missing}", "missing", "times: and values:, or file: with both")
         else:
             others = _OF_TABLES if is_bag(given) else _OF_BAGS
             for key in ("times", "values", *others):
                 if getattr(given, key) is not None:
                     what = "a bag" if is_bag(given) else "a table"
-                    self._findings.add(f"{path}.{key}", f"'{key}' for {what}, '{given.file}'", "no such key here")
+                    self.findings.add(f"{path}.{key}", f"'{key}' for {what}, '{given.file}'", "no such key here")
             if is_bag(given) and given.topic is None:
-                self._findings.add(f"{path}.topic", "missing", "the topic and field, such as /cmd:linear.x")
-        return len(self._findings) == before
+                self.findings.add(f"{path}.topic", "missing", "the topic and field, such as /cmd:linear.x")
+        return len(self.findings) == before
 
     def _listed(self, given: ScenarioValues, variable: Variable, change: Linear, path: str) -> Schedule | None:
         times, plain = given.times or [], given.values or []
         if len(times) != len(plain) or not times:
             found = f"{len(plain)} values for {len(times)} times"
-            self._findings.add(f"{path}.values", found, "one value for each time, and at least one")
+            self.findings.add(f"{path}.values", found, "one value for each time, and at least one")
             return None
         for index in range(1, len(times)):
             if times[index] < times[index - 1]:
                 found = f"{times[index]:g} s after {times[index - 1]:g} s"
-                self._findings.add(f"{path}.times[{index}]", found, "a time that is not before the one in front of it")
+                self.findings.add(f"{path}.times[{index}]", found, "a time that is not before the one in front of it")
                 return None
         values = [self._value(one, variable, f"{path}.values[{i}]", change) for i, one in enumerate(plain)]
         if any(value is None for value in values) or any(map(math.isnan, times)):  # a time that is wrong
@@ -311,7 +303,7 @@ class _Resolving:
     def _bag(
         self, reference: str, given: ScenarioValues, variable: Variable, change: Linear, path: str
     ) -> Schedule | None:
-        found = self._scenario.bags.get(reference)
+        found = self.scenario.bags.get(reference)
         if found is None:
             return None
         values = []
@@ -320,13 +312,13 @@ class _Resolving:
             if value is None:
                 return None
             values.append(value)
-        self._hash(self._scenario.source.resolve(given.file or ""))
+        self._hash(self.scenario.source.resolve(given.file or ""))
         return Schedule(variable.name, found.times, tuple(values), initial=False, tolerance=BAG_STAMP_S)
 
     def _table(
         self, reference: str, given: ScenarioValues, variable: Variable, change: Linear, path: str
     ) -> Schedule | None:
-        file = self._scenario.source.resolve(given.file or "")
+        file = self.scenario.source.resolve(given.file or "")
         try:
             digest = self._hash(file)
             column, time = given.column, given.time or "time"
@@ -338,7 +330,7 @@ class _Resolving:
             series = SeriesFile(str(file), digest, time, column, change.factor, change.offset)
             read_series(series, variable)
         except SeriesRefused as refused:
-            self._findings.add(f"{path}.{refused.key}", str(refused), refused.expected, refused.suggestion)
+            self.findings.add(f"{path}.{refused.key}", str(refused), refused.expected, refused.suggestion)
             return None
         return Schedule(variable.name, (), (), file=series)
 
@@ -346,9 +338,9 @@ class _Resolving:
         """The SHA-256 of a file; of a folder, that is not known."""
         if file.is_dir():
             return ""
-        if str(file) not in self._files:
-            self._files[str(file)] = content_of(file)
-        return self._files[str(file)]
+        if str(file) not in self.files:
+            self.files[str(file)] = content_of(file)
+        return self.files[str(file)]
 
     def _value(
         self, plain: PlainInput, variable: Variable, path: str, change: Linear = _UNCHANGED, where: str = ""
@@ -360,7 +352,7 @@ class _Resolving:
             found = f"{shown(plain)}{where} for the {variable.type_name} '{variable.name}'"
             if refused.out_of_range:
                 found = f"{shown(plain)}{where} for '{variable.name}', which is out of its range"
-            self._findings.add(path, found, refused.expected, refused.suggestion)
+            self.findings.add(path, found, refused.expected, refused.suggestion)
             return None
 
     def _unit(self, unit: str | None, variable: Variable, path: str) -> Linear | None:
@@ -368,72 +360,65 @@ class _Resolving:
         if unit is None or unit == variable.unit:
             return _UNCHANGED
         if not is_float(variable.type):
-            self._findings.add(f"{path}.unit", f"a unit for '{variable.name}', {_what(variable)}", "no unit here")
+            self.findings.add(f"{path}.unit", f"a unit for '{variable.name}', {_what(variable)}", "no unit here")
             return None
         base = self._base_unit(unit)
         if base is None:
-            self._findings.add(f"{path}.unit", f"the unknown unit '{unit}'", f"a unit such as {variable.unit or 'N.m'}")
+            self.findings.add(f"{path}.unit", f"the unknown unit '{unit}'", f"a unit such as {variable.unit or 'N.m'}")
         elif variable.base_unit is None:
             what = f"its model does not define '{variable.unit}'" if variable.unit else "it has no unit"
             found = f"'{unit}' for '{variable.name}', which cannot be converted: {what}"
-            self._findings.add(f"{path}.unit", found, "values in the unit of the variable, and no unit here")
+            self.findings.add(f"{path}.unit", found, "values in the unit of the variable, and no unit here")
         else:
             change = conversion(base, variable.base_unit, relative=variable.relative_quantity)
             if change is not None:
                 return change
             found = f"'{unit}' ({base}) for '{variable.name}' in {variable.unit} ({variable.base_unit})"
-            self._findings.add(f"{path}.unit", found, "a unit of the same dimension")
+            self.findings.add(f"{path}.unit", found, "a unit of the same dimension")
         return None
 
     def _base_unit(self, unit: str) -> BaseUnit | None:
         """A unit as a model of this mesh defines it, or by its usual name."""
-        for own in self._variables.values():
+        for own in self.variables.values():
             for variable in (own or {}).values():
                 if variable.unit == unit and variable.base_unit is not None:
                     return variable.base_unit
-        return self._scenario.unit_of(unit)
+        return self.scenario.unit_of(unit)
 
     # --- the run
 
     def _course(self, entry: _Entry) -> Course | None:
-        own = self._instances[entry.instance]
+        own = self.instances[entry.instance]
         try:
-            course = course_of(entry.schedule, entry.variable, self._grid, own.step_points)
+            course = course_of(entry.schedule, entry.variable, self.grid, own.step_points)
         except SeriesRefused as refused:
-            self._findings.add(f"{entry.path}.{refused.key}", str(refused), refused.expected)
+            self.findings.add(f"{entry.path}.{refused.key}", str(refused), refused.expected)
             return None
         time = course.not_finite_at if own.not_finite == "stop" else None
         if time is not None:
             found = f"a value of '{entry.instance}.{entry.variable.name}' at {time:.9g} s that is not finite"
-            self._findings.add(entry.path, found, FINITE)
+            self.findings.add(entry.path, found, FINITE)
             return None
         return course
 
     def _tell_late(self, places: Sequence[tuple[str, float]], instance: str, *, linear: bool = False) -> None:
         """Warn of the first time after the last step: it, the stop time, or the unit of a time may be wrong."""
-        points, last, time_of = self._instances[instance].step_points, self._grid.last_point, self._grid.time
-        late = [self._grid.step_at(time, points) * points >= last > 0 for _, time in places]
+        points, last, time_of = self.instances[instance].step_points, self.grid.last_point, self.grid.time
+        late = [self.grid.step_at(time, points) * points >= last > 0 for _, time in places]
         for path, time in places[late.index(True) + linear :][:1] if any(late) else ():  # the first one may end a line
             found = f"never reached: at {time:.9g} s, stop time {time_of(last):.9g} s"
-            self._late.add(path, found, f"a time up to {time_of((last - 1) // points * points):.9g} s: the last step")
+            self.late.add(path, found, f"a time up to {time_of((last - 1) // points * points):.9g} s: the last step")
 
     def _check_start(self, entry: _Entry) -> None:
         """A value for the start is a start value: there must be no other one, and it must be allowed."""
         name = f"{entry.instance}.{entry.variable.name}"
-        other = self._instances[entry.instance].start_values.get(entry.variable.name)
+        other = self.instances[entry.instance].start_values.get(entry.variable.name)
         if other is not None:
             found = f"a value of '{name}' at the start, which has the start value {shown(other)}, too"
-            self._findings.add(entry.path, found, "one of the two")
+            self.findings.add(entry.path, found, "one of the two")
         elif not entry.variable.settable_before_start:
             found = f"a value of '{name}' at the start, {entry.variable.role} that cannot be set before the start"
-            self._findings.add(entry.path, found, f"values after {self._grid.start_time:g} s")
-
-
-def _merged(values: Schedule, events: Schedule) -> Schedule:
-    """Values over time with those of events; at equal times an event counts."""
-    pairs = [*zip(values.times, values.values, strict=True), *zip(events.times, events.values, strict=True)]
-    ordered = sorted(pairs, key=lambda pair: pair[0])
-    return replace(values, times=tuple(time for time, _ in ordered), values=tuple(value for _, value in ordered))
+            self.findings.add(entry.path, found, f"values after {self.grid.start_time:g} s")
 
 
 def _changed(plain: PlainInput, change: Linear) -> PlainInput:
@@ -446,5 +431,4 @@ def _changed(plain: PlainInput, change: Linear) -> PlainInput:
 
 
 def _what(variable: Variable) -> str:
-    article = "an" if variable.causality[0] in "aeiou" else "a"
-    return f"{article} {variable.causality} of type {variable.type_name}"
+    return f"{with_article(variable.causality)} of type {variable.type_name}"

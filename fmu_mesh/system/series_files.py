@@ -36,14 +36,7 @@ _TRUTH = {"true": True, "1": True, "1.0": True, "false": False, "0": False, "0.0
 
 
 class SeriesRefused(ValueError):
-    """A table that cannot be used: what was found, and what would be right.
-
-    Args:
-        found: what is wrong.
-        expected: what would be right.
-        key: the key of the scenario that it is about.
-        suggestion: the nearest right name, if there is one.
-    """
+    """A table that cannot be used: what was found and expected, and the key of the scenario that it is about."""
 
     def __init__(self, found: str, expected: str, key: str = "file", suggestion: str | None = None) -> None:
         super().__init__(found)
@@ -107,12 +100,6 @@ def courses_of(
     schedules: Iterable[Schedule], description: ModelDescription, grid: TimeGrid, points: int
 ) -> dict[str, Course]:
     """What the steps of an instance use, by variable; tables are read here.
-
-    Args:
-        schedules: those of the instance.
-        description: its model description.
-        grid: the communication points.
-        points: points per own step.
 
     Raises:
         ConfigurationError: a table cannot be read, or has changed since the run was planned.

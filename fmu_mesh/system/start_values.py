@@ -1,7 +1,7 @@
 """From the start values of a configuration to values of the types of the variables.
 
-Owns which variables can be set before the start (FMI 2.0, 2.2.7), and which start values an FMU gets although FMI
-forbids them. The conversion of a single value is `fmu_mesh.variables.value_conversion`.
+Owns which variables can be set before the start (FMI 2.0, 2.2.7) and which between two steps, and which start values
+an FMU gets although FMI forbids them. The conversion of a single value is `fmu_mesh.variables.value_conversion`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fmu_mesh.variables.model_description import ModelDescription, Value, Variab
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
 from fmu_mesh.variables.value_types import MAX_ELEMENTS, flattened, nested, split_element
 
-__all__ = ["forbidden", "forbidden_start_values", "resolve_start_values", "sized"]
+__all__ = ["forbidden", "forbidden_start_values", "resolve_start_values", "sized", "why_not_settable"]
 
 _SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.0 (2.4.7)"}
 """The clause that says which variables may have a start value, by version of FMI."""
@@ -30,11 +30,7 @@ _SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.
 def sized(name: str, description: ModelDescription, config: InstanceSection, findings: Findings) -> ModelDescription:
     """A model description with its arrays in the sizes that the structural parameters of the configuration give.
 
-    Args:
-        name: instance name.
-        description: the model description.
-        config: the instance's section of the configuration.
-        findings: where arrays go that would be too large; these keep their sizes.
+    If an array would be too large, which is a finding, all keep their sizes.
     """
     sizes: dict[str, Value] = {}
     for variable in description.with_causality("structuralParameter"):
@@ -56,12 +52,7 @@ def resolve_start_values(
 ) -> dict[str, Value]:
     """The start values of the instance ``name``, converted to the types of its variables.
 
-    Args:
-        name: instance name.
-        config: its section of the configuration.
-        description: its model description.
-        findings: where unknown names and wrong values go; the result does not have them.
-        finite: whether NaN and infinity are refused.
+    Unknown names and wrong values are findings, and with ``finite`` NaN and infinity are; the result has the others.
     """
     settable = [variable.name for variable in description.variables if variable.settable_before_start]
     values: dict[str, Value] = {}
@@ -105,11 +96,7 @@ def forbidden_start_values(
 ) -> None:
     """Add a finding for each start value that FMI forbids. FMUs get these values anyway, because some use them.
 
-    Args:
-        config: the configuration.
-        descriptions: the model descriptions by instance name.
-        findings: where they go.
-        strict: true: for the instances where they are errors; false: for those where they are warnings.
+    They are those of the instances where they are errors (``strict``), or of those where they are warnings.
     """
     for name, instance in config.instances.items():
         if not instance.follows_fmi or name not in descriptions or config.is_strict(instance) != strict:
@@ -129,3 +116,22 @@ def forbidden(variable: Variable, description: ModelDescription) -> str:
     source = _SOURCES[description.fmi_version[0]]
     what = f"'{variable.name}', {variable.role}"
     return f"{what}: {source} does not allow setting it; whether it takes effect is up to the FMU"
+
+
+def why_not_settable(variable: Variable, source: str | None) -> str | None:
+    """Why a variable may not be set between two steps, as the predicate of a sentence about it; None if it may.
+
+    Nobody else decides it: `VariableView.settable` tells tools of a running mesh. ``source`` is the instance that the
+    variable is connected to; None if it is not connected.
+    """
+    match variable.causality:
+        case "input" if source is not None:
+            return f"is connected to '{source}'; only unconnected inputs can be set"
+        case "parameter" if source is not None:
+            return f"gets its value from '{source}'; only parameters without a connection can be prescribed"
+        case "parameter" | "calculatedParameter" if variable.variability != "tunable":
+            return f"is a {variable.variability} parameter; only tunable ones can be set while it runs"
+        case "input" | "parameter" | "calculatedParameter":
+            return None
+        case _:
+            return "is no input and no parameter, so it cannot be set"

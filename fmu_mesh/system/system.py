@@ -21,17 +21,11 @@ from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
-from fmu_mesh.system.connections import (
-    Connection,
-    Variables,
-    resolve_connections,
-    unit_warnings,
-)
+from fmu_mesh.system.connections import Connection, Variables, resolve_connections, unit_warnings
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
-from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess
+from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
@@ -48,13 +42,10 @@ class SystemInstance(msgspec.Struct, frozen=True):
     """One instance of the system.
 
     Attributes:
-        name: instance name.
         fmu: absolute path of the model; empty for a kind without files.
-        description: its model description.
         start_values: start values by variable name, converted to the variable's type; with those of the scenario.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
-        scenario: what a scenario prescribes for its variables.
         not_finite: what an output that is NaN or infinite means.
     """
 
@@ -163,7 +154,14 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
         edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
         nodes = automatic_nodes(config, edges, claims)
         instances = {name: replace(own, node=nodes.get(name, own.node)) for name, own in instances.items()}
-    instances = {name: _with_scenario(own, prescribed) for name, own in instances.items()}
+    instances = {
+        name: replace(
+            own,
+            start_values=own.start_values | prescribed.start_values.get(name, {}),
+            scenario=prescribed.schedules.get(name, ()),
+        )
+        for name, own in instances.items()
+    }
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
@@ -188,17 +186,11 @@ def _prescribed(  # noqa: PLR0913, PLR0917  what a scenario refers to
         return ResolvedScenario()
     grid = grid or TimeGrid(start_time=0.0, step_size=1.0, last_point=ENDLESS)
     inputs = {name: ScenarioInput(own.start_values, own.step_points, own.not_finite) for name, own in instances.items()}
-    if scenario.source.prefix:
-        return resolve_scenario(scenario, variables, inputs, sources, grid, findings)
-    own = scenario.source.findings()
+    own = findings if scenario.source.prefix else scenario.source.findings()  # a file of its own has its own
     prescribed = resolve_scenario(scenario, variables, inputs, sources, grid, own)
-    findings.merge(own)
+    if own is not findings:
+        findings.merge(own)
     return prescribed
-
-
-def _with_scenario(instance: SystemInstance, prescribed: ResolvedScenario) -> SystemInstance:
-    start_values = instance.start_values | prescribed.start_values.get(instance.name, {})
-    return replace(instance, start_values=start_values, scenario=prescribed.schedules.get(instance.name, ()))
 
 
 def _grid(config: Config, findings: Findings) -> TimeGrid | None:

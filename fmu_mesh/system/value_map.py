@@ -13,7 +13,7 @@ from typing import Final
 from msgspec.structs import replace
 
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.text import listed, nearest, shown
+from fmu_mesh.text import listed, nearest, shown, with_article
 from fmu_mesh.variables.model_description import Variable
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
 from fmu_mesh.variables.value_types import INTEGERS
@@ -31,17 +31,11 @@ def resolve_map(
 ) -> Pairs:
     """The entries of a `map` as numbers, in ascending order; false is 0 and true is 1.
 
-    An entry for a number that the output cannot be has no effect, and is left out.
-
-    Args:
-        entries: what the input gets, by the value of the output: `true`, a whole number, or an item.
-        source: the output.
-        target: the input.
-        path: the place of the entries in the file.
-        findings: where entries go that are wrong.
+    An entry says what the input gets, by the value of the output: `true`, a whole number, or an item. One for a number
+    that the output cannot be has no effect, and is left out.
     """
     if not all(variable.type in INTEGERS or variable.type == "Boolean" for variable in (source, target)):
-        found = f"a map from {_a(source)} to {_a(target)}"
+        found = f"a map from {with_article(_type_of(source))} to {with_article(_type_of(target))}"
         findings.add(path, found, "a map between Boolean, integer types and Enumeration only")
         return ()
     pairs: dict[int, int] = {}
@@ -73,11 +67,6 @@ def checked_items(source: Variable, target: Variable, pairs: Pairs) -> tuple[tup
     """The items of an Enumeration if a number or a map may give it none of them; empty if there is nothing to check.
 
     What one Enumeration gives another one without a map is up to the two FMUs.
-
-    Args:
-        source: the output.
-        target: the input.
-        pairs: the entries of the `map` of the connection.
     """
     if target.type != "Enumeration" or not target.items or (source.type == "Enumeration" and not pairs):
         return ()
@@ -135,8 +124,3 @@ def _word(number: int, variable: Variable) -> str:
 def _type_of(variable: Variable) -> str:
     """The type of a variable, or of the elements of an array."""
     return variable.type_name.partition("[")[0]
-
-
-def _a(variable: Variable) -> str:
-    name = _type_of(variable)
-    return f"an {name}" if name[0] in "aeiouAEIOU" else f"a {name}"

@@ -41,9 +41,7 @@ STEADY_POINTS = 1024
 def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
     """Number of points that the recorder may be behind: no node needs its rows, so it delays nodes as late as possible.
 
-    Args:
-        window: window of the mesh in points.
-        row_sizes: row sizes of the rings of all recorded instances in bytes.
+    The window is that of the mesh in points, the sizes in bytes those of the rows of all recorded instances.
     """
     return max(window, min(RECORDER_WINDOW, _ROOM_BYTES // max(sum(row_sizes), 1)))
 
@@ -57,12 +55,8 @@ def window_of(system: ResolvedSystem, outputs: Iterable[Layout], asked: int | No
     """The window of a mesh in points; `auto` is as large as the memory for the rows allows.
 
     A large window costs memory only. Values do not depend on it, and a pause takes effect soon at every window: see
-    `fmu_mesh.master.granting`. So of wide rows, a window that is configured is only as large as memory should be.
-
-    Args:
-        system: the system, with the window of the configuration.
-        outputs: the rows of all instances.
-        asked: instead of the window of the configuration.
+    `fmu_mesh.master.granting`. So of wide rows, a window that is configured is only as large as memory should be. One
+    that is ``asked`` for counts instead of that of the configuration.
     """
     configured = asked if asked is not None else system.config.simulation.window
     widest = max(1, *(layout.row_size for layout in outputs))
@@ -78,11 +72,8 @@ def rows_for(rows: int) -> int:
 
 
 def rows_of_ring(layout: Layout, needed: int = 0, most: int = RECORDER_WINDOW) -> int:
-    """Number of rows of a ring.
+    """Number of rows of a ring whose readers may be ``needed`` rows behind.
 
-    Args:
-        layout: of its rows.
-        needed: how many rows the readers may be behind.
-        most: with how many rows the readers look less often; as many as take little memory.
+    With ``most`` rows the readers look less often: a ring has as many of them as take little memory.
     """
     return rows_for(max(needed, min(most, _ROOM_BYTES // row_bytes(layout))))

@@ -42,7 +42,7 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
         shape: the sizes of an array's dimensions.
         minimum: the smallest value that its model description allows; None without one. So is ``maximum``.
         items: item names and values of an Enumeration.
-        settable: whether it can be set while the mesh runs (`fmu_mesh.system.settable`).
+        settable: whether it can be set while the mesh runs (`fmu_mesh.system.start_values`).
     """
 
     name: str

@@ -59,14 +59,6 @@ def test_rows_are_read_in_their_order(rule: CouplingRule, step: int) -> None:
     assert rule.row_for(step) <= rule.row_for(step + 1)
 
 
-@given(rules, steps)
-def test_a_step_is_ready_exactly_if_its_row_is_there(rule: CouplingRule, rows: int) -> None:
-    ready = rule.steps_ready(rows)
-
-    assert rule.row_for(ready) >= rows
-    assert ready == 0 or rule.row_for(ready - 1) < rows
-
-
 @given(rules, st.integers(0, 50))
 def test_an_array_of_steps_reads_what_each_of_them_reads(rule: CouplingRule, count: int) -> None:
     assert rule.row_for(np.arange(count)).tolist() == [rule.row_for(step) for step in range(count)]
