@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from cffi import FFI
+from fmpy.fmi1 import FMICallException
 
 from ..call_guard import call_named
 from .fmu_library import FmuLibrary
@@ -23,6 +24,7 @@ __all__ = [
     "RowPointers",
     "address_of",
     "cffi_function",
+    "checked_function",
     "declared",
     "memory",
     "pointer",
@@ -34,6 +36,7 @@ Pointer: TypeAlias = Any
 Function: TypeAlias = Callable[..., int]
 """A function of an FMU that returns its status."""
 
+_WARNING = 1
 _ffi = FFI()
 
 
@@ -71,6 +74,29 @@ class FmpyCalls:
 def declared(library: FmuLibrary, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
     """The function ``name`` of a library with a prototype of ours."""
     return ctypes.cast(getattr(library, name), prototype)
+
+
+def checked_function(library: FmuLibrary, symbols: str, name: str, prototype: Any) -> Any:  # noqa: ANN401 as above
+    """As `declared`, but a status above warning is an exception, as it is where FMPy calls.
+
+    Args:
+        library: has the function.
+        symbols: what its symbols begin with; in FMI 1.0 a model identifier and `_fmi`.
+        name: the rest of the symbol.
+        prototype: of ctypes.
+
+    Raises:
+        FMICallException: by the function: the FMU returned a status above warning.
+    """
+
+    def check(status: int, _function: object, _arguments: object) -> int:
+        if status > _WARNING:
+            raise FMICallException(function=symbols.rpartition("_")[2] + name, status=status)
+        return status
+
+    function = declared(library, symbols + name, prototype)
+    function.errcheck = check
+    return function
 
 
 def cffi_function(function: Function, declaration: str) -> Function:

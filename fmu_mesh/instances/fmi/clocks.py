@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from fmpy.fmi3 import fmi3Float64, fmi3IntervalQualifier, fmi3ValueReference
 
+from ...simtime import resolvable
 from ...variables.model_description import Clock
-from .model_exchange.solver import resolvable
 
 __all__ = ["NO_CLOCKS", "Clocks"]
 

@@ -23,7 +23,7 @@ from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls
 from .fmu_library import FmuLibrary, calling
-from .fmu_values import FATAL
+from .fmu_values import FATAL, ValueFunctions
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
 
@@ -43,14 +43,14 @@ class FmuFunctions(NamedTuple):
 
     Attributes:
         library: FMPy's class for them.
-        prefix: the prefix of their names, such as `fmi2`.
+        values: those that get and set values.
         free: FMPy's method that frees an instance.
         needed: the functions, without their prefix, that every run needs.
         names: FMI functions whose name does not follow from the name of FMPy's method, by that name.
     """
 
     library: type[Any]
-    prefix: str
+    values: ValueFunctions
     free: str
     needed: tuple[str, ...]
     names: Mapping[str, str] = {}
@@ -128,7 +128,7 @@ class LoadedFmu:
                 unzipDirectory=str(self._folder),
                 instanceName=self._fmu.name,
             )
-        self.calls = FmpyCalls(loaded, functions.prefix, functions.names)
+        self.calls = FmpyCalls(loaded, functions.values.prefix, functions.names)
 
     @property
     def changes_process(self) -> bool:
@@ -137,7 +137,7 @@ class LoadedFmu:
             self._changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
         return self._changes_process
 
-    def instantiate(self, make: Callable[[], None]) -> None:
+    def instantiate(self, make: Callable[[], object]) -> None:
         """Give the FMU to its next user; ``make`` makes an instance, if none is there that was reset.
 
         Raises:

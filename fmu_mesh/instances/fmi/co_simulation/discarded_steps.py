@@ -48,25 +48,32 @@ class StepStatus:
     Args:
         dll: its library.
         component: the instance.
-        prefix: the prefix of its functions, such as `fmi2`.
+        symbols: what the symbols of its functions begin with.
+        failed: makes the error of the instance.
     """
 
-    def __init__(self, dll: Any, component: int, prefix: str) -> None:  # noqa: ANN401 of ctypes
+    def __init__(self, dll: Any, component: int, symbols: str, failed: Callable[..., Exception]) -> None:  # noqa: ANN401 of ctypes
         self._component = component
-        self._get_status = declared(dll, f"{prefix}GetStatus", _ASK)
-        self._get_real_status = declared(dll, f"{prefix}GetRealStatus", _ASK)
+        self._prefix = symbols.rpartition("_")[2]
+        self._failed = failed
+        self._get_status = declared(dll, f"{symbols}GetStatus", _ASK)
+        self._get_real_status = declared(dll, f"{symbols}GetRealStatus", _ASK)
 
-    def wait(self) -> int | None:
-        """Wait until a pending step is done, and return its status; None if the FMU does not tell.
+    def wait(self) -> int:
+        """Wait until a pending step is done, and return its status.
 
         The FMU gets no function to call when it is done, so we have to ask (FMI 2.0, 2.1.5). `CallWatch` watches the
         deadline of the step.
+
+        Raises:
+            StepFailed: the FMU does not tell.
         """
         pause, longest = _PAUSES_S
         while True:
             answer = ctypes.c_int(PENDING)
             if self._get_status(self._component, _DO_STEP_STATUS, ctypes.addressof(answer)) > WARNING:
-                return None
+                what = f"{self._prefix}DoStep returned pending, and {self._prefix}GetStatus does not tell when the step"
+                raise self._failed(f"{what} is done")
             if answer.value != PENDING:
                 return answer.value
             time.sleep(pause)  # noqa: TID251 there is nothing to wait on

@@ -9,15 +9,14 @@ from collections.abc import Mapping
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
-from ....errors import TerminationRequested
 from ....rings.native import StepKind
+from ....simtime import resolvable
 from ....variables.value_types import Value
 from ..calls import cffi_function
-from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, Fmi2Values
+from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, FMI2_VALUES, Fmi2
+from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from ..model_exchange.solver import resolvable
-from ..state import Bookkeeping
 from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
 from .native_instance import NativeInstance
 
@@ -26,13 +25,12 @@ __all__ = ["Fmi2Instance"]
 _DO_STEP = "int (*)(void *, double, double, int)"
 
 
-class Fmi2Instance(NativeInstance, Fmi2Values):
+class Fmi2Instance(NativeInstance, Fmi2):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _kind = StepKind.FMI2
-    _functions = FmuFunctions(FMU2Slave, "fmi2", "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
+    _functions = FmuFunctions(FMU2Slave, FMI2_VALUES, "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
     _retrying: RetriedSteps | None = None
-    _derivatives: Mapping[str, float] = {}
     _terminated = False
     """Whether the FMU has asked to end the simulation with the step that is complete now."""
 
@@ -50,46 +48,33 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         if not self._terminated:
             super().set_values(values)
 
-    def set_input_derivatives(
-        self,
-        derivatives: Mapping[str, float],
-        *,
-        continuous: bool = False,  # noqa: ARG002 for model exchange
-    ) -> None:
-        """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
-        self._derivatives = derivatives  # the FMU gets them after the values of these inputs
-
-    def _instantiated(self) -> None:
-        dll = self._fmu.dll
+    def _instantiate(self, **arguments: object) -> None:
+        super()._instantiate(**arguments)
+        dll, options = self._fmu.dll, self._options
         self._do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
-        self._step_status = StepStatus(dll, self._component, "fmi2")
-        if self._options.retry_discarded_steps:
-            self._retrying = RetriedSteps(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)
-
-    def _needs_python(self) -> bool:
-        return bool(self._options.retry_discarded_steps or self._options.linear_inputs)
+        self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
+        self._by_calls = bool(options.retry_discarded_steps or options.linear_inputs)
+        if options.retry_discarded_steps:
+            wait = self._step_status.wait
+            self._retrying = RetriedSteps(self._fmu, self._do_step, wait, self._asks_to_end, self._failed)
 
     def _step_by_calls(self, step: int) -> None:
         self._check_not_terminated()
         super()._step_by_calls(step)
 
-    def _take_step(self, step: int) -> None:
-        if self._derivatives:
-            self._set_derivatives(self._derivatives)
-        take = self._retrying or self._do_step
-        status = take(self._self, self._time_of(step), self._step_size, 1)
+    def _complete(self, step: int, status: int | None) -> None:
+        time = self._time_of(step)
+        if status is None:
+            if self._derivatives:
+                self._set_derivatives(self._derivatives)
+            status = (self._retrying or self._do_step)(self._self, time, self._step_size, 1)
         if status > WARNING:
-            self._complete(step, status)
-
-    def _complete(self, step: int, status: int) -> None:
-        self._finish(status, self._time_of(step) + self._step_size)
+            self._finish(status, time + self._step_size)
 
     def _set_derivatives(self, derivatives: Mapping[str, float]) -> None:
         references = [self._variables[name].value_reference for name in derivatives]
-        try:
-            self._fmu.setRealInputDerivatives(references, [1] * len(references), list(derivatives.values()))
-        except FMICallException as error:
-            raise self._failed(error.function, status=error.status) from error
+        orders, values = [1] * len(references), list(derivatives.values())
+        self._checked(lambda: self._fmu.setRealInputDerivatives(references, orders, values))
 
     def _finish(self, status: int, end: float) -> None:
         """Complete a step to ``end`` (s) whose ``status`` is above warning (FMI 2.0, 4.2.1).
@@ -99,7 +84,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
             TerminationRequested: the FMU asks to end the simulation before the end of the step.
         """
         if status == PENDING:
-            status = self._waited()
+            status = self._step_status.wait()
         if status <= WARNING:
             return
         if status != DISCARD:
@@ -127,15 +112,6 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
     def _check_not_terminated(self) -> None:
         if self._terminated:
             raise self._end_requested()
-
-    def _end_requested(self) -> TerminationRequested:
-        return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
-
-    def _waited(self) -> int:
-        status = self._step_status.wait()
-        if status is None:
-            raise self._failed("fmi2DoStep returned pending, and fmi2GetStatus does not tell when the step is done")
-        return status
 
     def _asks_to_end(self) -> bool:
         """Whether a discarded step means that the FMU asks to end; most FMUs do not know this question."""

@@ -8,23 +8,20 @@ are `fmu_mesh.instances.fmi.co_simulation.fmi3_steps`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, TypeVar
 
-from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 
-from ....errors import FmuError, TerminationRequested
 from ....rings.native import RowBase, StepKind
 from ....rings.ring import Ring
-from ....simtime import TimeGrid
+from ....simtime import TimeGrid, resolvable
 from ....variables.value_types import Value
 from ..calls import Pointer, cffi_function
-from ..fmi_versions import FMI3_NEEDED, Fmi3Values
+from ..fmi_versions import FMI3_NEEDED, FMI3_VALUES, Fmi3
+from ..fmu_instance import Bookkeeping
 from ..fmu_values import PartCall, Verb
 from ..loaded_fmu import FmuFunctions
-from ..model_exchange.solver import SolverFailed, resolvable
-from ..state import Bookkeeping
+from ..model_exchange.solver import SolverFailed
 from .fmi3_steps import Fmi3Steps
 from .native_instance import NativeInstance
 
@@ -36,11 +33,11 @@ _NEEDED = "fmi3InstantiateCoSimulation", *FMI3_NEEDED, "fmi3DoStep"
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 
 
-class Fmi3Instance(NativeInstance, Fmi3Values):
+class Fmi3Instance(NativeInstance, Fmi3):
     """One instance of an FMI 3.0 co-simulation FMU."""
 
     _kind = StepKind.FMI3
-    _functions = FmuFunctions(FMU3Slave, "fmi3", "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
+    _functions = FmuFunctions(FMU3Slave, FMI3_VALUES, "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
     _steps: Fmi3Steps
     _discrete_row: tuple[bytes | list[Any], ...] = ()
 
@@ -59,7 +56,12 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
         if self._discrete:
             self._native = None  # a node does not know whether these inputs have changed
             take, member = self._in_step
-            self._in_step = partial(self._take_after_events, take), member
+
+            def take_after_events(member: Pointer, step: int) -> int:
+                self._set_discrete(step & self._input_mask)
+                return take(member, step)
+
+            self._in_step = take_after_events, member
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -67,17 +69,17 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
         end = time + step_size
         self._advance(end, lambda: self._steps.step(time, step_size, end))
 
-    def _instantiated(self) -> None:
+    def _instantiate(self, **arguments: object) -> None:
+        has_event_mode = self._description.has_event_mode
+        super()._instantiate(eventModeUsed=has_event_mode, earlyReturnAllowed=True, **arguments)
         self._do_step = cffi_function(self._fmu.dll.fmi3DoStep, _DO_STEP)
-
-    def _uses(self) -> dict[str, bool]:
-        return {"eventModeUsed": self._description.has_event_mode, "earlyReturnAllowed": True}
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)
         self._said.note(time=start_time)
         self._steps = Fmi3Steps(self._fmu, self._do_step, self._description, self._said)
         self._checked(lambda: self._steps.start(start_time))
+        self._by_calls = bool(self._steps.clocks)
 
     def _exit_initialization(self) -> None:
         """An FMU with event mode is in it now."""
@@ -96,28 +98,19 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
         continuous = all(variable.variability == "continuous" for variable in part.variables)
         return self._description.has_event_mode and not continuous
 
-    def _needs_python(self) -> bool:
-        return bool(self._steps.clocks)
-
-    def _take_after_events(self, take: Callable[[Pointer, int], int], member: Pointer, step: int) -> int:
-        """As ``take``, after the inputs have been set that change in event mode only."""
-        self._set_discrete(step & self._input_mask)
-        return take(member, step)
-
-    def _take_step(self, step: int) -> None:
-        start, end = self._time_of(step), self._time_of(step + 1)
-        self._advance(end, lambda: self._steps.step(start, self._step_size, end))
-
-    def _complete(self, step: int, status: int) -> None:
-        start, end = self._time_of(step), self._time_of(step + 1)
-        self._advance(end, lambda: self._steps.finish(status, start, self._step_size, end))
+    def _complete(self, step: int, status: int | None) -> None:
+        steps, start, size, end = self._steps, self._time_of(step), self._step_size, self._time_of(step + 1)
+        if status is None:
+            self._advance(end, lambda: steps.step(start, size, end))
+        else:
+            self._advance(end, lambda: steps.finish(status, start, size, end))
 
     def _advance(self, end: float, step: Callable[[], float]) -> None:
         """Take a step to ``end`` (s); ``step`` returns the time that it has reached."""
         time = self._checked(step)
         self._said.note(time=time)
         if resolvable(time, end):
-            raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+            raise self._end_requested()
 
     def _set_discrete(self, slot: int) -> None:
         """In event mode: set the inputs that change in event mode only, if they did change."""
@@ -131,14 +124,9 @@ class Fmi3Instance(NativeInstance, Fmi3Values):
 
     def _checked(self, call: Callable[[], T]) -> T:
         try:
-            return call()
-        except (FMICallException, SolverFailed) as error:
-            raise self._failure(error) from error
-
-    def _failure(self, error: FMICallException | SolverFailed) -> FmuError:
-        if isinstance(error, SolverFailed):
-            return self._failed(str(error))
-        return self._failed(error.function, status=error.status)
+            return super()._checked(call)
+        except SolverFailed as error:
+            raise self._failed(str(error)) from error
 
     def _bookkeeping(self) -> Bookkeeping:
         next_event, event_time = self._steps.place

@@ -20,12 +20,12 @@ from typing import Any, Final
 from fmpy.fmi1 import FMICallException
 
 from ....rings.native import Said
-from ....simtime import step_within
+from ....simtime import resolvable, step_within
 from ....variables.model_description import ModelDescription
 from ..calls import Function, pointer
 from ..clocks import Clocks
 from ..fmu_values import DISCARD, WARNING
-from ..model_exchange.solver import SolverFailed, resolvable
+from ..model_exchange.solver import SolverFailed
 from .discarded_steps import SMALLEST
 
 __all__ = ["Fmi3Steps"]
