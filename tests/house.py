@@ -334,6 +334,8 @@ ALLOWED: dict[str, dict[str, str]] = {
         "api/offered_variables.py": "the command line reads models only through the library",
     },
     "large_modules": {
+        "adapter/adapter.py": "one public class, and half of it are docstrings",
+        "instances/fmi/fmu_instance.py": "one class",
         "api/mesh_builder.py": "one public class, and half of it are docstrings with examples",
         "api/result.py": "one public class, and half of it are docstrings with examples",
         "api/run_handle.py": "one public class, and half of it are docstrings with examples",
