@@ -10,9 +10,9 @@ import math
 
 import msgspec
 
-__all__ = ["BaseUnit", "Linear", "conversion"]
+__all__ = ["BASE_UNITS", "BaseUnit", "Linear", "conversion"]
 
-_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 class BaseUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,7 +41,7 @@ class BaseUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __str__(self) -> str:
         """The dimension, such as `kg.m2.s-2`; `1` for none."""
-        powers = zip(_BASE_UNITS, self.dimension, strict=True)
+        powers = zip(BASE_UNITS, self.dimension, strict=True)
         return ".".join(f"{unit}{power if power != 1 else ''}" for unit, power in powers if power) or "1"
 
 
