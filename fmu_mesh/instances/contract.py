@@ -30,6 +30,7 @@ __all__ = [
     "Instance",
     "KeepsFiles",
     "KeepsState",
+    "KeepsStateAsBytes",
     "Kind",
     "LogMessage",
     "Opening",
@@ -359,3 +360,19 @@ class KeepsState(Protocol):
     def deserialize_state(self, data: bytes) -> object:
         """The state from the bytes that an instance of the same model has made."""
         ...
+
+
+class KeepsStateAsBytes:
+    """The rest of `KeepsState` where `get_state` returns bytes, which any instance of the model can restore."""
+
+    def free_state(self, state: object) -> None:
+        """Nothing to free."""
+
+    def serialize_state(self, state: object) -> bytes:
+        """The state, which is bytes already."""
+        assert isinstance(state, bytes)
+        return state
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The state, which is these bytes; `set_state` checks them."""
+        return data

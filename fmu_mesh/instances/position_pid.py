@@ -22,7 +22,7 @@ from ..errors import StepFailed
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import Causality, ModelDescription, Value, Variable
-from .contract import Instance, Kind, Opening
+from .contract import Instance, KeepsStateAsBytes, Kind, Opening
 
 __all__ = ["KIND_OF_CONTROLLERS", "PidConfig", "PidInstance", "describe_pid"]
 
@@ -126,7 +126,7 @@ def _variable(name: str, causality: Causality, text: str, start: float | None = 
     )
 
 
-class PidInstance:
+class PidInstance(KeepsStateAsBytes):
     """The controller; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(self, name: str) -> None:
@@ -193,18 +193,6 @@ class PidInstance:
         assert isinstance(state, bytes)
         decoded = msgspec.json.decode(state, type=_State)
         self._values, self._integral = dict(decoded.values), decoded.integral
-
-    def free_state(self, state: object) -> None:
-        """Nothing to free: a state is bytes."""
-
-    def serialize_state(self, state: object) -> bytes:
-        """The state, which is bytes already."""
-        assert isinstance(state, bytes)
-        return state
-
-    def deserialize_state(self, data: bytes) -> object:
-        """The state, which is these bytes."""
-        return data
 
     def close(self) -> None:
         """Nothing to free."""

@@ -76,15 +76,7 @@ class FmuState(NamedTuple):
 class FmuInstance(ABC):
     """One instance of an FMU; see `Instance` and `KeepsState` in `fmu_mesh.instances.contract`.
 
-    Args:
-        path: the .fmu file.
-        name: instance name.
-        description: what `read_description` returned for it.
-        folder: an existing private folder; the FMU is extracted below it.
-        log: called with every log message, on the thread that calls the FMU.
-        terms: limits and checks for the archive.
-        options: how the instance is stepped.
-        kept: has what earlier instances of this name have left, and gets what this one leaves.
+    Its arguments are those of `Opening`, and the ``terms`` of its archive and the ``options`` of its steps.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.

@@ -57,16 +57,7 @@ class FmuFunctions(NamedTuple):
 
 
 class FmuToLoad(NamedTuple):
-    """What is loaded.
-
-    Attributes:
-        path: the .fmu file.
-        name: instance name.
-        description: what `read_description` returned for it.
-        terms: limits and checks for the archive.
-        functions: of this version of FMI.
-        deep_binding: whether its library finds its own functions and variables before those of the process.
-    """
+    """What is loaded; see `FmuInstance`, and `StepOptions` for ``deep_binding``."""
 
     path: Path
     name: str

@@ -54,11 +54,6 @@ def check_gazebo_classic() -> None:
 class GazeboClassicInstance:
     """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
 
-    Args:
-        path: the SDF file.
-        name: instance name.
-        config: its section of the configuration.
-
     Raises:
         LoadFailed: the world cannot be read, or Gazebo does not start or does not load it.
     """

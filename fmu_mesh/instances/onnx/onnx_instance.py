@@ -26,12 +26,13 @@ from ...system.layout import Layout
 from ...variables.model_description import ModelDescription, Value
 from ...variables.value_conversion import to_value
 from ...variables.value_types import is_float
+from ..contract import KeepsStateAsBytes
 from .onnx_model import Array, OnnxModel, reason_of
 
 __all__ = ["OnnxInstance"]
 
 
-class OnnxInstance:
+class OnnxInstance(KeepsStateAsBytes):
     """One model; see `fmu_mesh.instances.contract.Instance` for the call sequence.
 
     Args:
@@ -140,18 +141,6 @@ class OnnxInstance:
             raise StepFailed(f"{len(state)} bytes are no state of this model", instance=self.name)
         for part, values in zip(own, parts, strict=True):
             part[...] = values
-
-    def free_state(self, state: object) -> None:
-        """Nothing to free: a state is bytes."""
-
-    def serialize_state(self, state: object) -> bytes:
-        """The state as bytes, which it is."""
-        assert isinstance(state, bytes)
-        return state
-
-    def deserialize_state(self, data: bytes) -> object:
-        """The state of these bytes, which they are; `set_state` checks them."""
-        return data
 
     def close(self) -> None:
         """Nothing to do: the session of onnxruntime has neither files nor threads, and is freed with this object."""

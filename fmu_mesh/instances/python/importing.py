@@ -54,7 +54,6 @@ class ImportedComponent:
         self._path = path
         self._target = target
         self.modules = OwnModules(path.parent)
-        self._module = target.module
         self._file = path if target.file else None
         self.cls: type[Component] = Component
         self.description: ModelDescription | None = None
@@ -72,7 +71,12 @@ class ImportedComponent:
             wanted = f"`{place}:Controller`, if the class is called Controller"
             raise CallRefused(f"'{place}' names no class at the top of the module, expected {wanted}")
         with _marked(place):
-            module, data = self._from_file() if self._file is not None else self._from_module()
+            if self._file is not None:
+                module, data = self._from_file(self._file)
+            else:
+                module = importlib.import_module(target.module)
+                self._file = Path(module.__file__) if module.__file__ is not None else None
+                data = self._file.read_bytes() if self._file is not None else b""
         found = getattr(module, target.name, None)
         if found is None:
             classes = [name for name, value in vars(module).items() if _is_component(value) and value is not Component]
@@ -109,21 +113,15 @@ class ImportedComponent:
         """Forget the module, and those of its folder."""
         self.modules.close()
 
-    def _from_file(self) -> tuple[ModuleType, bytes]:
-        assert self._file is not None
-        name = self.modules.name_of(self._file.stem.replace(".", "_"))
-        loader = _SourceFile(name, str(self._file))
-        spec = importlib.util.spec_from_file_location(name, self._file, loader=loader)
+    def _from_file(self, file: Path) -> tuple[ModuleType, bytes]:
+        name = self.modules.name_of(file.stem.replace(".", "_"))
+        loader = _SourceFile(name, str(file))
+        spec = importlib.util.spec_from_file_location(name, file, loader=loader)
         assert spec is not None
         module = self.modules.adopted(importlib.util.module_from_spec(spec))
         sys.modules[name] = module
         loader.exec_module(module)
         return module, loader.data
-
-    def _from_module(self) -> tuple[ModuleType, bytes]:
-        module = importlib.import_module(self._module)
-        self._file = Path(module.__file__) if module.__file__ is not None else None
-        return module, self._file.read_bytes() if self._file is not None else b""
 
 
 class _SourceFile(FileLoader):

@@ -122,7 +122,8 @@ class OwnModules(MetaPathFinder):
         """What a module of the folder is written in; empty if there is none, or one is installed: that comes first."""
         if top not in self._kinds:
             spec = PathFinder.find_spec(top, [self._folder])
-            kind: Literal["Python", "C"] = "Python" if spec is None or _is_python(spec) else "C"
+            is_python = spec is None or spec.loader is None or isinstance(spec.loader, SourceFileLoader)
+            kind: Literal["Python", "C"] = "Python" if is_python else "C"
             self._kinds[top] = kind if spec is not None and not _is_installed(top) else ""
         return self._kinds[top]
 
@@ -172,10 +173,6 @@ class _Imported(Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         vars(module)["__spec__"] = self._spec  # the import system has replaced it
-
-
-def _is_python(spec: ModuleSpec) -> bool:
-    return spec.loader is None or isinstance(spec.loader, SourceFileLoader)
 
 
 def _is_installed(top: str) -> bool:

@@ -162,7 +162,9 @@ class PythonInstance:
             try:
                 write(row & mask, values[name])
             except KeyError:
-                raise self._never_assigned(name) from None
+                text = "the component has not assigned this output"
+                hint = f"Assign `self.{name}` in `step`, or give the output a `start`."
+                raise StepFailed(text, instance=self.name, variable=name, hint=hint) from None
             except ValueRefused as refused:
                 raise StepFailed(str(refused), instance=self.name, variable=name) from refused
 
@@ -266,8 +268,3 @@ class PythonInstance:
             return TerminationRequested(error.message, instance=self.name)
         hint = error.hint if isinstance(error, FmuMeshError) else None
         return _ERRORS[self._phase](self._imported.told(error), instance=self.name, hint=hint)
-
-    def _never_assigned(self, name: str) -> StepFailed:
-        text = "the component has not assigned this output"
-        hint = f"Assign `self.{name}` in `step`, or give the output a `start`."
-        return StepFailed(text, instance=self.name, variable=name, hint=hint)
