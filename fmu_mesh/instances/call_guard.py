@@ -45,7 +45,29 @@ __all__ = [
 
 Result = TypeVar("Result")
 
-_LOOK_S: Final = 0.25
+# Who meets here: the thread that calls FMUs (of a node the main thread, in a program the thread that owns the system),
+# and for each `CallWatch` one thread that waits for the deadlines of its calls. ADR 12 says what is guarded, ADR 56 how
+# the line of a component is found, ADR 57 which steps are taken without Python.
+#
+# They share two attributes. Only the calling thread writes `_call` and `_position`, each with one assignment, and it
+# never waits for the watching thread to look. That one reads both once in a round and compares them with those of the
+# round before. It holds the lock of the condition from there until it waits, so a call that begins meanwhile wakes it.
+#
+# A call that hangs cannot be cancelled: no exception of Python reaches C, and a signal would interrupt the FMU
+# anywhere, perhaps while it holds a lock of malloc. So an overrun is told on the watching thread, and whoever owns the
+# process ends the process. Nothing may wait for the calling thread on that way, and nothing may call the FMU, `exit` or
+# a destructor.
+#
+# Steps have no `calling` of their own: to wake a thread takes longer than a short step. Their owner gives a function
+# that says who steps and from which point; if it still says the same after the limit, a step has overrun. The clock is
+# `AwakeClock`: a process that stood (a debugger, swap, a suspended host) must not look like an FMU that hangs.
+#
+# Where a thread is, is asked after a missed deadline only, so that it costs nothing before. `_functions` has the FMI
+# function of each call from Python; steps of the library have a stage in their tables instead. The frames of a
+# component come from `sys._current_frames`: `faulthandler` tells the same only to a file.
+
+_POLL_S: Final = 0.25
+"""How often a step is compared with what it was: an overrun is told this much late at most."""
 _DO_STEP: Final = "doStep"
 
 _functions: dict[int, str] = {}
@@ -151,9 +173,9 @@ class CallWatch:
                     return
                 call, position = self._call, self._position
                 if call is None:
-                    self._changed.wait(_LOOK_S if position is not None else None)
+                    self._changed.wait(_POLL_S if position is not None else None)
                 elif call == watched:
-                    self._changed.wait(min(_LOOK_S, max(0.0, since + call.limit_s - clock())))
+                    self._changed.wait(min(_POLL_S, max(0.0, since + call.limit_s - clock())))
                 if call is not self._call or position is not self._position:
                     continue
             place: object = call

@@ -27,6 +27,20 @@ __all__ = [
     "restore_floating_point",
 ]
 
+# Who meets here: every thread of the process. Working directory, locale, umask, environment and signal handlers are
+# those of all threads; the locale of `uselocale`, the blocked signals and the floating-point mode are those of one. So
+# the thread that called the FMU looks, and two threads that look at once may each undo what the FMU of the other one
+# did. Our own threads change only the working directory, while a library is loaded: `FOLDER` is the lock for that. ADR
+# 12.
+#
+# C is asked, not Python: `os.environ` is a copy, and `signal` and `locale` know what Python itself has set. An FMU
+# changes what C has.
+#
+# A look takes longer than most steps. So steps are looked after one by one only where a step may change something, or
+# has done so, and otherwise every `LOOK_STEPS` steps or at the end of a burst. The floating-point mode changes results,
+# and three additions tell it: it is looked at after every step. To look at the rest after each burst, in a model that
+# is known to change it, would make the result depend on timing.
+
 _SIGNALS: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGPIPE", "SIGCHLD") if hasattr(signal, name)
 )

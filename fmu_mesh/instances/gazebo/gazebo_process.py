@@ -19,6 +19,12 @@ from collections.abc import Sequence
 
 __all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
 
+# Which processes meet here: the node and one Gazebo, over pipes (ADR 21). Gazebo ends when its standard input ends, so
+# it needs no signal when the node is killed. What it writes to standard error goes to a file: nobody reads it during a
+# step, and a full pipe would stop Gazebo. Each answer has a deadline of its own, by `select`. A command has none: if
+# Gazebo hangs while one is written that the pipe cannot take as a whole, the deadline of the step ends the node
+# (`call_guard`).
+
 PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
 """The environment variable with the command of the lock-step program, as a shell would split it."""
 

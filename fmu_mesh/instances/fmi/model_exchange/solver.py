@@ -25,6 +25,29 @@ from .model_calls import ModelCalls
 
 __all__ = ["Solver", "SolverFailed", "make_solver"]
 
+# Who meets here: one thread, in three languages. Python calls CVode, CVode calls back (`_RHS`, `_ROOT`), and this calls
+# the FMU. No exception may cross C: it is kept in `_failure`, CVode is told to give up, and it is raised once CVode has
+# returned. ctypes gives up the lock of the interpreter meanwhile, so other threads run; none of them may use this
+# solver. ADR 11 says why each instance has a solver of its own, and why no step of it crosses a communication point.
+#
+# What may go wrong, and what is done about it:
+#
+# * A failed evaluation is no failed step. `discard` asks for a smaller step (FMI 2.0, 2.1.3); everything else ends the
+#   run, with what the FMU said and not with what CVode makes of it.
+# * A linear input that turns does not fit the history of CVode, which gives up after seven failed error tests in one
+#   step. It begins anew there, once, from the states at the start of the step.
+# * An indicator that is exactly 0 is not above 0 (FMI 2.0, 3.1). CVode would stop at exactly 0, where the model sees no
+#   event yet, and would not see it rise from there. So CVode never sees a 0.
+# * A model with indicators and without states gets a constant state, so that there is something to step.
+# * CVode does not say that a derivative is NaN, only that its tests fail or that time stands still. `_give_up` asks
+#   again.
+#
+# The history of CVode is no part of a state of FMI. Whoever takes a state therefore restarts the solver, so that the
+# run goes on as it would from that state.
+#
+# Not taken: the declarations of `fmpy.sundials`. They lack the stop time and the handlers of errors, and make an object
+# of each vector that a callback gets.
+
 _RHS = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 _ROOT = _RHS
 _HANDLER = ctypes.CFUNCTYPE(
