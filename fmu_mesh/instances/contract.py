@@ -152,13 +152,7 @@ class Kind(ABC, Generic[Section]):
             OSError, LoadFailed: a file cannot be read.
         """
 
-    def claims(
-        self,
-        path: Path,  # noqa: ARG002  for those who claim something
-        section: Section,  # noqa: ARG002  as above
-        description: ModelDescription,  # noqa: ARG002  as above
-        limits: LimitsConfig,  # noqa: ARG002  as above
-    ) -> Claims:
+    def claims(self, path: Path, section: Section, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """What such an instance uses of which a process has only one; nothing by default.
 
         Called only where instances are to share a process: what is slow is done here.
@@ -188,7 +182,7 @@ class Kind(ABC, Generic[Section]):
             LoadFailed: it has not; says what is missing.
         """
 
-    def check_showing(self, showing: Showing) -> None:  # noqa: ARG002  for those who can show something
+    def check_showing(self, showing: Showing) -> None:
         """Check that this host can show what ``showing`` asks for; called only with `can_be_shown`.
 
         Raises:
@@ -203,7 +197,7 @@ class Kind(ABC, Generic[Section]):
         """
         return
 
-    def prepare(self, opening: Opening[Section]) -> None:  # noqa: ARG002  for those who can prepare something
+    def prepare(self, opening: Opening[Section]) -> None:
         """Do once what every `open` of a model needs, such as unpacking it; nothing is prepared by default.
 
         Called in the process of `preload`. It must load no library of the model.

@@ -66,16 +66,12 @@ class ControllerKind(Kind[PidConfig]):
     expected = "no file"
 
     def describe(
-        self,
-        path: Path,  # noqa: ARG002  there is no file
-        section: PidConfig,  # noqa: ARG002  there is one controller
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-        tell: Callable[[str], None],  # noqa: ARG002  takes no time
+        self, path: Path, section: PidConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """The model description of the controller."""
         return describe_pid()
 
-    def content(self, path: Path) -> str:  # noqa: ARG002  there is no file
+    def content(self, path: Path) -> str:
         """Empty: there is no file."""
         return ""
 
@@ -141,10 +137,7 @@ class PidInstance(KeepsStateAsBytes):
         return self._description
 
     def enter_initialization(
-        self,
-        start_time: float,  # noqa: ARG002  as in the Protocol
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set ``start_values``."""
         self.set_values(start_values)

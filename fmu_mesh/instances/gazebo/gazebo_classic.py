@@ -98,10 +98,7 @@ class GazeboClassicInstance:
         return self._world.description
 
     def enter_initialization(
-        self,
-        start_time: float,  # noqa: ARG002  as in the Protocol
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set the start values of inputs; the world starts as its file says."""
         self.set_values(start_values)

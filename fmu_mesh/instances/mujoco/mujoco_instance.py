@@ -121,10 +121,7 @@ class MujocoInstance(KeepsStateAsBytes):
         return self._world.description
 
     def enter_initialization(
-        self,
-        start_time: float,
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Start from the keyframe or the model's own position, then set ``start_values`` (time in s)."""
         if self._world.keyframe is not None:

@@ -31,11 +31,7 @@ class MujocoKind(Kind[MujocoConfig]):
     can_be_shown = True
 
     def describe(
-        self,
-        path: Path,
-        section: MujocoConfig,
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-        tell: Callable[[str], None],  # noqa: ARG002  loading a model is fast
+        self, path: Path, section: MujocoConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """Load the model in a child process; its joints, bodies, sensors and actuators are the variables."""
         return ask_description_of(f"MuJoCo, which loads '{path}',", __name__, (str(path), section))

@@ -182,7 +182,7 @@ class Window:
         self._data: Any = None
         self._last = 0.0
 
-    def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401, ARG002  mujoco has no types; the Protocol's
+    def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401  mujoco has no types
         """Bring the window up to date, if its last picture is old enough."""
         now = time.monotonic()
         if now - self._last < 1.0 / WINDOW_RATE:

@@ -62,10 +62,7 @@ class OnnxInstance(KeepsStateAsBytes):
         return self._model.description
 
     def enter_initialization(
-        self,
-        start_time: float,  # noqa: ARG002  a model knows no time
-        stop_time: float | None,  # noqa: ARG002  as above
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set ``start_values``."""
         self.set_values({name: to_value(value, self._variables[name]) for name, value in start_values.items()})
@@ -95,14 +92,7 @@ class OnnxInstance(KeepsStateAsBytes):
             self._follow()
         return [self._values.value(0, name) for name in names]
 
-    def bind(
-        self,
-        inputs: Ring,
-        outputs: Sequence[Ring],
-        grid: TimeGrid,  # noqa: ARG002  a model knows no time
-        points: int,  # noqa: ARG002  as above
-        step: int = 0,
-    ) -> None:
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Choose the rings of `do_step`, and write the current outputs to row ``step``."""
         self._takes = [(self._own(name), *_columns(inputs, name), inputs.mask) for name in inputs.layout.names]
         self._gives = [

@@ -89,10 +89,7 @@ class PythonInstance:
         return self._description
 
     def enter_initialization(
-        self,
-        start_time: float,
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set ``start_values``."""
         self._phase = "initialization"
@@ -187,7 +184,7 @@ class PythonInstance:
     def free_state(self, state: object) -> None:
         """Nothing to free: a state is Python objects."""
 
-    def serialize_state(self, state: object) -> bytes:  # noqa: ARG002  as in the Protocol
+    def serialize_state(self, state: object) -> bytes:
         """A state has Python objects of any kind, which only this process can use.
 
         Raises:
@@ -195,7 +192,7 @@ class PythonInstance:
         """
         raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
 
-    def deserialize_state(self, data: bytes) -> object:  # noqa: ARG002  as in the Protocol
+    def deserialize_state(self, data: bytes) -> object:
         """See `serialize_state`.
 
         Raises:

@@ -33,11 +33,7 @@ class PythonKind(Kind[PythonConfig]):
     expected = "a component in Python, such as `controller.py:Controller` or `package.module:Controller`"
 
     def describe(
-        self,
-        path: Path,
-        section: PythonConfig,
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-        tell: Callable[[str], None],  # noqa: ARG002  takes less than a second, as a rule
+        self, path: Path, section: PythonConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """Import the class in a child process, which sends back its description."""
         target = class_place_of(section.python)
@@ -52,13 +48,7 @@ class PythonKind(Kind[PythonConfig]):
         """A SHA-256 of the file; empty for a module, whose content is in the description."""
         return hashlib.sha256(path.read_bytes()).hexdigest() if path != Path() else ""
 
-    def claims(
-        self,
-        path: Path,
-        section: PythonConfig,  # noqa: ARG002  the file says everything
-        description: ModelDescription,  # noqa: ARG002  as above
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-    ) -> Claims:
+    def claims(self, path: Path, section: PythonConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """The interpreter, and the modules of its folder that cannot be imported for one instance alone."""
         claims: dict[str, str] = {BOTH_USE_PYTHON: "components"}
         for file in path.parent.iterdir() if path != Path() else ():

@@ -89,12 +89,7 @@ class NativeInstance(FmuInstance):
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
         self._in_step = take, pointer(ctypes.addressof(member))
 
-    def set_input_derivatives(
-        self,
-        derivatives: Mapping[str, float],
-        *,
-        continuous: bool = False,  # noqa: ARG002 for model exchange
-    ) -> None:
+    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """See `TakesDerivatives` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
         self._derivatives = derivatives  # the FMU gets them after the values of these inputs
 

@@ -249,7 +249,7 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1):
         super()._instantiate(**arguments)
         self._own_calls = Fmi1Calls(self._fmu, self._description, self._symbols)
 
-    def _initialize(self, start_time: float, stop_time: float | None) -> None:  # noqa: ARG002 only for co-simulation
+    def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitialize (FMI 1.0, 2.5)."""
         tolerance = self._options.solver.relative_tolerance
         self._checked(lambda: self._own_calls.initialize(start_time, tolerance))

@@ -113,7 +113,7 @@ class NothingToSolve:
     def restart(self) -> None:
         """Nothing to do."""
 
-    def step(self, time: float, stop: float) -> tuple[float, bool]:  # noqa: ARG002 the Protocol
+    def step(self, time: float, stop: float) -> tuple[float, bool]:
         """Go to ``stop``; the model is put there by its event loop."""
         return stop, False
 
