@@ -232,10 +232,7 @@ def lines_shown_of(file: str | None) -> None:
 def not_returned(thread: int, seconds: float, otherwise: str) -> str:
     """In words where a thread has been for too long.
 
-    Args:
-        thread: its identifier.
-        seconds: for how long, in s.
-        otherwise: the function of an FMU, if it is not known which one.
+    ``seconds`` in s; ``otherwise`` is the function of an FMU, if it is not known which one.
     """
     if (line := _line_of_user(thread)) is not None:
         return f"the component has not returned for {seconds:.1f} s from {line}{ENDED}"
@@ -268,14 +265,10 @@ def call_named(name: str, function: Callable[..., Result], *arguments: Any, **ke
 class Guarded(AroundNativeSteps):
     """An instance whose calls have a deadline and leave the state of the process unchanged.
 
+    ``open_`` makes the instance, which is a call with a deadline like the others.
+
     That a step leaves it is looked after only where a step may change it: it takes longer than many a step. Such an
     instance has no `native` steps.
-
-    Args:
-        name: instance name.
-        open_: makes the instance; a call with a deadline like the others.
-        watch: watches the deadlines, or does not.
-        timeouts: the deadlines.
     """
 
     def __init__(

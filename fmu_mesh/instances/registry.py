@@ -179,11 +179,8 @@ def check_engines(
 ) -> None:
     """Check that this host has what all instances need that no `host` is named for: engines, and libraries of a system.
 
-    Args:
-        sections: the sections of a configuration, by instance.
-        models: the absolute path and the description of the model of each.
-        limits: how large an FMU may be.
-        findings: where one goes for each instance that misses something.
+    A finding is added for each instance that misses something. ``models`` has the absolute path and the description of
+    the model of each.
     """
     reasons: dict[object, LoadFailed | None] = {}
     for name, section in sections.items():

@@ -79,11 +79,7 @@ def declared(library: FmuLibrary, name: str, prototype: Any) -> Any:  # noqa: AN
 def checked_function(library: FmuLibrary, symbols: str, name: str, prototype: Any) -> Any:  # noqa: ANN401 as above
     """As `declared`, but a status above warning is an exception, as it is where FMPy calls.
 
-    Args:
-        library: has the function.
-        symbols: what its symbols begin with; in FMI 1.0 a model identifier and `_fmi`.
-        name: the rest of the symbol.
-        prototype: of ctypes.
+    Its symbol is ``symbols`` and ``name``; ``symbols`` begins with the model identifier in FMI 1.0.
 
     Raises:
         FMICallException: by the function: the FMU returned a status above warning.
@@ -102,9 +98,7 @@ def checked_function(library: FmuLibrary, symbols: str, name: str, prototype: An
 def cffi_function(function: Function, declaration: str) -> Function:
     """A function of a loaded library, called through cffi.
 
-    Args:
-        function: the function as ctypes has it.
-        declaration: the C type of a pointer to it, such as ``int (*)(void *, double)``.
+    ``declaration`` is the C type of a pointer to it, such as ``int (*)(void *, double)``.
     """
     address = ctypes.cast(function, ctypes.c_void_p).value  # type: ignore[arg-type]  # it is one of ctypes' own
     called: Function = _ffi.cast(declaration, address or 0)
@@ -119,9 +113,7 @@ def pointer(address: int | None) -> Pointer:
 class RowPointers(dict[int, Pointer]):
     """Pointers to the rows of an array by row number; a pointer is made when it is first used.
 
-    Args:
-        address: address of row 0.
-        row_size: distance of two rows in bytes.
+    ``address`` is that of row 0, ``row_size`` the distance of two rows in bytes.
     """
 
     def __init__(self, address: int, row_size: int) -> None:

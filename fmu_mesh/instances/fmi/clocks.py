@@ -25,10 +25,6 @@ _APERIODIC: Final = ("changing", "countdown")
 class Clocks:
     """The clocks of one instance.
 
-    Args:
-        fmu: FMPy's object, instantiated.
-        clocks: as the model description has them.
-
     Attributes:
         next_tick: time of the next tick of an input clock in s; infinite if there is none.
         ticked: the output clocks that have ticked since this was last emptied.

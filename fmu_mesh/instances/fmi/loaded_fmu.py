@@ -76,9 +76,7 @@ class FmuToLoad(NamedTuple):
 class LoadedFmu:
     """One FMU with a folder and a library of its own.
 
-    Args:
-        fmu: what is loaded.
-        folder: an existing private folder; the FMU is extracted below it.
+    It is extracted below ``folder``, an existing private folder.
 
     Attributes:
         key: what it was made from.

@@ -50,13 +50,6 @@ _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
 class MujocoInstance(KeepsStateAsBytes):
     """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
 
-    Args:
-        path: the model file (MJCF or URDF).
-        name: instance name.
-        config: its section of the configuration.
-        log: called with every message of the engine.
-        picture: a film or a window that shows the world after every own step.
-
     Raises:
         LoadFailed: MuJoCo is not installed, or cannot load the model.
     """

@@ -85,10 +85,6 @@ class Film:
     A film is unreadable until it is complete. Until then, its file is `<name>.unfinished.mp4` in the same folder. A run
     that ends before the first step writes no film, and does not touch an older one.
 
-    Args:
-        path: the file; its suffix says the format.
-        instance: for errors.
-
     Raises:
         LoadFailed: the renderer cannot be started, or the file not be written.
     """

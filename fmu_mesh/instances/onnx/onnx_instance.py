@@ -35,10 +35,7 @@ __all__ = ["OnnxInstance"]
 class OnnxInstance(KeepsStateAsBytes):
     """One model; see `fmu_mesh.instances.contract.Instance` for the call sequence.
 
-    Args:
-        name: instance name.
-        model: what is computed.
-        not_finite: whether NaN is an error.
+    With ``not_finite`` as `record`, NaN is no error.
     """
 
     def __init__(self, name: str, model: OnnxModel, not_finite: Literal["stop", "record"] | None = None) -> None:

@@ -36,9 +36,7 @@ _TEXT_CHARACTERS = 500
 class ImportedComponent:
     """The class of a component, imported for one instance.
 
-    Args:
-        path: the absolute path of its file; `Path()` for a module.
-        target: where the class is.
+    ``path`` is the absolute path of its file; `Path()` for a module.
 
     Raises:
         Exception: whatever the code of the user raises; `told` says it in words.

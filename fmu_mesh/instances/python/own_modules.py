@@ -38,9 +38,6 @@ _numbers = itertools.count(1)
 class OwnModules(MetaPathFinder):
     """The modules of one instance. It finds them from the start until `close`.
 
-    Args:
-        folder: where the file of the component is.
-
     Attributes:
         lent: the names that were imported by name from elsewhere, in the call into the component that is under way.
     """

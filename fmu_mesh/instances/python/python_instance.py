@@ -43,9 +43,6 @@ class _State(NamedTuple):
 class PythonInstance:
     """A component in Python that is stepped by a mesh.
 
-    Args:
-        opening: its section, the path of its file and its description.
-
     Raises:
         LoadFailed: the class cannot be imported or called, or is another one than when the run was planned.
     """

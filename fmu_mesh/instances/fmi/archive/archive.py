@@ -73,10 +73,6 @@ class OpenFmu(ABC):
         compile_sources(fmu, description, tell)
     ```
 
-    Args:
-        path: where it lies.
-        limits: how large it may be.
-
     Raises:
         LoadFailed: by each method: a file cannot be read or is damaged.
     """

@@ -31,10 +31,6 @@ def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, .
 
     Of several with one name, which no version of FMI allows and some FMUs have, the last one is the variable: a name is
     a key, a column and an address, and cannot stand for two things.
-
-    Args:
-        source: the description as FMPy reads it.
-        root: the root of the XML.
     """
     elements = {element.get("name"): element for element in root.iterfind("ModelVariables/*")}
     convert: Callable[[ModelVariable, ET.Element, Dependencies], Variable]

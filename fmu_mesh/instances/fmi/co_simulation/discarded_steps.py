@@ -45,11 +45,7 @@ _ENDS: Final = 6
 class StepStatus:
     """Asks one instance about its last step.
 
-    Args:
-        dll: its library.
-        component: the instance.
-        symbols: what the symbols of its functions begin with.
-        failed: makes the error of the instance.
+    ``failed`` makes the error of the instance.
     """
 
     def __init__(self, dll: Any, component: int, symbols: str, failed: Callable[..., Exception]) -> None:  # noqa: ANN401 of ctypes
@@ -89,14 +85,9 @@ class StepStatus:
 class RetriedSteps:
     """fmi2DoStep that takes a discarded step in smaller ones.
 
-    After fmi2Discard, only fmi2SetFMUstate is allowed (FMI 2.0, 4.2.4), so the state is kept before every step.
+    ``waited`` waits for a pending step and returns its status; ``failed`` makes the error of the instance.
 
-    Args:
-        fmu: FMPy's object, instantiated.
-        do_step: fmi2DoStep.
-        waited: waits for a pending step and returns its status.
-        asks_to_end: whether the FMU asks to end the simulation with the step that it has discarded.
-        failed: makes the error of the instance.
+    After fmi2Discard, only fmi2SetFMUstate is allowed (FMI 2.0, 4.2.4), so the state is kept before every step.
 
     Attributes:
         ends: whether the FMU asked to end the simulation with the last discarded step.
@@ -177,10 +168,8 @@ def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_siz
 def discarded(function: str, last_time: float | None, smallest: int | None) -> str:
     """The text of an error for a step that was discarded.
 
-    Args:
-        function: the name of the function.
-        last_time: the last successful time in s, if the FMU tells.
-        smallest: the last attempt was a sub-step of 1/smallest of the step; None if there were no sub-steps.
+    ``last_time`` is the last successful time in s, if the FMU tells; the last attempt was a sub-step of 1/``smallest``
+    of the step, or the whole step if that is None.
     """
     tried = f" down to 1/{smallest} of the step" if smallest is not None else ""
     told = f"; the last successful time is {last_time:.12g} s" if last_time is not None else ""

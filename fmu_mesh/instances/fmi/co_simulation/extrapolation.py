@@ -41,12 +41,7 @@ class TakesDerivatives(Instance, KeepsState, Protocol):
 
 
 class LinearInputs(AroundInstance[TakesDerivatives]):
-    """An instance with inputs that change linearly within a step.
-
-    Args:
-        instance: the inner instance; `close` closes it.
-        inputs: the linear inputs.
-    """
+    """An instance with inputs that change linearly within a step."""
 
     def __init__(self, instance: TakesDerivatives, inputs: Sequence[LinearInput]) -> None:
         super().__init__(instance)

@@ -45,15 +45,6 @@ class EventInfo(NamedTuple):
 class ModelCalls:
     """The model exchange functions of one instance. Arrays are given as addresses of float64 memory.
 
-    Args:
-        fmu: FMPy's object, instantiated.
-        description: its model description.
-        symbols: what the symbols of its functions begin with.
-
-    Attributes:
-        n_states: number of continuous states.
-        n_indicators: number of event indicators.
-
     Raises:
         FMICallException: by every method: the FMU returned a status above warning.
     """

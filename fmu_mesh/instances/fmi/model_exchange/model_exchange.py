@@ -35,12 +35,8 @@ EVENT_ITERATIONS: Final = 1000
 class EventLoop:
     """One model between its communication points.
 
-    Args:
-        calls: the functions of the model.
-        settings: of the solver.
-        tell_completed_steps: whether the FMU needs to know of completed integrator steps.
-        stop_time: the stop time of the FMU in s; its time is never set to a later one.
-        clocks: the clocks of the model.
+    The time of the FMU is never set to a later one than ``stop_time`` (s). It is told of completed integrator steps if
+    it needs that.
 
     Attributes:
         terminated: whether the FMU has asked to end the simulation; nothing may be advanced then.
@@ -86,9 +82,7 @@ class EventLoop:
     def set_inputs(self, set_values: Callable[[], None], line: Callable[[float], None] | None) -> None:
         """Set inputs as an `event` at the start of a step.
 
-        Args:
-            set_values: sets all inputs.
-            line: sets the inputs that change within the step, at a time in s; None if all are constant.
+        ``line`` sets the inputs that change within the step, at a time in s; None if all are constant.
         """
         self._calls.follow(None)
         self.event(set_values)
@@ -98,9 +92,6 @@ class EventLoop:
         """Continue with inputs that change continuously: no event, and the solver goes on (FMI 2.0, 3.2.1).
 
         If the small jump of an extrapolated input takes an event indicator over 0, that is an `event`.
-
-        Args:
-            line: see `set_inputs`.
         """
         above = self._above_zero()
         line(self._time)

@@ -124,9 +124,7 @@ class NothingToSolve:
 class EulerSolver:
     """Forward Euler; events are seen at the end of the step in which they happen.
 
-    Args:
-        equations: the model.
-        maximum_step_size: in s; None: one step per communication step.
+    ``maximum_step_size`` is in s; None: one step per communication step.
     """
 
     def __init__(self, equations: ModelCalls, maximum_step_size: float | None) -> None:
@@ -179,13 +177,10 @@ class EulerSolver:
 class CVodeSolver:
     """CVode of SUNDIALS: variable-order BDF with root finding, one internal step per call and never beyond ``stop``.
 
+    ``maximum_step_size`` is in s; None: as long as the communication step.
+
     So the FMU learns of every completed integrator step (FMI 2.0, 3.2.2), and no input is extrapolated beyond its
     communication step. The absolute tolerances are the relative one times the nominal values (FMI 2.0, 3.2.1).
-
-    Args:
-        equations: the model; one without states gets a constant one, so that its event indicators are watched.
-        relative_tolerance: relative tolerance of the local error.
-        maximum_step_size: in s; None: as long as the communication step.
     """
 
     def __init__(self, equations: ModelCalls, relative_tolerance: float, maximum_step_size: float | None) -> None:
