@@ -17,7 +17,7 @@ from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.calls import cffi_function
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import SMALLEST, take_sub_steps
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
-from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
+from fmu_mesh.instances.fmi.co_simulation.fmi3 import Fmi3Steps
 from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
 from fmu_mesh.instances.fmi.fmu_values import DISCARD
 from fmu_mesh.instances.fmi.opening import open_instance, stepped

@@ -338,7 +338,7 @@ def _sundials() -> Any:  # noqa: ANN401 ctypes has no types
     from fmpy.sundials import libraries  # noqa: PLC0415 the import loads the libraries: only if needed
 
     pointer, real, integer, size = ctypes.c_void_p, ctypes.c_double, ctypes.c_int, ctypes.c_int64
-    types = {  # of the result, and of each argument
+    types: dict[Any, dict[str, tuple[Any, ...]]] = {  # of the result, and of each argument
         libraries.sundials_core: {
             "SUNContext_Create": (integer, integer, pointer),
             "SUNContext_Free": (integer, pointer),
