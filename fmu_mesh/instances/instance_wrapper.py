@@ -111,7 +111,7 @@ class AroundInstance(Generic[Within]):
         return cast("KeepsState", self._instance)
 
 
-def packed(own: msgspec.Struct, within: bytes) -> bytes:
+def packed(own: msgspec.Struct | tuple[msgspec.Struct, ...], within: bytes) -> bytes:
     """Our own part of a state and the serialized state of the inner instance as one."""
     return msgspec.msgpack.encode((own, within))
 

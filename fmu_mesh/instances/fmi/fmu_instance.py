@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeVar
+from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
 import msgspec
 from fmpy.fmi1 import FMICallException
@@ -116,7 +116,8 @@ class FmuInstance(ABC):
         self._symbols = f"{description.model_identifier}_{prefix}" if prefix == "fmi" else prefix
         self._kept = kept
         fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding)
-        self._model = LoadedFmu(fmu, folder) if kept is None else LoadedFmu.kept(fmu, kept)
+        left = cast("LoadedFmu | None", kept.take(name, fmu.key)) if kept is not None else None
+        self._model = left or LoadedFmu(fmu, folder if kept is None else kept.folder)
         try:
             self._model.load()
             self._fmu = self._model.calls
@@ -279,7 +280,7 @@ class FmuInstance(ABC):
     def _instantiate(self, **arguments: object) -> None:
         """Make the instance with these arguments for FMPy, unless one was reset; look up what the steps need."""
         register(self.name, self, id(self._model))
-        self._model.instantiate(lambda: self._fmu.instantiate(loggingOn=False, **arguments))
+        self._model.instantiate(**arguments)
         self._component = self._fmu.component
         self._self = pointer(self._component)
         if not self._functions.values.sized:  # FMI 3.0 passes no component to its logger

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import chdir, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException
 
 from ...variables.model_description import ModelDescription
-from ..kept_models import KeptModels
 from ..process_end import process_ends
 from ..process_state import FOLDER
 from .archive.archive import Terms
@@ -96,11 +95,6 @@ class LoadedFmu:
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
         self._changes_process: bool | None = None
 
-    @classmethod
-    def kept(cls, fmu: FmuToLoad, kept: KeptModels) -> LoadedFmu:
-        """The FMU as the last instance of this name has left it, where it can be used again; if not, a new one."""
-        return cast("LoadedFmu | None", kept.take(fmu.name, fmu.key)) or cls(fmu, kept.folder)
-
     def load(self) -> None:
         """Load the library, if it is not loaded."""
         if self.calls is not None:
@@ -126,14 +120,14 @@ class LoadedFmu:
             self._changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
         return self._changes_process
 
-    def instantiate(self, make: Callable[[], object]) -> None:
-        """Give the FMU to its next user; ``make`` makes an instance, if none is there that was reset.
+    def instantiate(self, **arguments: object) -> None:
+        """Make an instance with these arguments for FMPy, if none is there that was reset.
 
         Raises:
             RuntimeError: there is no instance.
         """
         if not self.has_instance:
-            make()
+            self.calls.instantiate(loggingOn=False, **arguments)
             self.has_instance = bool(self.calls.component)
             if not self.has_instance:
                 raise RuntimeError(f"{self._fmu.functions.names['instantiate']} returned no instance")

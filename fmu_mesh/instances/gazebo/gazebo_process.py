@@ -86,7 +86,6 @@ class GazeboProcess:
         links: scoped names.
 
     Attributes:
-        version: of Gazebo, and its engine.
         state: the last state, as the protocol has it.
 
     Raises:
@@ -110,7 +109,7 @@ class GazeboProcess:
             parts = [f"joint {name} {'free' if free else 'limited'}\n" for name, free in joints]
             parts += [f"link {name}\n" for name in links]
             self._send(b"world %d\n%b%b" % (len(text), text, "".join([*parts, "go\n"]).encode()))
-            self.version = self._answer(_START_S).removeprefix("gazebo ")
+            self._answer(_START_S)  # the versions of Gazebo and its engine
             self.state = self._numbers(_START_S)
             stack.pop_all()
 

@@ -17,12 +17,14 @@ from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, FMI2_VALUES, Fmi2
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
+from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi2Instance"]
 
 _DO_STEP = "int (*)(void *, double, double, int)"
+_ENDS = 6
+"""Our own status for a discarded step with which the FMU asks to end the simulation."""
 
 
 class Fmi2Instance(NativeInstance, Fmi2):
@@ -30,7 +32,6 @@ class Fmi2Instance(NativeInstance, Fmi2):
 
     _kind = StepKind.FMI2
     _functions = FmuFunctions(FMU2Slave, FMI2_VALUES, "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
-    _retrying: RetriedSteps | None = None
     _terminated = False
     """Whether the FMU has asked to end the simulation with the step that is complete now."""
 
@@ -54,9 +55,8 @@ class Fmi2Instance(NativeInstance, Fmi2):
         self._do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
         self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
         self._by_calls = bool(options.retry_discarded_steps or options.linear_inputs)
-        if options.retry_discarded_steps:
-            wait = self._step_status.wait
-            self._retrying = RetriedSteps(self._fmu, self._do_step, wait, self._asks_to_end, self._failed)
+        self._kept_state = ctypes.c_void_p()
+        """That before the step, where steps are retried."""
 
     def _step_by_calls(self, step: int) -> None:
         self._check_not_terminated()
@@ -67,9 +67,33 @@ class Fmi2Instance(NativeInstance, Fmi2):
         if status is None:
             if self._derivatives:
                 self._set_derivatives(self._derivatives)
-            status = (self._retrying or self._do_step)(self._self, time, self._step_size, 1)
+            if self._options.retry_discarded_steps:
+                status = self._checked(lambda: self._retried(time, self._step_size))
+            else:
+                status = self._do_step(self._self, time, self._step_size, 1)
         if status > WARNING:
             self._finish(status, time + self._step_size)
+
+    def _retried(self, time: float, step_size: float) -> int:
+        """Take a step, a discarded one in smaller steps; `DISCARD`: the smallest was discarded, `_ENDS`: it is the end.
+
+        After fmi2Discard, only fmi2SetFMUstate is allowed (FMI 2.0, 4.2.4), so the state is kept before every step.
+        """
+        fmu, state = self._fmu, ctypes.byref(self._kept_state)
+
+        def attempt(start: float, size: float) -> int:
+            fmu.fmi2GetFMUstate(self._component, state)
+            status = self._do_step(self._self, start, size, 0)
+            if status == PENDING:
+                status = self._step_status.wait()
+            if status == DISCARD:
+                if self._asks_to_end():
+                    return _ENDS
+                fmu.fmi2SetFMUstate(self._component, self._kept_state)
+            return status
+
+        status = attempt(time, step_size)
+        return take_sub_steps(attempt, time, step_size) if status == DISCARD else status
 
     def _set_derivatives(self, derivatives: Mapping[str, float]) -> None:
         references = [self._variables[name].value_reference for name in derivatives]
@@ -87,10 +111,11 @@ class Fmi2Instance(NativeInstance, Fmi2):
             status = self._step_status.wait()
         if status <= WARNING:
             return
-        if status != DISCARD:
+        retries = self._options.retry_discarded_steps
+        if status not in (DISCARD, _ENDS):
             raise self._failed("fmi2DoStep", status=status)
         messages = self._last_messages
-        if self._asks_to_end() if self._retrying is None else self._retrying.ends:
+        if status == _ENDS or (not retries and self._asks_to_end()):
             # The outputs are those of the last successful time: a row, if this is the end of the step.
             last_time = self._step_status.last_successful_time()
             self._terminated = last_time is not None and not resolvable(last_time, end)
@@ -98,7 +123,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
                 raise self._end_requested()
             self._said.note(quiet_until=-math.inf)  # `_step_by_calls` refuses the next step
             return
-        if self._retrying is not None:
+        if retries:
             raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # a message about these questions is not the reason of the failure
@@ -128,5 +153,5 @@ class Fmi2Instance(NativeInstance, Fmi2):
         self._said.note(quiet_until=math.inf)
 
     def _release(self) -> None:
-        if self._retrying is not None:
-            self._retrying.free()
+        if self._kept_state.value is not None:
+            self._fmu.fmi2FreeFMUstate(self._component, ctypes.byref(self._kept_state))
