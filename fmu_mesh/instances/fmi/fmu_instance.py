@@ -33,7 +33,7 @@ from .archive.system_libraries import missing_libraries
 from .buffers import BinaryBuffer, Buffer
 from .callbacks import recall, register, register_component, tell_counted, unregister
 from .calls import RowPointers, cffi_function, declared, memory, pointer
-from .fmu_values import FATAL, OK, WARNING, PartCall, Verb, status_name
+from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
 from .step_options import StepOptions
 
@@ -87,6 +87,9 @@ class FmuInstance(ABC):
 
     _component: int
     """The address of the instance, for functions called through ctypes; ``_self`` is the same for cffi."""
+
+    _solver = ""
+    """What the error of a solver begins with."""
 
     _description: ModelDescription
     _variables: Mapping[str, Variable]
@@ -374,11 +377,13 @@ class FmuInstance(ABC):
             raise ValueError(msg)
 
     def _checked(self, call: Callable[[], T]) -> T:
-        """Call the FMU; if it fails, that is an error of this instance."""
+        """Call the FMU; if it or its solver fails, that is an error of this instance."""
         try:
             return call()
         except FMICallException as error:
             raise self._failed(error.function, status=error.status) from error
+        except SolverFailed as error:
+            raise self._failed(f"{self._solver}{error}") from error
 
     def _note(self, status: int) -> None:
         """After fatal, no function of the instance is called, not even to free it (FMI 2.0, 2.1.3; 3.0, 2.2.3)."""

@@ -20,7 +20,7 @@ from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
 from .calls import Function, Pointer, RowPointers, address_of
 from .fmu_library import MISSING
 
-__all__ = ["DISCARD", "FATAL", "OK", "WARNING", "PartCall", "ValueFunctions", "Verb", "status_name"]
+__all__ = ["DISCARD", "FATAL", "OK", "WARNING", "PartCall", "SolverFailed", "ValueFunctions", "Verb", "status_name"]
 
 OK: Final = 0
 WARNING: Final = 1
@@ -36,6 +36,10 @@ _GET_OR_SET_3: Final = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _SIZE,
 _GET_OR_SET_BINARY: Final = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _SIZE, _ADDRESS, _ADDRESS, _SIZE)
 _FMI2_NAMES: Final[dict[VariableType, str]] = {"Float64": "Real", "Int32": "Integer", "Enumeration": "Integer"}
 """The types of FMI 1.0 and 2.0 that have another name in FMI 3.0."""
+
+
+class SolverFailed(Exception):
+    """Steps make no progress, or events do not converge; the text says why."""
 
 
 class ValueFunctions(NamedTuple):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
@@ -29,15 +29,12 @@ from ..calls import Function, Pointer, cffi_function, pointer
 from ..clocks import Clocks
 from ..fmi_versions import FMI3_NEEDED, FMI3_VALUES, Fmi3
 from ..fmu_instance import Bookkeeping
-from ..fmu_values import DISCARD, WARNING, PartCall, Verb
+from ..fmu_values import DISCARD, WARNING, PartCall, SolverFailed, Verb
 from ..loaded_fmu import FmuFunctions
-from ..model_exchange.solver import SolverFailed
 from .discarded_steps import SMALLEST
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi3Instance", "Fmi3Steps"]
-
-T = TypeVar("T")
 
 _NEEDED = "fmi3InstantiateCoSimulation", *FMI3_NEEDED, "fmi3DoStep"
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
@@ -133,12 +130,6 @@ class Fmi3Instance(NativeInstance, Fmi3):
         self._discrete_row = row
         set_row = self._set_row
         self._checked(lambda: self._steps.event(self._said.time, lambda: set_row(slot, self._discrete)))
-
-    def _checked(self, call: Callable[[], T]) -> T:
-        try:
-            return super()._checked(call)
-        except SolverFailed as error:
-            raise self._failed(str(error)) from error
 
     def _bookkeeping(self) -> Bookkeeping:
         next_event, event_time = self._steps.place

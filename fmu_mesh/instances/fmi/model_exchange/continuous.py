@@ -11,7 +11,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from fmpy.fmi1 import FMICallException, FMU1Model
@@ -40,11 +40,9 @@ from ..fmu_values import WARNING
 from ..loaded_fmu import FmuFunctions
 from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
 from .model_exchange import EventLoop
-from .solver import SolverFailed
 
 __all__ = ["ContinuousInstance", "Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
 
-T = TypeVar("T")
 _RowBytes = tuple[bytes | list[Any], ...]
 
 _NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
@@ -82,6 +80,7 @@ class ContinuousInstance(FmuInstance):
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """See `Instance`."""
+        self._solver = f"solver {self._options.solver.name}: "
         self._time_of_start, self._stop_time = start_time, math.inf if stop_time is None else stop_time
         super().enter_initialization(start_time, stop_time, start_values)
 
@@ -231,12 +230,6 @@ class ContinuousInstance(FmuInstance):
                 raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
 
         return set_inputs
-
-    def _checked(self, call: Callable[[], T]) -> T:
-        try:
-            return super()._checked(call)
-        except SolverFailed as error:
-            raise self._failed(f"solver {self._options.solver.name}: {error}") from error
 
 
 class Fmi1ModelInstance(ContinuousInstance, Fmi1):

@@ -22,9 +22,10 @@ import numpy as np
 
 from ....simtime import resolvable
 from ..clocks import NO_CLOCKS, Clocks
+from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
 from .model_calls import ModelCalls
-from .solver import SolverFailed, make_solver
+from .solver import make_solver
 
 __all__ = ["EventLoop"]
 

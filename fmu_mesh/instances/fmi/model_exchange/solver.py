@@ -19,11 +19,11 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from ....simtime import resolvable, steps_between
-from ..fmu_values import DISCARD
+from ..fmu_values import DISCARD, SolverFailed
 from ..step_options import SolverSettings
 from .model_calls import ModelCalls
 
-__all__ = ["Solver", "SolverFailed", "make_solver"]
+__all__ = ["Solver", "make_solver"]
 
 # Who meets here: one thread, in three languages. Python calls CVode, CVode calls back (`_RHS`, `_ROOT`), and this calls
 # the FMU. No exception may cross C: it is kept in `_failure`, CVode is told to give up, and it is raised once CVode has
@@ -92,10 +92,6 @@ class Solver(Protocol):
     def close(self) -> None:
         """Free its memory."""
         ...
-
-
-class SolverFailed(Exception):
-    """The solver gave up; the text says why."""
 
 
 def make_solver(settings: SolverSettings, equations: ModelCalls) -> Solver:
