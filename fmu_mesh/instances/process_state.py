@@ -144,8 +144,7 @@ class _Seen(NamedTuple):
 def _signals(actions: ctypes.Array[ctypes.c_char] | None) -> tuple[ctypes.Array[ctypes.c_char], list[bytes]]:
     """The actions at `_SIGNALS` and the blocked signals, one after the other; and of these what can be compared.
 
-    Args:
-        actions: what to set instead; None: all stay.
+    ``actions`` is what to set instead; None: all stay.
     """
     found = ctypes.create_string_buffer((len(_SIGNALS) + 1) * _SIGNAL_BYTES)
     to, wanted = ctypes.addressof(found), ctypes.addressof(actions) if actions is not None else None
@@ -179,8 +178,7 @@ def _variables() -> bytes:
 def kept_state(*, keep_mode: bool = False) -> Iterator[ProcessState]:
     """Restore the state of the process at the end of the block.
 
-    Args:
-        keep_mode: True restores the floating-point mode of before; False sets the default mode.
+    With ``keep_mode``, the floating-point mode of before is restored; without, the default mode is set.
     """
     environment = ctypes.create_string_buffer(_ENVIRONMENT_BYTES)
     if keep_mode:

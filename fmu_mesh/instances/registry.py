@@ -27,7 +27,6 @@ from .contract import Instance, Kind, Opening, Showing
 __all__ = [
     "GROUP",
     "KINDS",
-    "can_be_shown",
     "check_engines",
     "check_showing",
     "claims",
@@ -166,11 +165,6 @@ def open_instance(opening: Opening[Any]) -> Instance:
     return kind.open(opening)
 
 
-def can_be_shown(section: InstanceSection) -> bool:
-    """Whether `--view` and `--video` can show an instance."""
-    return _kind_of(section).can_be_shown
-
-
 def check_engines(
     sections: Mapping[str, InstanceSection],
     models: Mapping[str, tuple[Path, ModelDescription]],
@@ -219,7 +213,7 @@ def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> 
     """
     if not showing:
         return
-    worlds = [name for name, section in sections.items() if can_be_shown(section)]
+    worlds = [name for name, section in sections.items() if _kind_of(section).can_be_shown]
     if len(worlds) != 1:
         option = "`view=True`" if showing.view else "`video=...`"
         found = f"this one has {listed(worlds)}" if worlds else "this one has none"

@@ -71,10 +71,7 @@ class Linear(msgspec.Struct, frozen=True):
 def conversion(source: BaseUnit, target: BaseUnit, *, relative: bool = False) -> Linear | None:
     """The conversion of values from ``source`` to ``target``; None if the dimensions differ.
 
-    Args:
-        source: the unit that values come in.
-        target: the unit that they are wanted in.
-        relative: whether the value is a difference, so that 10 degC are 10 K (FMI 3.0, 2.4.4, relativeQuantity).
+    With ``relative``, the value is a difference, so that 10 degC are 10 K (FMI 3.0, 2.4.4, relativeQuantity).
     """
     if source.dimension != target.dimension:
         return None

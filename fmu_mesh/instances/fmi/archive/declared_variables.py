@@ -81,8 +81,6 @@ def _fmi2(source: ModelVariable, _element: ET.Element, dependencies: Dependencie
     return _variable(
         source,
         FMI2_TYPES[source.type],
-        causality=source.causality or "local",
-        initial=source.initial,
         start=_start(FMI2_TYPES[source.type], source.start),
         dependencies=dependencies.get(source.name, ()),
     )
@@ -99,8 +97,6 @@ def _fmi3(source: ModelVariable, element: ET.Element, dependencies: Dependencies
     return _variable(
         source,
         type_,
-        causality=source.causality or "local",
-        initial=source.initial,
         start=_array_start(type_, texts, shape),
         dependencies=dependencies.get((source.alias or source).name, ()),
         declared_type=None,
@@ -117,6 +113,8 @@ def _variable(source: ModelVariable, type_: VariableType, **more: object) -> Var
     declared = source.declaredType
     items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
     fields: dict[str, object] = {
+        "causality": source.causality or "local",
+        "initial": source.initial,
         "variability": source.variability or ("continuous" if type_ == "Float64" else "discrete"),
         "unit": source.unit or (declared.unit if declared is not None else None),
         "description": source.description,
