@@ -23,7 +23,7 @@ from .native_instance import NativeInstance
 __all__ = ["Fmi2Instance"]
 
 _DO_STEP = "int (*)(void *, double, double, int)"
-_ENDS = 6
+_ENDS = 998
 """Our own status for a discarded step with which the FMU asks to end the simulation."""
 
 
