@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["ENDLESS", "TimeGrid", "step_within", "steps_between"]
+__all__ = ["ENDLESS", "TimeGrid", "resolvable", "step_within", "steps_between"]
 
 ENDLESS = 2**53
 """Last point of a run without a stop time. Beyond it a point has no exact double any more."""
@@ -90,6 +90,15 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return None
         last_start = self.time((self.last_point // points - 1) * points)
         return max(self.stop_time, last_start + points * self.step_size)
+
+
+def resolvable(time: float, stop: float) -> bool:
+    """Whether ``stop`` is after ``time`` (both in s) by more than rounding.
+
+    Time events and communication points are computed in different ways. So the same instant may have two values that
+    differ in the last digits; there is nothing to integrate between them.
+    """
+    return math.isinf(stop) or stop - time > 8 * math.ulp(max(abs(time), abs(stop)))
 
 
 def step_within(time: float, step_size: float, end: float) -> float:

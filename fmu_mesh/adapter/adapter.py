@@ -21,7 +21,10 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from ..errors import FmuError
-from ..instances.fmi import FmuInstance, LogMessage, open_instance, read_description
+from ..instances.contract import LogMessage
+from ..instances.fmi.archive.reading import read_description
+from ..instances.fmi.fmu_instance import FmuInstance
+from ..instances.fmi.opening import open_instance
 from ..instances.fmi.step_options import StepOptions
 from ..instances.input_trajectory import Trajectory
 from ..instances.process_state import LOOK_STEPS, kept_mode, kept_state

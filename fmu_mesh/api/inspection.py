@@ -14,7 +14,9 @@ from .. import files
 from ..config.call_options import checked
 from ..config.instance_sections import KIND
 from ..errors import CallRefused, LoadFailed, UnknownName
-from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of
+from ..instances.fmi.archive.archive import sha256_of, size_of
+from ..instances.fmi.archive.reading import read_description
+from ..instances.fmi.archive.system_libraries import missing_libraries
 from ..instances.registry import KINDS, describe
 from ..pictures.tables import html_table, pairs
 from ..printing import page, printable

@@ -13,18 +13,18 @@ def main() -> None:
     """Answer the request."""
     answers = os.dup(1)
     os.dup2(2, 1)  # what a component writes is no answer
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def end_with_parent() -> None:
+        while os.read(0, 4096):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     _, module, request = sys.argv
     answer = import_module(module).answer_to(request)  # only now may anything else write
     while answer:
         answer = answer[os.write(answers, answer) :]
     os._exit(0)  # the component may have started threads
-
-
-def _end_with_parent() -> None:
-    while os.read(0, 4096):
-        pass
-    os._exit(1)
 
 
 if __name__ == "__main__":

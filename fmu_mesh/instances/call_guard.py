@@ -45,9 +45,29 @@ __all__ = [
 
 Result = TypeVar("Result")
 
-# How late a call beyond its limit may be noticed: limits are seconds, and this thread should wake up rarely, but as
-# often as `AwakeClock` has to be read.
+# Who meets here: the thread that calls FMUs (of a node the main thread, in a program the thread that owns the system),
+# and for each `CallWatch` one thread that waits for the deadlines of its calls. ADR 12 says what is guarded, ADR 56 how
+# the line of a component is found, ADR 57 which steps are taken without Python.
+#
+# They share two attributes. Only the calling thread writes `_call` and `_position`, each with one assignment, and it
+# never waits for the watching thread to look. That one reads both once in a round and compares them with those of the
+# round before. It holds the lock of the condition from there until it waits, so a call that begins meanwhile wakes it.
+#
+# A call that hangs cannot be cancelled: no exception of Python reaches C, and a signal would interrupt the FMU
+# anywhere, perhaps while it holds a lock of malloc. So an overrun is told on the watching thread, and whoever owns the
+# process ends the process. Nothing may wait for the calling thread on that way, and nothing may call the FMU, `exit` or
+# a destructor.
+#
+# Steps have no `calling` of their own: to wake a thread takes longer than a short step. Their owner gives a function
+# that says who steps and from which point; if it still says the same after the limit, a step has overrun. The clock is
+# `AwakeClock`: a process that stood (a debugger, swap, a suspended host) must not look like an FMU that hangs.
+#
+# Where a thread is, is asked after a missed deadline only, so that it costs nothing before. `_functions` has the FMI
+# function of each call from Python; steps of the library have a stage in their tables instead. The frames of a
+# component come from `sys._current_frames`: `faulthandler` tells the same only to a file.
+
 _WATCH_S: Final = 0.25
+"""How often a step is compared with what it was: an overrun is told this much late at most."""
 _DO_STEP: Final = "doStep"
 
 _functions: dict[int, str] = {}
@@ -212,10 +232,7 @@ def lines_shown_of(file: str | None) -> None:
 def not_returned(thread: int, seconds: float, otherwise: str) -> str:
     """In words where a thread has been for too long.
 
-    Args:
-        thread: its identifier.
-        seconds: for how long, in s.
-        otherwise: the function of an FMU, if it is not known which one.
+    ``seconds`` in s; ``otherwise`` is the function of an FMU, if it is not known which one.
     """
     if (line := _line_of_user(thread)) is not None:
         return f"the component has not returned for {seconds:.1f} s from {line}{ENDED}"
@@ -248,14 +265,10 @@ def call_named(name: str, function: Callable[..., Result], *arguments: Any, **ke
 class Guarded(AroundNativeSteps):
     """An instance whose calls have a deadline and leave the state of the process unchanged.
 
+    ``open_`` makes the instance, which is a call with a deadline like the others.
+
     That a step leaves it is looked after only where a step may change it: it takes longer than many a step. Such an
     instance has no `native` steps.
-
-    Args:
-        name: instance name.
-        open_: makes the instance; a call with a deadline like the others.
-        watch: watches the deadlines, or does not.
-        timeouts: the deadlines.
     """
 
     def __init__(

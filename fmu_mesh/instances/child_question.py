@@ -19,6 +19,16 @@ from ..variables.model_description import ModelDescription
 
 __all__ = ["ask_description_of", "described", "run_child"]
 
+# Which processes meet here: the one that plans a run, and one child that imports or loads what a user wrote (ADR 56).
+# The child may hang, crash, print, leave threads and processes, or lose its parent.
+#
+# * It ends with us, however we end: a thread of it reads a pipe that only we can write to (its standard input).
+#   PDEATHSIG would follow our thread, not our process.
+# * It has a session of its own: Ctrl-C reaches us only, and `killpg` also ends what it has started.
+# * It answers on a copy of its standard output. What its code prints goes to standard error, and the end of that into
+#   the error.
+# * It leaves by `os._exit`: threads and destructors of foreign code must not turn an answer into a hang.
+
 _DEADLINE_S = 60.0
 _KILLED_S = 10.0
 _SHOWN_CHARACTERS = 300

@@ -30,6 +30,7 @@ __all__ = [
     "Instance",
     "KeepsFiles",
     "KeepsState",
+    "KeepsStateAsBytes",
     "Kind",
     "LogMessage",
     "Opening",
@@ -151,13 +152,7 @@ class Kind(ABC, Generic[Section]):
             OSError, LoadFailed: a file cannot be read.
         """
 
-    def claims(
-        self,
-        path: Path,  # noqa: ARG002  for those who claim something
-        section: Section,  # noqa: ARG002  as above
-        description: ModelDescription,  # noqa: ARG002  as above
-        limits: LimitsConfig,  # noqa: ARG002  as above
-    ) -> Claims:
+    def claims(self, path: Path, section: Section, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """What such an instance uses of which a process has only one; nothing by default.
 
         Called only where instances are to share a process: what is slow is done here.
@@ -187,7 +182,7 @@ class Kind(ABC, Generic[Section]):
             LoadFailed: it has not; says what is missing.
         """
 
-    def check_showing(self, showing: Showing) -> None:  # noqa: ARG002  for those who can show something
+    def check_showing(self, showing: Showing) -> None:
         """Check that this host can show what ``showing`` asks for; called only with `can_be_shown`.
 
         Raises:
@@ -202,7 +197,7 @@ class Kind(ABC, Generic[Section]):
         """
         return
 
-    def prepare(self, opening: Opening[Section]) -> None:  # noqa: ARG002  for those who can prepare something
+    def prepare(self, opening: Opening[Section]) -> None:
         """Do once what every `open` of a model needs, such as unpacking it; nothing is prepared by default.
 
         Called in the process of `preload`. It must load no library of the model.
@@ -359,3 +354,19 @@ class KeepsState(Protocol):
     def deserialize_state(self, data: bytes) -> object:
         """The state from the bytes that an instance of the same model has made."""
         ...
+
+
+class KeepsStateAsBytes:
+    """The rest of `KeepsState` where `get_state` returns bytes, which any instance of the model can restore."""
+
+    def free_state(self, state: object) -> None:
+        """Nothing to free."""
+
+    def serialize_state(self, state: object) -> bytes:
+        """The state, which is bytes already."""
+        assert isinstance(state, bytes)
+        return state
+
+    def deserialize_state(self, data: bytes) -> object:
+        """The state, which is these bytes; `set_state` checks them."""
+        return data

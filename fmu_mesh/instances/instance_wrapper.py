@@ -27,10 +27,9 @@ Result = TypeVar("Result")
 class AroundInstance(Generic[Within]):
     """Forwards all calls of `Instance` and `KeepsState` to another instance.
 
-    A subclass overrides the calls that it changes, and `_forward` if it puts something around every call.
+    `close` closes the inner instance.
 
-    Args:
-        instance: the inner instance; `close` closes it.
+    A subclass overrides the calls that it changes, and `_forward` if it puts something around every call.
     """
 
     def __init__(self, instance: Within) -> None:
@@ -112,7 +111,7 @@ class AroundInstance(Generic[Within]):
         return cast("KeepsState", self._instance)
 
 
-def packed(own: msgspec.Struct, within: bytes) -> bytes:
+def packed(own: msgspec.Struct | tuple[msgspec.Struct, ...], within: bytes) -> bytes:
     """Our own part of a state and the serialized state of the inner instance as one."""
     return msgspec.msgpack.encode((own, within))
 

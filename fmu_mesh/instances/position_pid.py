@@ -22,7 +22,7 @@ from ..errors import StepFailed
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import Causality, ModelDescription, Value, Variable
-from .contract import Instance, Kind, Opening
+from .contract import Instance, KeepsStateAsBytes, Kind, Opening
 
 __all__ = ["KIND_OF_CONTROLLERS", "PidConfig", "PidInstance", "describe_pid"]
 
@@ -66,16 +66,12 @@ class ControllerKind(Kind[PidConfig]):
     expected = "no file"
 
     def describe(
-        self,
-        path: Path,  # noqa: ARG002  there is no file
-        section: PidConfig,  # noqa: ARG002  there is one controller
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-        tell: Callable[[str], None],  # noqa: ARG002  takes no time
+        self, path: Path, section: PidConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """The model description of the controller."""
         return describe_pid()
 
-    def content(self, path: Path) -> str:  # noqa: ARG002  there is no file
+    def content(self, path: Path) -> str:
         """Empty: there is no file."""
         return ""
 
@@ -126,7 +122,7 @@ def _variable(name: str, causality: Causality, text: str, start: float | None = 
     )
 
 
-class PidInstance:
+class PidInstance(KeepsStateAsBytes):
     """The controller; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(self, name: str) -> None:
@@ -141,10 +137,7 @@ class PidInstance:
         return self._description
 
     def enter_initialization(
-        self,
-        start_time: float,  # noqa: ARG002  as in the Protocol
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set ``start_values``."""
         self.set_values(start_values)
@@ -193,18 +186,6 @@ class PidInstance:
         assert isinstance(state, bytes)
         decoded = msgspec.json.decode(state, type=_State)
         self._values, self._integral = dict(decoded.values), decoded.integral
-
-    def free_state(self, state: object) -> None:
-        """Nothing to free: a state is bytes."""
-
-    def serialize_state(self, state: object) -> bytes:
-        """The state, which is bytes already."""
-        assert isinstance(state, bytes)
-        return state
-
-    def deserialize_state(self, data: bytes) -> object:
-        """The state, which is these bytes."""
-        return data
 
     def close(self) -> None:
         """Nothing to free."""

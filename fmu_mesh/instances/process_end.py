@@ -24,6 +24,25 @@ from typing import Final
 
 __all__ = ["end_process", "ends_with_run", "process_ends", "surviving"]
 
+# Who meets here: the thread that closes an instance; threads and timers that the FMU has left, which may crash while
+# the other one closes; the watching thread of `call_guard`, which reports and ends the process; and forks of the FMU.
+# ADR 12.
+#
+# A crash is a signal on the thread that crashes, perhaps with a damaged stack and with locks that are held. `on_crash`
+# runs on that thread, so it only notes what happened and wakes the watching thread. Then the thread waits for ever: to
+# return from a SIGSEGV would run the same instruction again.
+#
+# `exit` is no signal. It calls what `__cxa_atexit` has registered last, so it is told (with the number 0) before the
+# destructors of the libraries. That is taken back before Python finalizes itself, because nothing of Python can be
+# called after that.
+#
+# Only a default handler is replaced, and only while an instance is closing: a virtual machine in the FMU needs its own
+# handler of SIGSEGV to run at all, and a crash at any other time has to be one.
+#
+# Given up: a handler of `signal.signal`, which Python runs between two of its own instructions, and a call that has
+# crashed never returns to them; and to unload the library in a process that ends anyway, which crashed FMUs with
+# threads.
+
 _SIGNALS: Final = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
 _ACTION_BYTES: Final = 512
 """More than the size of `struct sigaction` on any platform; the handler is its first field."""

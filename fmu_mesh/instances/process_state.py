@@ -27,6 +27,20 @@ __all__ = [
     "restore_floating_point",
 ]
 
+# Who meets here: every thread of the process. Working directory, locale, umask, environment and signal handlers are
+# those of all threads; the locale of `uselocale`, the blocked signals and the floating-point mode are those of one. So
+# the thread that called the FMU looks, and two threads that look at once may each undo what the FMU of the other one
+# did. Our own threads change only the working directory, while a library is loaded: `FOLDER` is the lock for that. ADR
+# 12.
+#
+# C is asked, not Python: `os.environ` is a copy, and `signal` and `locale` know what Python itself has set. An FMU
+# changes what C has.
+#
+# A look takes longer than most steps. So steps are looked after one by one only where a step may change something, or
+# has done so, and otherwise every `LOOK_STEPS` steps or at the end of a burst. The floating-point mode changes results,
+# and three additions tell it: it is looked at after every step. To look at the rest after each burst, in a model that
+# is known to change it, would make the result depend on timing.
+
 _SIGNALS: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGPIPE", "SIGCHLD") if hasattr(signal, name)
 )
@@ -130,8 +144,7 @@ class _Seen(NamedTuple):
 def _signals(actions: ctypes.Array[ctypes.c_char] | None) -> tuple[ctypes.Array[ctypes.c_char], list[bytes]]:
     """The actions at `_SIGNALS` and the blocked signals, one after the other; and of these what can be compared.
 
-    Args:
-        actions: what to set instead; None: all stay.
+    ``actions`` is what to set instead; None: all stay.
     """
     found = ctypes.create_string_buffer((len(_SIGNALS) + 1) * _SIGNAL_BYTES)
     to, wanted = ctypes.addressof(found), ctypes.addressof(actions) if actions is not None else None
@@ -165,8 +178,7 @@ def _variables() -> bytes:
 def kept_state(*, keep_mode: bool = False) -> Iterator[ProcessState]:
     """Restore the state of the process at the end of the block.
 
-    Args:
-        keep_mode: True restores the floating-point mode of before; False sets the default mode.
+    With ``keep_mode``, the floating-point mode of before is restored; without, the default mode is set.
     """
     environment = ctypes.create_string_buffer(_ENVIRONMENT_BYTES)
     if keep_mode:

@@ -27,7 +27,6 @@ from .contract import Instance, Kind, Opening, Showing
 __all__ = [
     "GROUP",
     "KINDS",
-    "can_be_shown",
     "check_engines",
     "check_showing",
     "claims",
@@ -166,11 +165,6 @@ def open_instance(opening: Opening[Any]) -> Instance:
     return kind.open(opening)
 
 
-def can_be_shown(section: InstanceSection) -> bool:
-    """Whether `--view` and `--video` can show an instance."""
-    return _kind_of(section).can_be_shown
-
-
 def check_engines(
     sections: Mapping[str, InstanceSection],
     models: Mapping[str, tuple[Path, ModelDescription]],
@@ -179,11 +173,8 @@ def check_engines(
 ) -> None:
     """Check that this host has what all instances need that no `host` is named for: engines, and libraries of a system.
 
-    Args:
-        sections: the sections of a configuration, by instance.
-        models: the absolute path and the description of the model of each.
-        limits: how large an FMU may be.
-        findings: where one goes for each instance that misses something.
+    A finding is added for each instance that misses something. ``models`` has the absolute path and the description of
+    the model of each.
     """
     reasons: dict[object, LoadFailed | None] = {}
     for name, section in sections.items():
@@ -222,7 +213,7 @@ def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> 
     """
     if not showing:
         return
-    worlds = [name for name, section in sections.items() if can_be_shown(section)]
+    worlds = [name for name, section in sections.items() if _kind_of(section).can_be_shown]
     if len(worlds) != 1:
         option = "`view=True`" if showing.view else "`video=...`"
         found = f"this one has {listed(worlds)}" if worlds else "this one has none"

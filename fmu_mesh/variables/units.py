@@ -10,9 +10,9 @@ import math
 
 import msgspec
 
-__all__ = ["BaseUnit", "Linear", "conversion"]
+__all__ = ["BASE_UNITS", "BaseUnit", "Linear", "conversion"]
 
-_BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 class BaseUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,7 +41,7 @@ class BaseUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __str__(self) -> str:
         """The dimension, such as `kg.m2.s-2`; `1` for none."""
-        powers = zip(_BASE_UNITS, self.dimension, strict=True)
+        powers = zip(BASE_UNITS, self.dimension, strict=True)
         return ".".join(f"{unit}{power if power != 1 else ''}" for unit, power in powers if power) or "1"
 
 
@@ -71,10 +71,7 @@ class Linear(msgspec.Struct, frozen=True):
 def conversion(source: BaseUnit, target: BaseUnit, *, relative: bool = False) -> Linear | None:
     """The conversion of values from ``source`` to ``target``; None if the dimensions differ.
 
-    Args:
-        source: the unit that values come in.
-        target: the unit that they are wanted in.
-        relative: whether the value is a difference, so that 10 degC are 10 K (FMI 3.0, 2.4.4, relativeQuantity).
+    With ``relative``, the value is a difference, so that 10 degC are 10 K (FMI 3.0, 2.4.4, relativeQuantity).
     """
     if source.dimension != target.dimension:
         return None

@@ -105,11 +105,7 @@ def is_finite(value: Value) -> bool:
 def checked_value(plain: object, variable: Variable, said: str, *, finite: bool = False) -> Value:
     """As `to_value`, with a whole sentence as the message of the error.
 
-    Args:
-        plain: the value that somebody gave.
-        variable: what it is for.
-        said: the value as the sentence shows it.
-        finite: see `to_value`.
+    ``said`` is the value as the sentence shows it.
 
     Raises:
         ValueRefused: it is no value of the variable's type and shape, or out of its range.

@@ -133,10 +133,7 @@ def zero(type_: VariableType) -> Value:
 def takes(target: VariableType, source: VariableType, items: tuple[int, ...] = ()) -> bool:
     """Whether every value of type ``source`` is also one of type ``target``: a connection then loses nothing.
 
-    Args:
-        target: the type of the input.
-        source: the type of the output.
-        items: the numbers that the source can have if it is an Enumeration; empty if they are not known.
+    ``items`` are the numbers that the source can have if it is an Enumeration; empty if they are not known.
     """
     if source == target:
         return True

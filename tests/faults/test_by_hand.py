@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.instances.fmi import read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmus.build import build
 from tests.fmus.helpers import NO_COMPILER
 from tests.fmus.packing import unpacked

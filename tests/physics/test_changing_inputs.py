@@ -12,7 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pytest
 
-from fmu_mesh.instances.fmi import open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid

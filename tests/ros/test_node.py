@@ -21,7 +21,7 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.fmi import Fmi2Instance
+from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
 from fmu_mesh.ros.messages.ros_names import ros_name
 from fmu_mesh.ros.node.node_topics import topics_of
 from tests.fmus.helpers import find_fmu

@@ -20,7 +20,7 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import CallRefused, FmuMeshError, InitializationFailed, LoadFailed, StepFailed
-from fmu_mesh.instances.fmi import Fmi2Instance
+from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
 from fmu_mesh.variables.model_description import Value
 from tests.fmus.helpers import FMUS, find_fmu
 

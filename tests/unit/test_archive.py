@@ -14,8 +14,10 @@ import pytest
 
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.instances.fmi import Terms, open_instance, read_description, sha256_of
+from fmu_mesh.instances.fmi.archive.archive import Terms, sha256_of
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract, prepare
+from fmu_mesh.instances.fmi.opening import open_instance
 from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
 

@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
-from fmu_mesh.instances.fmi import read_description, sha256_of
+from fmu_mesh.instances.fmi.archive.archive import sha256_of
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.run.preparing import prepare
 from tests.fmus.packing import repacked
 

@@ -14,8 +14,9 @@ import pytest
 import fmu_mesh
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import FmuError, LoadFailed
-from fmu_mesh.instances.fmi import open_instance, read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.fmu_library import MISSING, FmuLibrary
+from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout

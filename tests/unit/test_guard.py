@@ -20,8 +20,9 @@ import fmu_mesh
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.instances.call_guard import CallWatch, current_function
-from fmu_mesh.instances.fmi import Fmi2Instance, read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.calls import FmpyCalls
+from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
 from fmu_mesh.instances.process_state import floating_point_changed, kept_state, restore_floating_point
 from fmus.build import find_compiler
 from tests.fmus.helpers import NO_COMPILER

@@ -15,7 +15,8 @@ import yaml
 from fmu_mesh import FMIAdapter
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.instances.fmi import open_instance, read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.opening import open_instance
 from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked, unpacked
 

@@ -14,8 +14,11 @@ import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.instances.fmi import FmuInstance, LogMessage, open_instance, read_description
+from fmu_mesh.instances.contract import LogMessage
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract
+from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
+from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.rings.library import load_library
 from tests.fmus.chatty_fmus import chatty_fmu
 from tests.fmus.event_fmus import SOURCES, event_source_fmu

@@ -13,7 +13,7 @@ import pytest
 from lxml import etree
 
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.instances.fmi import read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from tests.fmus.helpers import FMUS, SOURCES
 

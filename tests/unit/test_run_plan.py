@@ -9,7 +9,9 @@ import pytest
 from msgspec.structs import replace
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
-from fmu_mesh.instances.fmi import Terms, open_instance, read_description, sha256_of
+from fmu_mesh.instances.fmi.archive.archive import Terms, sha256_of
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.preparing import plan_run
 from fmu_mesh.run.run_plan import RunPlan, read_node, read_run

@@ -21,7 +21,7 @@ import fmu_mesh
 from fmu_mesh import FMIAdapter
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, InitializationFailed
-from fmu_mesh.instances.fmi import read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract
 from fmu_mesh.variables.model_description import Kind
 from tests.fmus.event_fmus import Version, event_source_fmu

@@ -14,8 +14,9 @@ from fmu_mesh.config.mesh import TimeoutsConfig
 from fmu_mesh.errors import FmuError, FmuMeshError, TerminationRequested
 from fmu_mesh.instances.call_guard import CallWatch, Guarded
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
-from fmu_mesh.instances.fmi.state import Bookkeeping
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.fmu_instance import Bookkeeping, FmuInstance
+from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.instances.instance_wrapper import AroundInstance, packed, unpacked
 from fmu_mesh.node.inputs import TimedInputs

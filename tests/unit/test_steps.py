@@ -13,12 +13,14 @@ from typing import cast
 import pytest
 
 from fmu_mesh.errors import StepFailed, TerminationRequested
-from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.calls import cffi_function
 from fmu_mesh.instances.fmi.co_simulation.discarded_steps import SMALLEST, take_sub_steps
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import LinearInputs
-from fmu_mesh.instances.fmi.co_simulation.fmi3_steps import Fmi3Steps
+from fmu_mesh.instances.fmi.co_simulation.fmi3 import Fmi3Steps
+from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
 from fmu_mesh.instances.fmi.fmu_values import DISCARD
+from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings.native import Said
 from fmu_mesh.rings.ring import Ring

@@ -10,7 +10,9 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.instances.fmi import missing_libraries, open_instance, read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.archive.system_libraries import missing_libraries
+from fmu_mesh.instances.fmi.opening import open_instance
 from fmus.build import find_compiler
 from tests.fmus.helpers import FMUS, NO_COMPILER
 from tests.fmus.packing import repacked

@@ -9,7 +9,8 @@ from typing import Literal
 import pytest
 
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.instances.fmi import Fmi2Instance, read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.node.inputs import TimedInputs, set_input
 from fmu_mesh.node.stepping import Runner

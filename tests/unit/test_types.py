@@ -14,7 +14,9 @@ import pytest
 
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import CallRefused, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
-from fmu_mesh.instances.fmi import FmuInstance, open_instance, read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
+from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout

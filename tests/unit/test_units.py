@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.fmi import read_description
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.pictures.plan_page import plan_page
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.variables.units import BaseUnit, Linear, conversion

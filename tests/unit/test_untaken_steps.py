@@ -11,8 +11,9 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed
-from fmu_mesh.instances.fmi import open_instance, read_description, stepped
+from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import TakesDerivatives
+from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import StepOptions
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid

@@ -45,11 +45,7 @@ class Buffer(Protocol):
 class NumberBuffer:
     """Numbers whose C type differs from that of a row: a Boolean of FMI 2.0 is an `int`.
 
-    Args:
-        type_: the type of the elements.
-        dtype: the C type.
-        count: how many.
-        signs: -1 for an FMI 1.0 alias with the opposite sign, otherwise 1; None if all are 1.
+    ``signs`` are -1 for an FMI 1.0 alias with the opposite sign, otherwise 1; None if all are 1.
     """
 
     def __init__(
@@ -86,10 +82,7 @@ class NumberBuffer:
     def moves(self, base: RowBase, place: int, *, load: bool) -> list[Move]:
         """What `load`, or `values`, does: as moves of the library, one for each run of elements with the same sign.
 
-        Args:
-            base: a row of a ring.
-            place: of the elements in this row, in bytes.
-            load: from the row to the memory; False: from the memory to the row.
+        ``place`` is that of the elements in a row, in bytes. ``load`` moves from the row to the memory, otherwise back.
         """
         made, first = [], 0
         signs = [1] * self._memory.size if self._signs is None else self._signs.tolist()

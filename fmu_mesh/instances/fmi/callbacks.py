@@ -161,16 +161,14 @@ def _fmi1_callbacks() -> fmi1CallbackFunctions:
     return callbacks
 
 
-def _fmi3_logger() -> Any:  # noqa: ANN401 what FMPy makes a callback of
-    if _library is not None:
-        return ctypes.cast(_library.log_fmi3, ctypes.c_void_p).value
-    return lambda address, status, category, text: _log(address, None, status, category, text)
-
-
 _PASS_ON: Final = ctypes.CFUNCTYPE(None, ctypes.POINTER(_Message))(_pass_on)
 _library: Final = ctypes.PyDLL(path) if (path := load_library()) is not None else None
 if _library is not None:
     _library.pass_messages_to(_PASS_ON)
 _FMI2_CALLBACKS = _fmi2_callbacks()
 FMI1_CALLBACKS = _fmi1_callbacks()
-FMI3_LOGGER: Final = _fmi3_logger()
+FMI3_LOGGER: Final = (
+    ctypes.cast(_library.log_fmi3, ctypes.c_void_p).value
+    if _library is not None
+    else lambda address, status, category, text: _log(address, None, status, category, text)
+)

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from cffi import FFI
+from fmpy.fmi1 import FMICallException
 
 from ..call_guard import call_named
 from .fmu_library import FmuLibrary
@@ -23,6 +24,7 @@ __all__ = [
     "RowPointers",
     "address_of",
     "cffi_function",
+    "checked_function",
     "declared",
     "memory",
     "pointer",
@@ -34,6 +36,7 @@ Pointer: TypeAlias = Any
 Function: TypeAlias = Callable[..., int]
 """A function of an FMU that returns its status."""
 
+_WARNING = 1
 _ffi = FFI()
 
 
@@ -73,12 +76,29 @@ def declared(library: FmuLibrary, name: str, prototype: Any) -> Any:  # noqa: AN
     return ctypes.cast(getattr(library, name), prototype)
 
 
+def checked_function(library: FmuLibrary, symbols: str, name: str, prototype: Any) -> Any:  # noqa: ANN401 as above
+    """As `declared`, but a status above warning is an exception, as it is where FMPy calls.
+
+    Its symbol is ``symbols`` and ``name``; ``symbols`` begins with the model identifier in FMI 1.0.
+
+    Raises:
+        FMICallException: by the function: the FMU returned a status above warning.
+    """
+
+    def check(status: int, _function: object, _arguments: object) -> int:
+        if status > _WARNING:
+            raise FMICallException(function=symbols.rpartition("_")[2] + name, status=status)
+        return status
+
+    function = declared(library, symbols + name, prototype)
+    function.errcheck = check
+    return function
+
+
 def cffi_function(function: Function, declaration: str) -> Function:
     """A function of a loaded library, called through cffi.
 
-    Args:
-        function: the function as ctypes has it.
-        declaration: the C type of a pointer to it, such as ``int (*)(void *, double)``.
+    ``declaration`` is the C type of a pointer to it, such as ``int (*)(void *, double)``.
     """
     address = ctypes.cast(function, ctypes.c_void_p).value  # type: ignore[arg-type]  # it is one of ctypes' own
     called: Function = _ffi.cast(declaration, address or 0)
@@ -93,9 +113,7 @@ def pointer(address: int | None) -> Pointer:
 class RowPointers(dict[int, Pointer]):
     """Pointers to the rows of an array by row number; a pointer is made when it is first used.
 
-    Args:
-        address: address of row 0.
-        row_size: distance of two rows in bytes.
+    ``address`` is that of row 0, ``row_size`` the distance of two rows in bytes.
     """
 
     def __init__(self, address: int, row_size: int) -> None:

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from fmpy.fmi3 import fmi3Float64, fmi3IntervalQualifier, fmi3ValueReference
 
+from ...simtime import resolvable
 from ...variables.model_description import Clock
-from .model_exchange.solver import resolvable
 
 __all__ = ["NO_CLOCKS", "Clocks"]
 
@@ -24,10 +24,6 @@ _APERIODIC: Final = ("changing", "countdown")
 
 class Clocks:
     """The clocks of one instance.
-
-    Args:
-        fmu: FMPy's object, instantiated.
-        clocks: as the model description has them.
 
     Attributes:
         next_tick: time of the next tick of an input clock in s; infinite if there is none.

@@ -1,52 +1,82 @@
-"""The life cycle of an FMU instance, the same for all FMI versions: files, states, messages and errors.
+"""An FMU instance, the same for all FMI versions: life cycle, values by name and in rows, states, messages, errors.
 
-A version of FMI and a kind of FMU add the calls: how an instance is made, initialized, stepped and freed.
+A version of FMI (`fmi_versions`) adds how an instance is made and initialized, a kind of FMU (`co_simulation`,
+`model_exchange`) how it is stepped. A state is that of the FMU and our own `Bookkeeping`; FMI 1.0 has no states.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
-from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
+import msgspec
 from fmpy.fmi1 import FMICallException
 
-from ...errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from ...rings.native import Said
-from ...variables.model_description import ModelDescription
+from ...errors import FmuError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
+from ...rings.native import RowBase, Said, Stage
+from ...rings.ring import Ring
+from ...simtime import TimeGrid
+from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_conversion import to_value
-from ...variables.value_types import Value
+from ...variables.value_types import Value, VariableType, flattened, nested
+from ..call_guard import call_named, doing
 from ..contract import LogMessage
+from ..instance_wrapper import of_kind, packed, unpacked
 from ..kept_models import KeptModels
 from .archive.archive import Terms
 from .archive.system_libraries import missing_libraries
-from .callbacks import recall, register, tell_counted, unregister
-from .calls import pointer
-from .fmu_values import FATAL, OK, FmuValues, status_name
+from .buffers import BinaryBuffer, Buffer
+from .callbacks import recall, register, register_component, tell_counted, unregister
+from .calls import RowPointers, cffi_function, declared, memory, pointer
+from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
-from .state import Bookkeeping, KeepsFmuState
 from .step_options import StepOptions
 
-__all__ = ["FmuInstance", "LogSink"]
-
+__all__ = ["Bookkeeping", "FmuInstance", "LogSink"]
 
 LogSink = Callable[[LogMessage], None]
+T = TypeVar("T")
+
+_DOING: Final[dict[Verb, str]] = {"Set": doing(Stage.SETTING), "Get": doing(Stage.GETTING)}
+_OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
-class FmuInstance(KeepsFmuState, FmuValues):
-    """One instance of an FMU; see `fmu_mesh.instances.contract.Instance` for the call sequence.
+class Bookkeeping(msgspec.Struct, frozen=True):
+    """What we know about an instance besides its FMU state.
 
-    Args:
-        path: the .fmu file.
-        name: instance name.
-        description: what `read_description` returned for it.
-        folder: an existing private folder; the FMU is extracted below it.
-        log: called with every log message, on the thread that calls the FMU.
-        terms: limits and checks for the archive.
-        options: how the instance is stepped.
-        kept: has what earlier instances of this name have left, and gets what this one leaves.
+    Attributes:
+        step: own steps done; -1 in or before Initialization Mode.
+        time: the time of the FMU in s, where it does not follow from the step.
+        next_event: time of its next time event in s; None if there is none.
+        row: its held inputs.
+        ticks: the clocks; see `Clocks.place`.
+        last_event: time of its last event mode in s, where the steps depend on it; None if there was none.
+    """
+
+    step: int
+    time: float | None = None
+    next_event: float | None = None
+    row: tuple[bytes | list[Any], ...] = ()
+    ticks: tuple[float | None, ...] = ()
+    last_event: float | None = None
+
+
+class FmuState(NamedTuple):
+    """One state of one instance; it belongs to this instance until `FmuInstance.free_state`."""
+
+    handle: Any
+    kept: Bookkeeping
+
+
+class FmuInstance(ABC):
+    """One instance of an FMU; see `Instance` and `KeepsState` in `fmu_mesh.instances.contract`.
+
+    Its arguments are those of `Opening`, and the ``terms`` of its archive and the ``options`` of its steps.
 
     Raises:
         LoadFailed: the FMU cannot be extracted, loaded or instantiated.
@@ -57,6 +87,12 @@ class FmuInstance(KeepsFmuState, FmuValues):
 
     _component: int
     """The address of the instance, for functions called through ctypes; ``_self`` is the same for cffi."""
+
+    _solver = ""
+    """What the error of a solver begins with."""
+
+    _description: ModelDescription
+    _variables: Mapping[str, Variable]
 
     def __init__(  # noqa: PLR0913, PLR0917 what an instance is made of; all of it is named where it is called
         self,
@@ -73,22 +109,23 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._options = options
         self._log = log
         self._last_messages: list[str] = []
-        self._said = Said(step=-1, quiet_until=math.inf)
+        self._said = Said(step=-1, quiet_until=math.inf)  # how far the instance is
         self._state: Literal["instantiated", "initialization", "stepping", "failed", "closed"] = "instantiated"
         self._live = False
-        self._keep = []
+        self._keep: list[object] = []
         self._describe(description)
+        prefix = self._functions.values.prefix
+        # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
+        self._symbols = f"{description.model_identifier}_{prefix}" if prefix == "fmi" else prefix
         self._kept = kept
         fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding)
-        self._model = LoadedFmu(fmu, folder) if kept is None else LoadedFmu.kept(fmu, kept)
+        left = cast("LoadedFmu | None", kept.take(name, fmu.key)) if kept is not None else None
+        self._model = left or LoadedFmu(fmu, folder if kept is None else kept.folder)
         try:
             self._model.load()
             self._fmu = self._model.calls
             self._check_functions()
             self._instantiate()
-            self._component = self._fmu.component
-            self._self = pointer(self._component)
-            self._instantiated()
             self._live = True
         except Exception as error:
             self._state = "failed"
@@ -127,6 +164,46 @@ class FmuInstance(KeepsFmuState, FmuValues):
         self._exit_initialization()
         self._state = "stepping"
 
+    def set_values(self, values: Mapping[str, Value]) -> None:
+        """Set variables by name."""
+        self._check_live()
+        for type_, names in self._by_type(values).items():
+            variables = [self._variables[name] for name in names]
+            buffer = self._functions.values.buffer(type_, variables)
+            self._load(buffer, [e for v in variables for e in flattened(values[v.name], len(v.shape))], names)
+            self._transfer("Set", type_, variables, buffer)
+
+    def get_values(self, names: Sequence[str]) -> list[Value]:
+        """Current values of variables by name."""
+        self._check_live()
+        values: dict[str, Value] = {}
+        for type_, members in self._by_type(names).items():
+            variables = [self._variables[name] for name in members]
+            buffer = self._functions.values.buffer(type_, variables)
+            self._transfer("Get", type_, variables, buffer)
+            elements, first = self._elements(buffer, members), 0
+            for variable in variables:
+                values[variable.name] = nested(elements[first : first + variable.size], variable.shape)
+                first += variable.size
+        return [values[name] for name in names]
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
+        self._check_live()
+        self._start_time = grid.start_time
+        self._base_step_size = grid.step_size
+        self._points = points
+        self._step_size = points * grid.step_size
+        self._said.note(step=step)
+        self._input_mask = inputs.mask
+        self._keep = [inputs, *outputs]
+        self._setters = self._part_calls("Set", inputs, RowBase.FIXED)
+        getters = [
+            call for base, ring in zip(_OWN_ROWS, outputs, strict=False) for call in self._part_calls("Get", ring, base)
+        ]
+        self._getters = sorted(getters, key=_is_buffered)
+        self._read_outputs(step)
+
     @abstractmethod
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
@@ -154,6 +231,39 @@ class FmuInstance(KeepsFmuState, FmuValues):
         """From any thread, when the process is about to be ended: remove the extracted files."""
         self._model.remove_files()
 
+    def get_state(self) -> FmuState:
+        """See `KeepsState`."""
+        self._check_state(self.description.can_get_and_set_state, "get and set its state")
+        return FmuState(self._on_state(self._fmu.getFMUState), self._bookkeeping())
+
+    def set_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        own = of_kind(FmuState, state)
+        self._on_state(lambda: self._fmu.setFMUState(own.handle))
+        self._restore(own.kept)
+
+    def free_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        own = of_kind(FmuState, state)
+        with suppress(StepFailed):  # it takes memory, and nothing else
+            self._on_state(lambda: self._fmu.freeFMUState(own.handle))
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `KeepsState`."""
+        self._check_state(self.description.can_serialize_state, "serialize its state")
+        own = of_kind(FmuState, state)
+        return packed(own.kept, self._on_state(lambda: self._fmu.serializeFMUState(own.handle)))
+
+    def deserialize_state(self, data: bytes) -> FmuState:
+        """See `KeepsState`.
+
+        Raises:
+            FmuMeshError: ``data`` is no state of an instance.
+        """
+        self._check_state(self.description.can_serialize_state, "serialize its state")
+        kept, rest = unpacked(data, Bookkeeping, self.name)
+        return FmuState(self._on_state(lambda: self._fmu.deserializeFMUState(rest)), kept)
+
     def logged(self, status: int, category: bytes, message: bytes, counted: int) -> None:
         """See `Logged`; the last messages become part of an error that follows."""
         if status > OK:
@@ -168,19 +278,16 @@ class FmuInstance(KeepsFmuState, FmuValues):
         """See `Logged`."""
         self._last_messages = [*self._last_messages[-2:], message.decode(errors="replace").strip()]
 
-    # --- what a version of FMI adds
+    # --- what a version of FMI and a kind of FMU add
 
-    @abstractmethod
-    def _make_instance(self) -> None:
-        """Make the instance; any exception says why it cannot be made."""
-
-    def _instantiate(self) -> None:
-        """Make the instance, unless there is one that was reset."""
+    def _instantiate(self, **arguments: object) -> None:
+        """Make the instance with these arguments for FMPy, unless one was reset; look up what the steps need."""
         register(self.name, self, id(self._model))
-        self._model.instantiate(self._make_instance)
-
-    def _instantiated(self) -> None:
-        """Look up what the steps need, now that the instance exists."""
+        self._model.instantiate(**arguments)
+        self._component = self._fmu.component
+        self._self = pointer(self._component)
+        if not self._functions.values.sized:  # FMI 3.0 passes no component to its logger
+            register_component(self._component, self)
 
     @abstractmethod
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
@@ -194,10 +301,10 @@ class FmuInstance(KeepsFmuState, FmuValues):
         """End the simulation."""
         self._fmu.terminate()
 
-    def _release(self) -> None:
+    def _release(self) -> None:  # noqa: B027 most have allocated nothing
         """Free what this object has allocated in the FMU."""
 
-    # --- shared by the versions
+    # --- its life
 
     def _end_run(self, *, resets: bool) -> bool:
         """End the simulation; with ``resets`` also reset the instance, and return whether that was done."""
@@ -269,11 +376,14 @@ class FmuInstance(KeepsFmuState, FmuValues):
             msg = f"instance '{self.name}' is closed"
             raise ValueError(msg)
 
-    def _initializing(self, function: str, call: Callable[[], object]) -> None:
+    def _checked(self, call: Callable[[], T]) -> T:
+        """Call the FMU; if it or its solver fails, that is an error of this instance."""
         try:
-            call()
+            return call()
         except FMICallException as error:
-            raise self._failed(function, status=error.status) from error
+            raise self._failed(error.function, status=error.status) from error
+        except SolverFailed as error:
+            raise self._failed(f"{self._solver}{error}") from error
 
     def _note(self, status: int) -> None:
         """After fatal, no function of the instance is called, not even to free it (FMI 2.0, 2.1.3; 3.0, 2.2.3)."""
@@ -292,7 +402,149 @@ class FmuInstance(KeepsFmuState, FmuValues):
         tell_counted(self)  # a node closes its instances after it has told its failure
         return error
 
+    def _end_requested(self) -> TerminationRequested:
+        return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+
     def _message(self) -> str:
         recall()
         messages, self._last_messages = self._last_messages, []
         return f"; the FMU says: {' | '.join(messages)}." if messages else "; the FMU gave no message."
+
+    # --- its states
+
+    def _check_state(self, can: bool, what: str) -> None:  # noqa: FBT001 a capability flag
+        if not can:
+            raise FmuError(f"the FMU cannot {what}, as its model description says", instance=self.name)
+
+    def _on_state(self, call: Callable[[], T]) -> T:
+        """Call the FMU; if it fails, the instance may go on."""
+        self._check_live()
+        try:
+            return call()
+        except FMICallException as error:
+            self._note(error.status)
+            raise StepFailed(f"{error.function} returned {status_name(error.status)}", instance=self.name) from error
+
+    # --- its values
+
+    def _time_of(self, step: int) -> float:
+        """The time in s at which own step ``step`` begins: one multiplication, as in `TimeGrid.time`."""
+        return self._start_time + step * self._points * self._base_step_size
+
+    def _part_calls(self, verb: Verb, ring: Ring, base: RowBase) -> list[PartCall]:
+        """The calls that move a row of a ring; those that need no buffer are first."""
+        calls, functions = [], self._functions.values
+        for number, part in enumerate(ring.layout.parts):
+            variables = [self._variables[column.name] for column in part.columns]
+            array, offset = ring.parts[number], ring.offsets[number]
+            is_direct = functions.is_direct(part.type, variables)
+            references = (ctypes.c_uint * len(variables))(*(variable.value_reference for variable in variables))
+            calls.append(
+                PartCall(
+                    type=part.type,
+                    variables=variables,
+                    array=array,
+                    base=base,
+                    place=ring.address + offset if base == RowBase.FIXED else offset,
+                    sizes=(part.width,) if functions.sized else (),
+                    buffer=None if is_direct else functions.buffer(part.type, variables),
+                    function=cffi_function(self._function(verb, part.type), functions.declaration),
+                    references=memory(references),
+                    rows=RowPointers(array.ctypes.data, array.strides[0]),
+                )
+            )
+        return sorted(calls, key=_is_buffered)
+
+    def _set_inputs(self, step: int) -> None:
+        """Set the inputs of row ``step``, call by call."""
+        self._set_row(step & self._input_mask, self._setters)
+
+    def _set_row(self, slot: int, setters: Sequence[PartCall]) -> None:
+        for part in setters:
+            if part.buffer is None:
+                self._call_part("Set", part, slot)
+            else:
+                self._load(part.buffer, part.array[slot], part.names)
+                self._transfer("Set", part.type, part.variables, part.buffer)
+
+    def _read_outputs(self, step: int) -> None:
+        """Write the outputs to row ``step``, call by call."""
+        for part in self._getters:
+            slot = step & (len(part.array) - 1)
+            if part.buffer is None:
+                self._call_part("Get", part, slot)
+            else:
+                self._transfer("Get", part.type, part.variables, part.buffer)
+                part.array[slot] = self._elements(part.buffer, part.names)
+
+    def _call_part(self, verb: Verb, part: PartCall, slot: int) -> None:
+        """Call a function of the FMU on the memory of a ring."""
+        arguments = self._self, part.references, len(part.variables), part.rows[slot], *part.sizes
+        status = call_named(_DOING[verb], part.function, *arguments)
+        if status > WARNING:
+            raise self._part_failed(verb, part, status)
+
+    def _part_failed(self, verb: Verb, part: PartCall, status: int) -> StepFailed | InitializationFailed:
+        """The error for a getter or setter of a row that has returned a status above warning."""
+        if part.buffer is None:
+            return self._failed(_DOING[verb], status=status)
+        return self._transfer_failed(verb, part.type, part.variables, status)
+
+    def _transfer(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> None:
+        """Call the getter or setter of a type for some variables, once."""
+        status = call_named(self._function_name(verb, type_), self._call, verb, type_, variables, buffer)
+        if status > WARNING:
+            raise self._transfer_failed(verb, type_, variables, status)
+
+    def _call(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> int:
+        count = len(variables)
+        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
+        values = [buffer.sizes_address, buffer.address] if isinstance(buffer, BinaryBuffer) else [buffer.address]
+        if self._functions.values.sized:
+            values.append(sum(variable.size for variable in variables))
+        return self._function(verb, type_)(self._component, ctypes.addressof(references), count, *values)
+
+    def _function_name(self, verb: Verb, type_: VariableType) -> str:
+        """The name of a getter or setter, for errors."""
+        functions = self._functions.values
+        return functions.prefix + functions.name(verb, type_)
+
+    def _function(self, verb: Verb, type_: VariableType) -> Callable[..., int]:
+        functions = self._functions.values
+        name = self._symbols + functions.name(verb, type_)
+        function: Callable[..., int] = declared(self._fmu.dll, name, functions.prototype(type_))
+        return function
+
+    def _transfer_failed(
+        self, verb: Verb, type_: VariableType, variables: Sequence[Variable], status: int
+    ) -> StepFailed | InitializationFailed:
+        names = [variable.name for variable in variables]
+        odd = next((v for v in variables if verb == "Set" and not v.settable_before_start), None)
+        hint = None
+        if odd is not None:
+            hint = f"FMI does not allow setting '{odd.name}', {odd.role}: leave its start value out."
+        what = f"{self._function_name(verb, type_)} of {', '.join(names)}"
+        return self._failed(what, status=status, variable=names[0] if len(names) == 1 else None, hint=hint)
+
+    def _load(self, buffer: Buffer, elements: Any, names: Sequence[str]) -> None:  # noqa: ANN401 a list or an array
+        try:
+            buffer.load(elements)
+        except OverflowError as error:
+            raise self._failed(f"{', '.join(names)} cannot be set: {error}") from error
+
+    def _elements(self, buffer: Buffer, names: Sequence[str]) -> list[Any]:
+        try:
+            elements = buffer.values()
+        except OverflowError as error:
+            raise self._failed(f"{', '.join(names)} cannot be read: {error}") from error
+        return elements.tolist() if hasattr(elements, "tolist") else list(elements)
+
+    def _by_type(self, names: Sequence[str] | Mapping[str, Value]) -> dict[VariableType, list[str]]:
+        groups: dict[VariableType, list[str]] = {}
+        for name in names:
+            groups.setdefault(self._variables[name].type, []).append(name)
+        return groups
+
+
+def _is_buffered(part: PartCall) -> bool:
+    return part.buffer is not None

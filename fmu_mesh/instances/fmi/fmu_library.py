@@ -97,10 +97,6 @@ _PROCESS: Final = _Library(None)
 class FmuLibrary(_Library):
     """The library of one FMU.
 
-    Args:
-        path: its file, in an FMU that was extracted for it.
-        deep_binding: whether it finds its own functions and variables before those of the process.
-
     Attributes:
         missing: the functions that were asked for and that it does not have.
 

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import chdir, suppress
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException
 
 from ...variables.model_description import ModelDescription
-from ..kept_models import KeptModels
 from ..process_end import process_ends
 from ..process_state import FOLDER
 from .archive.archive import Terms
@@ -23,7 +22,7 @@ from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls
 from .fmu_library import FmuLibrary, calling
-from .fmu_values import FATAL
+from .fmu_values import FATAL, ValueFunctions
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
 
@@ -43,30 +42,21 @@ class FmuFunctions(NamedTuple):
 
     Attributes:
         library: FMPy's class for them.
-        prefix: the prefix of their names, such as `fmi2`.
+        values: those that get and set values.
         free: FMPy's method that frees an instance.
         needed: the functions, without their prefix, that every run needs.
         names: FMI functions whose name does not follow from the name of FMPy's method, by that name.
     """
 
     library: type[Any]
-    prefix: str
+    values: ValueFunctions
     free: str
     needed: tuple[str, ...]
     names: Mapping[str, str] = {}
 
 
 class FmuToLoad(NamedTuple):
-    """What is loaded.
-
-    Attributes:
-        path: the .fmu file.
-        name: instance name.
-        description: what `read_description` returned for it.
-        terms: limits and checks for the archive.
-        functions: of this version of FMI.
-        deep_binding: whether its library finds its own functions and variables before those of the process.
-    """
+    """What is loaded; see `FmuInstance`, and `StepOptions` for ``deep_binding``."""
 
     path: Path
     name: str
@@ -85,9 +75,7 @@ class FmuToLoad(NamedTuple):
 class LoadedFmu:
     """One FMU with a folder and a library of its own.
 
-    Args:
-        fmu: what is loaded.
-        folder: an existing private folder; the FMU is extracted below it.
+    It is extracted below ``folder``, an existing private folder.
 
     Attributes:
         key: what it was made from.
@@ -107,11 +95,6 @@ class LoadedFmu:
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
         self._changes_process: bool | None = None
 
-    @classmethod
-    def kept(cls, fmu: FmuToLoad, kept: KeptModels) -> LoadedFmu:
-        """The FMU as the last instance of this name has left it, where it can be used again; if not, a new one."""
-        return cast("LoadedFmu | None", kept.take(fmu.name, fmu.key)) or cls(fmu, kept.folder)
-
     def load(self) -> None:
         """Load the library, if it is not loaded."""
         if self.calls is not None:
@@ -128,7 +111,7 @@ class LoadedFmu:
                 unzipDirectory=str(self._folder),
                 instanceName=self._fmu.name,
             )
-        self.calls = FmpyCalls(loaded, functions.prefix, functions.names)
+        self.calls = FmpyCalls(loaded, functions.values.prefix, functions.names)
 
     @property
     def changes_process(self) -> bool:
@@ -137,14 +120,14 @@ class LoadedFmu:
             self._changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
         return self._changes_process
 
-    def instantiate(self, make: Callable[[], None]) -> None:
-        """Give the FMU to its next user; ``make`` makes an instance, if none is there that was reset.
+    def instantiate(self, **arguments: object) -> None:
+        """Make an instance with these arguments for FMPy, if none is there that was reset.
 
         Raises:
             RuntimeError: there is no instance.
         """
         if not self.has_instance:
-            make()
+            self.calls.instantiate(loggingOn=False, **arguments)
             self.has_instance = bool(self.calls.component)
             if not self.has_instance:
                 raise RuntimeError(f"{self._fmu.functions.names['instantiate']} returned no instance")

@@ -14,7 +14,7 @@ from .co_simulation.fmi1 import Fmi1Instance
 from .co_simulation.fmi2 import Fmi2Instance
 from .co_simulation.fmi3 import Fmi3Instance
 from .fmu_instance import FmuInstance, LogSink
-from .model_exchange.model_instances import Fmi1ModelInstance, Fmi2ModelInstance, Fmi3ModelInstance
+from .model_exchange.continuous import Fmi1ModelInstance, Fmi2ModelInstance, Fmi3ModelInstance
 from .step_options import StepOptions
 
 __all__ = ["open_instance", "stepped"]

@@ -54,11 +54,6 @@ def check_gazebo_classic() -> None:
 class GazeboClassicInstance:
     """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
 
-    Args:
-        path: the SDF file.
-        name: instance name.
-        config: its section of the configuration.
-
     Raises:
         LoadFailed: the world cannot be read, or Gazebo does not start or does not load it.
     """
@@ -103,10 +98,7 @@ class GazeboClassicInstance:
         return self._world.description
 
     def enter_initialization(
-        self,
-        start_time: float,  # noqa: ARG002  as in the Protocol
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set the start values of inputs; the world starts as its file says."""
         self.set_values(start_values)

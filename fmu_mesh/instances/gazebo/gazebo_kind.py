@@ -21,11 +21,7 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
     expected = "an SDF world for Gazebo classic 11"
 
     def describe(
-        self,
-        path: Path,
-        section: GazeboClassicConfig,
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-        tell: Callable[[str], None],  # noqa: ARG002  reading a world is fast
+        self, path: Path, section: GazeboClassicConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """Read the world; its joints and links are the variables. Gazebo is not needed for that."""
         from .gazebo_world import load_gazebo_world  # noqa: PLC0415  only where there is a world

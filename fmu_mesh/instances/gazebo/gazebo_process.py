@@ -19,6 +19,12 @@ from collections.abc import Sequence
 
 __all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
 
+# Which processes meet here: the node and one Gazebo, over pipes (ADR 21). Gazebo ends when its standard input ends, so
+# it needs no signal when the node is killed. What it writes to standard error goes to a file: nobody reads it during a
+# step, and a full pipe would stop Gazebo. Each answer has a deadline of its own, by `select`. A command has none: if
+# Gazebo hangs while one is written that the pipe cannot take as a whole, the deadline of the step ends the node
+# (`call_guard`).
+
 PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
 """The environment variable with the command of the lock-step program, as a shell would split it."""
 
@@ -80,7 +86,6 @@ class GazeboProcess:
         links: scoped names.
 
     Attributes:
-        version: of Gazebo, and its engine.
         state: the last state, as the protocol has it.
 
     Raises:
@@ -104,7 +109,7 @@ class GazeboProcess:
             parts = [f"joint {name} {'free' if free else 'limited'}\n" for name, free in joints]
             parts += [f"link {name}\n" for name in links]
             self._send(b"world %d\n%b%b" % (len(text), text, "".join([*parts, "go\n"]).encode()))
-            self.version = self._answer(_START_S).removeprefix("gazebo ")
+            self._answer(_START_S)  # the versions of Gazebo and its engine
             self.state = self._numbers(_START_S)
             stack.pop_all()
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -121,17 +120,13 @@ def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[
         for joint in model.element.findall("joint")
         if joint.get("type") in {"revolute", "prismatic"}
     ]
-    names = _names([scoped for scoped, _ in found])
-    return tuple(
-        GazeboJoint(
-            scoped=scoped,
-            name=name,
-            revolute=joint.get("type") == "revolute",
-            effort_limit=math.inf if name in free else _effort_limit(joint, path),
-            free=name in free,
-        )
-        for name, (scoped, joint) in zip(names, found, strict=True)
-    )
+    joints = []
+    for name, (scoped, joint) in zip(_names([scoped for scoped, _ in found]), found, strict=True):
+        # SDF has a negative number where there is no limit.
+        limit = -1.0 if name in free else _number(joint.findtext("axis/limit/effort"), -1.0, path)
+        revolute = joint.get("type") == "revolute"
+        joints.append(GazeboJoint(scoped, name, revolute, limit if limit >= 0.0 else math.inf, name in free))
+    return tuple(joints)
 
 
 def _links(models: Sequence[GazeboModel]) -> tuple[GazeboLink, ...]:
@@ -144,12 +139,6 @@ def _names(scoped: list[str]) -> list[str]:
     last = [name.rpartition("::")[2] for name in scoped]
     counts = Counter(last)
     return [short if counts[short] == 1 else full for short, full in zip(last, scoped, strict=True)]
-
-
-def _effort_limit(joint: ET.Element, path: Path) -> float:
-    """SDF has a negative number where there is no limit."""
-    limit = _number(joint.findtext("axis/limit/effort"), -1.0, path)
-    return limit if limit >= 0.0 else math.inf
 
 
 def _number(text: str | None, default: float, path: Path) -> float:

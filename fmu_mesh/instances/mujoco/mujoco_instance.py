@@ -29,6 +29,7 @@ from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
+from ..contract import KeepsStateAsBytes
 from .mujoco_section import MujocoConfig
 from .mujoco_world import MujocoVariable, engine, load_world, warnings
 from .rendering import Picture
@@ -46,15 +47,8 @@ _OF_JOINTS = frozenset({"position", "velocity", "acceleration", "effort_applied"
 _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
 
 
-class MujocoInstance:
+class MujocoInstance(KeepsStateAsBytes):
     """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
-
-    Args:
-        path: the model file (MJCF or URDF).
-        name: instance name.
-        config: its section of the configuration.
-        log: called with every message of the engine.
-        picture: a film or a window that shows the world after every own step.
 
     Raises:
         LoadFailed: MuJoCo is not installed, or cannot load the model.
@@ -120,10 +114,7 @@ class MujocoInstance:
         return self._world.description
 
     def enter_initialization(
-        self,
-        start_time: float,
-        stop_time: float | None,  # noqa: ARG002  as in the Protocol
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Start from the keyframe or the model's own position, then set ``start_values`` (time in s)."""
         if self._world.keyframe is not None:
@@ -159,8 +150,10 @@ class MujocoInstance:
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         self._start_time, self._points, self._base = grid.start_time, points, grid.step_size
-        self._substeps = self._config.physics_steps or _fewest_steps(points * grid.step_size, self._timestep)
-        self._model.opt.timestep = points * grid.step_size / self._substeps
+        step_size, longest = points * grid.step_size, self._timestep
+        fewest = max(1, steps_between(0.0, step_size, longest) or math.ceil(step_size / longest))
+        self._substeps = self._config.physics_steps or fewest
+        self._model.opt.timestep = step_size / self._substeps
         self._step, self._last_step = step, grid.last_point // points
         self._inputs = inputs
         taken = [self._entries[name] for name in inputs.layout.names]
@@ -222,18 +215,6 @@ class MujocoInstance:
             size += part.size
         acting = np.flatnonzero(self._own["wrench"]) // 6
         self._driven = tuple(sorted({*self._driven, *acting.tolist()}))
-
-    def free_state(self, state: object) -> None:
-        """Nothing to free: a state is bytes."""
-
-    def serialize_state(self, state: object) -> bytes:
-        """The state as bytes, which it is."""
-        assert isinstance(state, bytes)
-        return state
-
-    def deserialize_state(self, data: bytes) -> object:
-        """The state of these bytes, which they are; `set_state` checks them."""
-        return data
 
     def close(self) -> None:
         """End the film or window. Never raises; may be called twice."""
@@ -363,8 +344,3 @@ def _grouped(entries: Sequence[MujocoVariable]) -> list[tuple[str, NDArray[np.in
 def _bodies_of(entries: Iterable[MujocoVariable]) -> set[int]:
     """The bodies whose velocities have to be computed for these variables."""
     return {entry.index // 3 for entry in entries if entry.where in _OF_VELOCITIES}
-
-
-def _fewest_steps(step_size: float, longest: float) -> int:
-    """The fewest equal steps that fill ``step_size`` and are not longer than ``longest`` (both in s)."""
-    return max(1, steps_between(0.0, step_size, longest) or math.ceil(step_size / longest))

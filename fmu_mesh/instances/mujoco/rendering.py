@@ -85,10 +85,6 @@ class Film:
     A film is unreadable until it is complete. Until then, its file is `<name>.unfinished.mp4` in the same folder. A run
     that ends before the first step writes no film, and does not touch an older one.
 
-    Args:
-        path: the file; its suffix says the format.
-        instance: for errors.
-
     Raises:
         LoadFailed: the renderer cannot be started, or the file not be written.
     """
@@ -182,7 +178,7 @@ class Window:
         self._data: Any = None
         self._last = 0.0
 
-    def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401, ARG002  mujoco has no types; the Protocol's
+    def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401  mujoco has no types
         """Bring the window up to date, if its last picture is old enough."""
         now = time.monotonic()
         if now - self._last < 1.0 / WINDOW_RATE:

@@ -26,18 +26,16 @@ from ...system.layout import Layout
 from ...variables.model_description import ModelDescription, Value
 from ...variables.value_conversion import to_value
 from ...variables.value_types import is_float
+from ..contract import KeepsStateAsBytes
 from .onnx_model import Array, OnnxModel, reason_of
 
 __all__ = ["OnnxInstance"]
 
 
-class OnnxInstance:
+class OnnxInstance(KeepsStateAsBytes):
     """One model; see `fmu_mesh.instances.contract.Instance` for the call sequence.
 
-    Args:
-        name: instance name.
-        model: what is computed.
-        not_finite: whether NaN is an error.
+    With ``not_finite`` as `record`, NaN is no error.
     """
 
     def __init__(self, name: str, model: OnnxModel, not_finite: Literal["stop", "record"] | None = None) -> None:
@@ -61,10 +59,7 @@ class OnnxInstance:
         return self._model.description
 
     def enter_initialization(
-        self,
-        start_time: float,  # noqa: ARG002  a model knows no time
-        stop_time: float | None,  # noqa: ARG002  as above
-        start_values: Mapping[str, Value],
+        self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """Set ``start_values``."""
         self.set_values({name: to_value(value, self._variables[name]) for name, value in start_values.items()})
@@ -94,14 +89,7 @@ class OnnxInstance:
             self._follow()
         return [self._values.value(0, name) for name in names]
 
-    def bind(
-        self,
-        inputs: Ring,
-        outputs: Sequence[Ring],
-        grid: TimeGrid,  # noqa: ARG002  a model knows no time
-        points: int,  # noqa: ARG002  as above
-        step: int = 0,
-    ) -> None:
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Choose the rings of `do_step`, and write the current outputs to row ``step``."""
         self._takes = [(self._own(name), *_columns(inputs, name), inputs.mask) for name in inputs.layout.names]
         self._gives = [
@@ -140,18 +128,6 @@ class OnnxInstance:
             raise StepFailed(f"{len(state)} bytes are no state of this model", instance=self.name)
         for part, values in zip(own, parts, strict=True):
             part[...] = values
-
-    def free_state(self, state: object) -> None:
-        """Nothing to free: a state is bytes."""
-
-    def serialize_state(self, state: object) -> bytes:
-        """The state as bytes, which it is."""
-        assert isinstance(state, bytes)
-        return state
-
-    def deserialize_state(self, data: bytes) -> object:
-        """The state of these bytes, which they are; `set_state` checks them."""
-        return data
 
     def close(self) -> None:
         """Nothing to do: the session of onnxruntime has neither files nor threads, and is freed with this object."""

@@ -43,11 +43,7 @@ class OnnxKind(Kind[OnnxConfig]):
     expected = "an ONNX model"
 
     def describe(
-        self,
-        path: Path,
-        section: OnnxConfig,  # noqa: ARG002  the file says everything
-        limits: LimitsConfig,
-        tell: Callable[[str], None],  # noqa: ARG002  loading a policy is fast
+        self, path: Path, section: OnnxConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """Load the model and compute it twice, in a child process; its inputs and outputs are the variables."""
         return ask_description_of(f"onnxruntime, which loads and computes '{path}',", __name__, (str(path), limits))

@@ -22,8 +22,10 @@ Array = NDArray[Any]
 ArrayStart = Sequence[Any] | Array | None
 FloatType = Literal["Float64", "Float32"]
 IntegerType = Literal["Int64", "UInt64", "Int32", "UInt32", "Int16", "UInt16", "Int8", "UInt8", "Enumeration"]
+BooleanType = Literal["Boolean"]
+StringType = Literal["String"]
+BinaryType = Literal["Binary"]
 Shape = int | tuple[int, ...]
-Scalar = tuple[()]
 
 
 class Details(TypedDict, total=False):
@@ -36,10 +38,20 @@ class Details(TypedDict, total=False):
     items: Mapping[str, int]
 
 
+class ScalarDetails(Details, total=False):
+    """What a variable that is no array may have."""
+
+    shape: tuple[()]
+
+
 class OutputDetails(Details, total=False):
     """What an output may have."""
 
     depends_on: Sequence[str]
+
+
+class ScalarOutput(OutputDetails, ScalarDetails, total=False):
+    """What an output that is no array may have."""
 
 
 class ParameterDetails(Details, total=False):
@@ -66,6 +78,7 @@ class Declared(Generic[T]):
         type: VariableType,  # noqa: A002 the word of FMI
         shape: Shape,
         details: Details,
+        **fields: Any,  # noqa: ANN401 of `Variable`
     ) -> None:
         if type not in DTYPES:
             raise CallRefused(f"'{type}' is no type of a variable", hint=f"The types are {', '.join(DTYPES)}.")
@@ -83,7 +96,6 @@ class Declared(Generic[T]):
             value_reference=0,
             type=type,
             causality=self.causality,
-            variability="continuous" if is_float(type) else "discrete",
             unit=unit,
             description=details.get("description"),
             minimum=details.get("min"),
@@ -92,6 +104,7 @@ class Declared(Generic[T]):
             base_unit=base_unit_of(unit) if unit is not None else None,
             dimensions=sizes,
             shape=sizes,
+            **{"variability": "continuous" if is_float(type) else "discrete", **fields},
         )
         if start is None:
             self._start = nested([zero(type)] * self._variable.size, sizes)
@@ -127,11 +140,8 @@ class Declared(Generic[T]):
 
     def variable(self, reference: int) -> Variable:
         """The variable for the model description, with this value reference."""
-        return replace(self._variable, name=self.name, value_reference=reference, **self._more())
-
-    def _more(self) -> dict[str, Any]:
-        """The other fields of the variable, which depend on what it is."""
-        return {"start": self._start}
+        start = None if self.causality == "output" else self._start
+        return replace(self._variable, name=self.name, value_reference=reference, start=start)
 
 
 class Input(Declared[T]):
@@ -166,48 +176,27 @@ class Input(Declared[T]):
 
     @overload
     def __init__(
-        self: Input[float],
-        start: float | None = None,
-        *,
-        type: FloatType = ...,
-        shape: Scalar = ...,
-        **details: Unpack[Details],
+        self: Input[float], start: float | None = None, *, type: FloatType = ..., **details: Unpack[ScalarDetails]
     ) -> None: ...
     @overload
     def __init__(
-        self: Input[int],
-        start: int | str | None = None,
-        *,
-        type: IntegerType,
-        shape: Scalar = ...,
-        **details: Unpack[Details],
+        self: Input[int], start: int | str | None = None, *, type: IntegerType, **details: Unpack[ScalarDetails]
     ) -> None: ...
     @overload
     def __init__(
         self: Input[bool],
         start: bool | None = None,  # noqa: FBT001 the value
         *,
-        type: Literal["Boolean"],
-        shape: Scalar = ...,
-        **details: Unpack[Details],
+        type: BooleanType,
+        **details: Unpack[ScalarDetails],
     ) -> None: ...
     @overload
     def __init__(
-        self: Input[str],
-        start: str | None = None,
-        *,
-        type: Literal["String"],
-        shape: Scalar = ...,
-        **details: Unpack[Details],
+        self: Input[str], start: str | None = None, *, type: StringType, **details: Unpack[ScalarDetails]
     ) -> None: ...
     @overload
     def __init__(
-        self: Input[bytes],
-        start: bytes | None = None,
-        *,
-        type: Literal["Binary"],
-        shape: Scalar = ...,
-        **details: Unpack[Details],
+        self: Input[bytes], start: bytes | None = None, *, type: BinaryType, **details: Unpack[ScalarDetails]
     ) -> None: ...
     @overload
     def __init__(
@@ -266,44 +255,31 @@ class Output(Declared[T]):
         start: float | None = None,
         *,
         type: FloatType = ...,
-        shape: Scalar = ...,
-        **details: Unpack[OutputDetails],
+        **details: Unpack[ScalarOutput],
     ) -> None: ...
     @overload
     def __init__(
-        self: Output[int],
-        start: int | str | None = None,
-        *,
-        type: IntegerType,
-        shape: Scalar = ...,
-        **details: Unpack[OutputDetails],
+        self: Output[int], start: int | str | None = None, *, type: IntegerType, **details: Unpack[ScalarOutput]
     ) -> None: ...
     @overload
     def __init__(
         self: Output[bool],
         start: bool | None = None,  # noqa: FBT001 the value
         *,
-        type: Literal["Boolean"],
-        shape: Scalar = ...,
-        **details: Unpack[OutputDetails],
+        type: BooleanType,
+        **details: Unpack[ScalarOutput],
     ) -> None: ...
     @overload
     def __init__(
-        self: Output[str],
-        start: str | None = None,
-        *,
-        type: Literal["String"],
-        shape: Scalar = ...,
-        **details: Unpack[OutputDetails],
+        self: Output[str], start: str | None = None, *, type: StringType, **details: Unpack[ScalarOutput]
     ) -> None: ...
     @overload
     def __init__(
         self: Output[bytes],
         start: bytes | None = None,
         *,
-        type: Literal["Binary"],
-        shape: Scalar = ...,
-        **details: Unpack[OutputDetails],
+        type: BinaryType,
+        **details: Unpack[ScalarOutput],
     ) -> None: ...
     @overload
     def __init__(
@@ -322,12 +298,9 @@ class Output(Declared[T]):
         shape: Shape = (),
         **details: Unpack[OutputDetails],
     ) -> None:
-        depends_on = details.pop("depends_on", None)
-        self.depends_on = None if depends_on is None else tuple(depends_on)
-        super().__init__(start, type, shape, details)
-
-    def _more(self) -> dict[str, Any]:
-        return {"initial": "calculated", "dependencies": self.depends_on, "feedthrough": self.depends_on}
+        on = details.pop("depends_on", None)
+        knowns = None if on is None else tuple(on)
+        super().__init__(start, type, shape, details, initial="calculated", dependencies=knowns, feedthrough=knowns)
 
 
 class Parameter(Declared[T]):
@@ -383,13 +356,9 @@ class Parameter(Declared[T]):
         type: VariableType | None = None,  # noqa: A002 the word of FMI
         **details: Unpack[ParameterDetails],
     ) -> None:
-        tunable = details.pop("tunable", False)
-        self._variability = "tunable" if tunable else "fixed"
-        array = isinstance(start, list | tuple | np.ndarray)
-        super().__init__(start, type or _type_of(start), np.shape(start) if array else (), details)
-
-    def _more(self) -> dict[str, Any]:
-        return {"start": self._start, "initial": "exact", "variability": self._variability}
+        variability = "tunable" if details.pop("tunable", False) else "fixed"
+        shape = np.shape(start) if isinstance(start, list | tuple | np.ndarray) else ()
+        super().__init__(start, type or _type_of(start), shape, details, initial="exact", variability=variability)
 
 
 _TYPES: dict[type, VariableType] = {

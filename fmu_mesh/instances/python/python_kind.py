@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Callable
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
+from shlex import quote
+from typing import Any
 
+import msgspec
+
+from ... import __version__
 from ...config.mesh import LimitsConfig
+from ...errors import FmuMeshError, LoadFailed
 from ...files import sha256_of
+from ...installing import installed_from
 from ...system.process_sharing import BOTH_USE_PYTHON, Claims
 from ...variables.model_description import ModelDescription
+from ..child_question import ask_description_of, described, run_child
 from ..contract import Instance, Kind, Opening
-from .python_section import PythonConfig
+from .python_section import PythonConfig, class_place_of
 
 __all__ = ["KIND_OF_COMPONENTS"]
 
@@ -24,28 +33,22 @@ class PythonKind(Kind[PythonConfig]):
     expected = "a component in Python, such as `controller.py:Controller` or `package.module:Controller`"
 
     def describe(
-        self,
-        path: Path,
-        section: PythonConfig,
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-        tell: Callable[[str], None],  # noqa: ARG002  takes less than a second, as a rule
+        self, path: Path, section: PythonConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """Import the class in a child process, which sends back its description."""
-        from .asking import ask_description  # noqa: PLC0415  only where there is a component
-
-        return ask_description(path, section)
+        target = class_place_of(section.python)
+        if target.file and not path.is_file():
+            raise LoadFailed("a folder" if path.is_dir() else "no such file")
+        if section.interpreter is not None:
+            _check_version(section.interpreter)
+        request = section.python, str(path), section.arguments
+        return ask_description_of("its import", __name__, request, section.interpreter or sys.executable)
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the file; empty for a module, whose content is in the description."""
         return hashlib.sha256(path.read_bytes()).hexdigest() if path != Path() else ""
 
-    def claims(
-        self,
-        path: Path,
-        section: PythonConfig,  # noqa: ARG002  the file says everything
-        description: ModelDescription,  # noqa: ARG002  as above
-        limits: LimitsConfig,  # noqa: ARG002  for FMUs
-    ) -> Claims:
+    def claims(self, path: Path, section: PythonConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """The interpreter, and the modules of its folder that cannot be imported for one instance alone."""
         claims: dict[str, str] = {BOTH_USE_PYTHON: "components"}
         for file in path.parent.iterdir() if path != Path() else ():
@@ -56,9 +59,50 @@ class PythonKind(Kind[PythonConfig]):
 
     def open(self, opening: Opening[PythonConfig]) -> Instance:
         """Import the class in this process, and make a component."""
-        from .python_instance import PythonInstance  # noqa: PLC0415  as above
+        from .python_instance import PythonInstance  # noqa: PLC0415  only where there is a component
 
         return PythonInstance(opening)
+
+
+def answer_to(request: str) -> bytes:
+    """In the child process: import what is asked for; returns the answer."""
+    from .component_description import check_arguments  # noqa: PLC0415  as above
+    from .importing import ImportedComponent  # noqa: PLC0415  as above
+
+    python, path, arguments = msgspec.json.decode(request, type=tuple[str, str, dict[str, Any]])
+    component = ImportedComponent(Path(path), class_place_of(python))
+
+    def describe() -> ModelDescription:
+        try:
+            description = component.load()
+            check_arguments(component.cls, arguments)
+        except (Exception, SystemExit) as error:  # it is code of the user
+            raise LoadFailed(component.told(error), hint=_hint(error)) from error
+        return description
+
+    return described(describe)
+
+
+def _hint(error: BaseException) -> str | None:
+    if isinstance(error, ModuleNotFoundError):
+        return "Is it installed in the Python that runs the component?"
+    return error.hint if isinstance(error, FmuMeshError) else None
+
+
+def _check_version(python: str) -> None:
+    """Check that a Python has our version.
+
+    Raises:
+        LoadFailed: it has another one, or none.
+    """
+    output, _ = run_child([python, "-Pc", "import fmu_mesh; print(fmu_mesh.__version__)"])
+    version = output.decode(errors="replace").strip()
+    if version != __version__:
+        has = f"has fmu-mesh {version}" if version else "has no fmu-mesh"
+        place = installed_from()
+        how = f"{quote(python)} -m pip install {place}" if place else f"from a clone of version {__version__}"
+        hint = f"Install fmu-mesh {__version__} there: {how}"
+        raise LoadFailed(f"the Python '{python}' {has}", hint=hint)
 
 
 KIND_OF_COMPONENTS = PythonKind()

@@ -11,15 +11,13 @@ import re
 from functools import cache
 from typing import Final
 
-from ...variables.units import BaseUnit
+from ...variables.units import BASE_UNITS, BaseUnit
 
 __all__ = ["base_unit_of"]
 
-_FIELDS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-
 _KNOWN: Final[dict[str, BaseUnit]] = {
     "1": BaseUnit(),
-    **{name: BaseUnit(**{name: 1}) for name in _FIELDS},
+    **{name: BaseUnit(**{name: 1}) for name in BASE_UNITS},
     "g": BaseUnit(kg=1, factor=1e-3),
     "t": BaseUnit(kg=1, factor=1e3),
     "min": BaseUnit(s=1, factor=60.0),
@@ -102,5 +100,5 @@ def _times(left: BaseUnit, right: BaseUnit, power: int) -> BaseUnit | None:
     """``left * right ** power``; None for units with an offset, which cannot be multiplied."""
     if left.offset or right.offset:
         return None
-    exponents = {field: getattr(left, field) + power * getattr(right, field) for field in _FIELDS}
+    exponents = {field: getattr(left, field) + power * getattr(right, field) for field in BASE_UNITS}
     return BaseUnit(**exponents, factor=left.factor * right.factor**power)

@@ -12,11 +12,13 @@ import hashlib
 import os
 import shutil
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from errno import EACCES, ENOSPC
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Final, Protocol
+from typing import IO, Final
 from zipfile import ZipInfo
 
 import msgspec
@@ -60,7 +62,7 @@ class Contents(msgspec.Struct, frozen=True):
     xml: dict[str, bytes]
 
 
-class OpenFmu(Protocol):
+class OpenFmu(ABC):
     """An FMU that is open and meets its terms.
 
     Whoever needs several things from one FMU opens it once:
@@ -71,38 +73,54 @@ class OpenFmu(Protocol):
         compile_sources(fmu, description, tell)
     ```
 
-    Attributes:
-        path: where it lies.
-
     Raises:
         LoadFailed: by each method: a file cannot be read or is damaged.
     """
 
-    path: Path
+    def __init__(self, path: Path, limits: LimitsConfig) -> None:
+        self.path = path
+        self._limits = limits
 
     def contents(self) -> Contents:
         """The names of its files and its descriptions; nothing is unpacked."""
-        ...
+        names = self._names()
+        return Contents(names, {name: self.read(name) for name in _XML_FILES if name in names})
 
     def read(self, name: str) -> bytes:
         """The content of one of its files, which must not be larger than a description (`limits.description_bytes`)."""
-        ...
+        size, limit = self._size(name), self._limits.description_bytes
+        if size > limit:
+            text = f"the {name} of '{self.path}' has {size} bytes; the limit is {limit}."
+            raise LoadFailed(text, hint=LIMITS_HINT)
+        return self.read_binary(name)
 
+    @abstractmethod
     def read_binary(self, name: str) -> bytes:
         """The content of one of its libraries, of any size that the limits of an archive allow."""
-        ...
 
+    @abstractmethod
     def content_sha256(self) -> str:
         """Calculate the SHA-256 of the archive, or of the names and contents of all files of a folder."""
-        ...
 
+    @abstractmethod
     def unpacked_size(self) -> int:
         """How many bytes `unpack_into` writes."""
-        ...
 
+    @abstractmethod
     def unpack_into(self, folder: Path) -> None:
         """Unpack all files into an empty folder."""
-        ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close it."""
+
+    @abstractmethod
+    def _names(self) -> frozenset[str]:
+        """The names of all files, with `/` between the parts."""
+
+    @abstractmethod
+    def _size(self, name: str) -> int:
+        """The size of a file in bytes."""
 
 
 @contextmanager
@@ -200,10 +218,9 @@ def _refuse_unfit(place: Path, size: int) -> None:
 # --- an archive
 
 
-class _Archive:
+class _Archive(OpenFmu):
     def __init__(self, path: Path, terms: Terms) -> None:
-        self.path = path
-        self._limits = terms.limits
+        super().__init__(path, terms.limits)
         # Bytes that have to be the right ones are read; it does not matter what the file was before.
         self._verifies = terms.sha256 is not None or terms.content is not None
         self._digest: str | None = None
@@ -213,26 +230,17 @@ class _Archive:
             else:
                 copy = inner_file(path, outer, terms.limits)
                 self._file, self._digest = stack.enter_context(copy.file), copy.sha256
-            if terms.sha256 is not None:
-                _verify(path, self._sha256(), terms.sha256.lower())
+            if terms.sha256 is not None and self._sha256() != terms.sha256.lower():
+                raise LoadFailed(
+                    f"'{path}' has the SHA-256 {self._sha256()}, not {terms.sha256.lower()}, which the configuration "
+                    "asks for.",
+                    hint="It is another file, or was changed. If it is the right one, correct `sha256`.",
+                )
             self._zip = stack.enter_context(checked_archive(path, self._file, terms.limits))
             self._open = stack.pop_all()
 
     def close(self) -> None:
         self._open.close()
-
-    def contents(self) -> Contents:
-        entries = {entry_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
-        present = [name for name in _XML_FILES if name in entries]
-        _refuse_large_description(self.path, {name: entries[name].file_size for name in present}, self._limits)
-        with reading(self.path):
-            return Contents(frozenset(entries), {name: self._zip.read(entries[name]) for name in present})
-
-    def read(self, name: str) -> bytes:
-        entry = self._entry(name)
-        _refuse_large_description(self.path, {name: entry.file_size}, self._limits)
-        with reading(self.path):
-            return self._zip.read(entry)
 
     def read_binary(self, name: str) -> bytes:
         with reading(self.path):
@@ -250,33 +258,25 @@ class _Archive:
             for entry in self._zip.infolist():
                 write_entry(self._zip, entry, folder)
 
+    def _names(self) -> frozenset[str]:
+        return frozenset(self._entries)
+
+    def _size(self, name: str) -> int:
+        return self._entry(name).file_size
+
+    @cached_property
+    def _entries(self) -> dict[str, ZipInfo]:
+        return {entry_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
+
     def _entry(self, name: str) -> ZipInfo:
-        entry = next((one for one in self._zip.infolist() if entry_name(one) == name and not one.is_dir()), None)
-        if entry is None:
+        if name not in self._entries:
             raise _no_file(self.path, name)
-        return entry
+        return self._entries[name]
 
     def _sha256(self) -> str:
         if self._digest is None:
             self._digest = files.sha256_of_open(self._file, again=self._verifies)
         return self._digest
-
-
-def _verify(path: Path, found: str, expected: str) -> None:
-    if found != expected:
-        raise LoadFailed(
-            f"'{path}' has the SHA-256 {found}, not {expected}, which the configuration asks for.",
-            hint="It is another file, or was changed. If it is the right one, correct `sha256`.",
-        )
-
-
-def _refuse_large_description(path: Path, sizes: dict[str, int], limits: LimitsConfig) -> None:
-    for name, size in sizes.items():
-        if size > limits.description_bytes:
-            raise LoadFailed(
-                f"the {name} of '{path}' has {size} bytes; the limit is {limits.description_bytes}.",
-                hint=LIMITS_HINT,
-            )
 
 
 def _no_file(path: Path, name: str) -> LoadFailed:
@@ -288,44 +288,23 @@ def _no_file(path: Path, name: str) -> LoadFailed:
 _COPIED: Final = ("binaries/", "resources/")
 
 
-class _Folder:
+class _Folder(OpenFmu):
     def __init__(self, path: Path, terms: Terms) -> None:
         if terms.sha256 is not None:
             text = f"'{path}' is a folder, and `sha256` is that of an archive."
             raise LoadFailed(text, hint="Zip it, or leave it out.")
-        self.path = path
-        self._limits = terms.limits
+        super().__init__(path, terms.limits)
 
     def close(self) -> None:
         """Nothing is open."""
 
-    def contents(self) -> Contents:
-        try:
-            names = _names_in(self.path)
-            sizes = {name: (self.path / name).stat().st_size for name in _XML_FILES if name in names}
-            _refuse_large_description(self.path, sizes, self._limits)
-            return Contents(names, {name: (self.path / name).read_bytes() for name in sizes})
-        except OSError as error:
-            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
-
-    def read(self, name: str) -> bytes:
-        if name in _names_in(self.path):
-            _refuse_large_description(self.path, {name: (self.path / name).stat().st_size}, self._limits)
-        return self.read_binary(name)
-
     def read_binary(self, name: str) -> bytes:
-        try:
-            if name not in _names_in(self.path):
-                raise _no_file(self.path, name)
-            return (self.path / name).read_bytes()
-        except OSError as error:
-            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
+        with self._reading():
+            return self._file(name).read_bytes()
 
     def content_sha256(self) -> str:
-        try:
+        with self._reading():
             return content_of(self.path)
-        except OSError as error:
-            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
 
     def unpacked_size(self) -> int:
         names = (name for name in _names_in(self.path) if name.startswith(_COPIED))
@@ -341,6 +320,25 @@ class _Folder:
                 shutil.copytree(entry, folder / entry.name, copy_function=files.cloned, ignore_dangling_symlinks=True)
             else:
                 (folder / entry.name).symlink_to(entry)
+
+    def _names(self) -> frozenset[str]:
+        return _names_in(self.path)
+
+    def _size(self, name: str) -> int:
+        with self._reading():
+            return self._file(name).stat().st_size
+
+    def _file(self, name: str) -> Path:
+        if name not in _names_in(self.path):
+            raise _no_file(self.path, name)
+        return self.path / name
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
 
 
 def _names_in(path: Path) -> frozenset[str]:

@@ -1,7 +1,8 @@
 """Variables of a model description as FMPy reads it to our own, for each version of FMI.
 
 What FMPy leaves out comes from the XML itself: aliases and direct dependencies of FMI 1.0; start values of String and
-Binary arrays, sizes and some limits of FMI 3.0.
+Binary arrays, sizes and some limits of FMI 3.0. FMI 1.0 names base units and gives no exponents, so none of its units
+can be converted.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from fmpy.model_description import ModelVariable, Unknown
 from msgspec.structs import replace
 
 from ....variables.model_description import Causality, Initial, Value, Variable, VariableType
+from ....variables.units import BASE_UNITS, BaseUnit
 from ....variables.value_types import FMI2_TYPES, INTEGERS, TYPES, nested
-from .declared_units import base_units, with_unit
 
-__all__ = ["states_of", "variables_of"]
+__all__ = ["number", "states_of", "variables_of"]
 
 _NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
 
@@ -30,10 +31,6 @@ def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, .
 
     Of several with one name, which no version of FMI allows and some FMUs have, the last one is the variable: a name is
     a key, a column and an address, and cannot stand for two things.
-
-    Args:
-        source: the description as FMPy reads it.
-        root: the root of the XML.
     """
     elements = {element.get("name"): element for element in root.iterfind("ModelVariables/*")}
     convert: Callable[[ModelVariable, ET.Element, Dependencies], Variable]
@@ -45,17 +42,20 @@ def variables_of(source: FmpyDescription, root: ET.Element) -> tuple[Variable, .
         dependencies = _dependencies(source, source.initialUnknowns)
         feedthrough = _dependencies(source, [*source.derivatives, *source.outputs])
         feedthrough |= dict.fromkeys(states_of(source), ())  # a state depends on no value of the same point
-    units = base_units(source)
-    variables = (
-        replace(
-            with_unit(convert(variable, element, dependencies), variable, element, units),
-            feedthrough=feedthrough.get((variable.alias or variable).name),
-        )
-        for variable in source.modelVariables
-        if variable.type in FMI2_TYPES or variable.type in TYPES
-        for element in (elements[(variable.alias or variable).name],)
-    )
-    return tuple({variable.name: variable for variable in variables}.values())
+    units = _base_units(source)
+    variables: dict[str, Variable] = {}
+    for declared in source.modelVariables:
+        if declared.type in FMI2_TYPES or declared.type in TYPES:
+            element = elements[(declared.alias or declared).name]
+            variable = convert(declared, element, dependencies)
+            base = units.get(variable.unit or "")
+            variables[variable.name] = replace(
+                variable,
+                base_unit=base,
+                relative_quantity=base is not None and _is_relative(declared, element),
+                feedthrough=feedthrough.get((declared.alias or declared).name),
+            )
+    return tuple(variables.values())
 
 
 def _fmi1(source: ModelVariable, element: ET.Element, dependencies: Dependencies) -> Variable:
@@ -81,8 +81,6 @@ def _fmi2(source: ModelVariable, _element: ET.Element, dependencies: Dependencie
     return _variable(
         source,
         FMI2_TYPES[source.type],
-        causality=source.causality or "local",
-        initial=source.initial,
         start=_start(FMI2_TYPES[source.type], source.start),
         dependencies=dependencies.get(source.name, ()),
     )
@@ -99,14 +97,12 @@ def _fmi3(source: ModelVariable, element: ET.Element, dependencies: Dependencies
     return _variable(
         source,
         type_,
-        causality=source.causality or "local",
-        initial=source.initial,
         start=_array_start(type_, texts, shape),
         dependencies=dependencies.get((source.alias or source).name, ()),
         declared_type=None,
-        nominal=_number(element.get("nominal")),
-        minimum=_number(element.get("min")),
-        maximum=_number(element.get("max")),
+        nominal=number(element.get("nominal")),
+        minimum=number(element.get("min")),
+        maximum=number(element.get("max")),
         dimensions=tuple(d.start if d.start is not None else d.variable.name for d in source.dimensions),
         shape=shape,
         max_size=int(size) if (size := element.get("maxSize")) is not None and size.isdecimal() else None,
@@ -117,17 +113,47 @@ def _variable(source: ModelVariable, type_: VariableType, **more: object) -> Var
     declared = source.declaredType
     items = tuple((item.name, int(item.value)) for item in declared.items) if declared and declared.items else ()
     fields: dict[str, object] = {
+        "causality": source.causality or "local",
+        "initial": source.initial,
         "variability": source.variability or ("continuous" if type_ == "Float64" else "discrete"),
         "unit": source.unit or (declared.unit if declared is not None else None),
         "description": source.description,
-        "minimum": _number(source.min),
-        "maximum": _number(source.max),
-        "nominal": _number(source.nominal),
+        "minimum": number(source.min),
+        "maximum": number(source.max),
+        "nominal": number(source.nominal),
         "items": items,
         "declared_type": source.type,
         **more,
     }
     return Variable(name=source.name, value_reference=int(source.valueReference), type=type_, **fields)  # type: ignore[arg-type] # by keyword
+
+
+def _base_units(source: FmpyDescription) -> dict[str, BaseUnit]:
+    """The units that are defined in SI base units, by name (FMI 2.0, 2.2.2)."""
+    units: dict[str, BaseUnit] = {}
+    for unit in source.unitDefinitions:
+        base = unit.baseUnit
+        if unit.name is None or base is None:
+            continue
+        try:
+            exponents = {name: int(getattr(base, name)) for name in BASE_UNITS}
+            converted = BaseUnit(**exponents, factor=float(base.factor), offset=float(base.offset))
+        except ValueError:
+            continue
+        if converted.usable:
+            units[unit.name] = converted
+    return units
+
+
+def _is_relative(source: ModelVariable, element: ET.Element) -> bool:
+    """Whether a variable is a difference: relativeQuantity of its own (FMI 2.0, 2.2.7), or of its declared type.
+
+    FMPy 0.3.32 does not read that of the variable.
+    """
+    own = (child.get("relativeQuantity") for child in (element, *element))
+    declared = source.declaredType.relativeQuantity if source.declaredType is not None else None
+    value = next((text for text in own if text is not None), declared)
+    return value in (True, "true", "1")
 
 
 def states_of(source: FmpyDescription) -> tuple[str, ...]:
@@ -192,7 +218,8 @@ def _float(text: str) -> float:
     return _NOT_FINITE[text] if text in _NOT_FINITE else float(text)
 
 
-def _number(text: str | float | None) -> float | None:
+def number(text: str | float | None) -> float | None:
+    """The number in an attribute; None if there is none."""
     if text is None:
         return None
     try:

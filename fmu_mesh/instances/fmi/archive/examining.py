@@ -91,14 +91,8 @@ def source_names(names: Iterable[str]) -> list[str]:
 def find_library(path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str) -> str | None:
     """Find the library of an FMU for this platform: the one with the required name, or else the only one.
 
-    Args:
-        path: the FMU.
-        names: the names of its files.
-        identifiers: the model identifier of the kind to use, then that of the other kind if there is one.
-        fmi_version: its FMI version.
-
-    Returns:
-        The name of the file; None if the library has to be compiled from sources.
+    ``identifiers`` are the model identifier of the kind to use, and that of the other kind if there is one. None: the
+    library has to be compiled from sources.
 
     Raises:
         LoadFailed: there is no library for this platform, or there are several; the message lists them.

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from ....errors import LoadFailed
 from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
 from .archive import Contents, OpenFmu, Terms, opened
-from .declared_variables import states_of, variables_of
+from .declared_variables import number, states_of, variables_of
 from .examining import examine, find_library, library_name
 
 __all__ = ["description_of", "parsed", "read_description"]
@@ -162,10 +162,10 @@ def _convert(
         description=source.description,
         generation_tool=source.generationTool,
         default_experiment=DefaultExperiment(
-            start_time=_number(getattr(experiment, "startTime", None)),
-            stop_time=_number(getattr(experiment, "stopTime", None)),
-            step_size=_number(getattr(experiment, "stepSize", None)),
-            tolerance=_number(getattr(experiment, "tolerance", None)),
+            start_time=number(getattr(experiment, "startTime", None)),
+            stop_time=number(getattr(experiment, "stopTime", None)),
+            step_size=number(getattr(experiment, "stepSize", None)),
+            tolerance=number(getattr(experiment, "tolerance", None)),
         ),
         can_handle_variable_step_size=can("canHandleVariableCommunicationStepSize"),
         can_reject_steps=can("canRejectSteps"),
@@ -185,13 +185,13 @@ def _convert(
         platforms=platforms,
         kinds=tuple(one for one in _WORDS if _interface(source, one) is not None),
         problems=problems,
-        fixed_step_size=_number(internal.get("fixedInternalStepSize")) if internal is not None else None,
+        fixed_step_size=number(internal.get("fixedInternalStepSize")) if internal is not None else None,
     )
 
 
 def _clock(element: ET.Element) -> Clock:
     """A clock; an interval given as a fraction is counted in units of its resolution (FMI 3.0, 2.2.8.4)."""
-    interval, shift = _number(element.get("intervalDecimal")), _number(element.get("shiftDecimal"))
+    interval, shift = number(element.get("intervalDecimal")), number(element.get("shiftDecimal"))
     counter, resolution = element.get("intervalCounter"), element.get("resolution")
     if counter is not None and resolution is not None and int(resolution):
         interval, shift = int(counter) / int(resolution), int(element.get("shiftCounter", 0)) / int(resolution)
@@ -203,12 +203,3 @@ def _clock(element: ET.Element) -> Clock:
         interval=interval,
         shift=shift or 0.0,
     )
-
-
-def _number(text: str | float | None) -> float | None:
-    if text is None:
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        return None

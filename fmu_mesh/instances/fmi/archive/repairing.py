@@ -96,10 +96,8 @@ class Repairs(NamedTuple):
 def repair(root: Xml, generation: str, fmi_version: str = "") -> Repairs:
     """Repair a description.
 
-    Args:
-        root: the root of its XML, which is changed.
-        generation: a key of `_SCHEMAS`.
-        fmi_version: the version that it should have; empty: that is right already.
+    ``generation`` is a key of `_SCHEMAS`, ``fmi_version`` the version that it should have; empty: that is right
+    already.
     """
     found = Repairs({}, {})
     etree.strip_tags(root, etree.Comment, etree.ProcessingInstruction)

@@ -168,10 +168,18 @@ def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Calla
 def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | None, folder: Path) -> None:
     """Unpack an FMU into an empty folder, and give it the library that it lacks."""
     fmu.unpack_into(folder)
-    if model is not None and model.library is not None:
-        _name_library(folder, model, folder / model.library)
-    elif model is not None or not _has_binaries(folder):
+    if model is None:
+        platforms = (fmpy.platform, fmpy.platform_tuple)
+        is_complete = any(any(folder.glob(f"binaries/{name}/*{_SUFFIX}")) for name in platforms)
+    else:
+        is_complete = model.library is not None
+    if not is_complete:
         _add_library(fmu, folder, model, tell)
+    elif model is not None:
+        # A link with the name that FMI requires; other libraries of the FMU may refer to the original name.
+        named = folder / library_name(model.model_identifier, model.fmi_version)
+        if not named.exists():
+            named.symlink_to(PurePosixPath(model.library or "").name)
 
 
 def cache_folder() -> Path:
@@ -181,18 +189,6 @@ def cache_folder() -> Path:
     from platformdirs import user_cache_path  # noqa: PLC0415 only FMUs of sources need it
 
     return user_cache_path("fmu_mesh")
-
-
-def _has_binaries(folder: Path) -> bool:
-    """Whether an unpacked FMU has a library for this platform."""
-    return any(any(folder.glob(f"binaries/{name}/*{_SUFFIX}")) for name in (fmpy.platform, fmpy.platform_tuple))
-
-
-def _name_library(folder: Path, model: ModelDescription, library: Path) -> None:
-    """Add a link with the name that FMI requires; other libraries of the FMU may refer to the original name."""
-    named = folder / library_name(model.model_identifier, model.fmi_version)
-    if not named.exists():
-        named.symlink_to(library.name)
 
 
 def _add_library(fmu: OpenFmu, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:

@@ -33,10 +33,7 @@ _BY_RULE: Final = re.compile(
 def missing_libraries(path: Path, library: str, terms: Terms = Terms()) -> tuple[str, ...]:  # noqa: B008 a frozen Struct
     """What the library of an FMU needs and this host does not have: whole libraries, or newer versions of them.
 
-    Args:
-        path: the FMU.
-        library: the name of the file in it, as `ModelDescription.library` has it.
-        terms: the conditions that the FMU must meet.
+    ``library`` is the name of the file in it, as `ModelDescription.library` has it.
 
     Raises:
         LoadFailed: the FMU cannot be read.

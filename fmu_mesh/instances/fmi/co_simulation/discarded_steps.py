@@ -11,10 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
-from fmpy.fmi1 import FMICallException
-
 from ....simtime import step_within
-from ..calls import Function, Pointer, declared
+from ..calls import declared
 from ..fmu_values import DISCARD, WARNING
 
 __all__ = [
@@ -22,7 +20,6 @@ __all__ = [
     "RETRY",
     "SMALLER_STEPS",
     "SMALLEST",
-    "RetriedSteps",
     "StepStatus",
     "discarded",
     "take_sub_steps",
@@ -38,35 +35,36 @@ _DO_STEP_STATUS, _LAST_SUCCESSFUL_TIME = 0, 2
 _ASK = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 _PAUSES_S: Final = (0.0, 1e-3)
 """The first and the longest pause between two questions whether a step is done."""
-_ENDS: Final = 6
-"""Our own status for a discarded step with which the FMU asks to end the simulation."""
 
 
 class StepStatus:
     """Asks one instance about its last step.
 
-    Args:
-        dll: its library.
-        component: the instance.
-        prefix: the prefix of its functions, such as `fmi2`.
+    ``failed`` makes the error of the instance.
     """
 
-    def __init__(self, dll: Any, component: int, prefix: str) -> None:  # noqa: ANN401 of ctypes
+    def __init__(self, dll: Any, component: int, symbols: str, failed: Callable[..., Exception]) -> None:  # noqa: ANN401 of ctypes
         self._component = component
-        self._get_status = declared(dll, f"{prefix}GetStatus", _ASK)
-        self._get_real_status = declared(dll, f"{prefix}GetRealStatus", _ASK)
+        self._prefix = symbols.rpartition("_")[2]
+        self._failed = failed
+        self._get_status = declared(dll, f"{symbols}GetStatus", _ASK)
+        self._get_real_status = declared(dll, f"{symbols}GetRealStatus", _ASK)
 
-    def wait(self) -> int | None:
-        """Wait until a pending step is done, and return its status; None if the FMU does not tell.
+    def wait(self) -> int:
+        """Wait until a pending step is done, and return its status.
 
         The FMU gets no function to call when it is done, so we have to ask (FMI 2.0, 2.1.5). `CallWatch` watches the
         deadline of the step.
+
+        Raises:
+            StepFailed: the FMU does not tell.
         """
         pause, longest = _PAUSES_S
         while True:
             answer = ctypes.c_int(PENDING)
             if self._get_status(self._component, _DO_STEP_STATUS, ctypes.addressof(answer)) > WARNING:
-                return None
+                what = f"{self._prefix}DoStep returned pending, and {self._prefix}GetStatus does not tell when the step"
+                raise self._failed(f"{what} is done")
             if answer.value != PENDING:
                 return answer.value
             time.sleep(pause)  # noqa: TID251 there is nothing to wait on
@@ -77,67 +75,6 @@ class StepStatus:
         answer = ctypes.c_double()
         status = self._get_real_status(self._component, _LAST_SUCCESSFUL_TIME, ctypes.addressof(answer))
         return answer.value if status <= WARNING else None
-
-
-class RetriedSteps:
-    """fmi2DoStep that takes a discarded step in smaller ones.
-
-    After fmi2Discard, only fmi2SetFMUstate is allowed (FMI 2.0, 4.2.4), so the state is kept before every step.
-
-    Args:
-        fmu: FMPy's object, instantiated.
-        do_step: fmi2DoStep.
-        waited: waits for a pending step and returns its status.
-        asks_to_end: whether the FMU asks to end the simulation with the step that it has discarded.
-        failed: makes the error of the instance.
-
-    Attributes:
-        ends: whether the FMU asked to end the simulation with the last discarded step.
-    """
-
-    def __init__(
-        self,
-        fmu: Any,  # noqa: ANN401 FMPy is untyped
-        do_step: Function,
-        waited: Callable[[], int],
-        asks_to_end: Callable[[], bool],
-        failed: Callable[..., Exception],
-    ) -> None:
-        self.ends = False
-        self._fmu = fmu
-        self._do_step = do_step
-        self._waited = waited
-        self._asks_to_end = asks_to_end
-        self._failed = failed
-        self._state = ctypes.c_void_p()
-
-    def __call__(self, component: Pointer, time: float, step_size: float, _no_set_state: int) -> int:
-        """As fmi2DoStep; `DISCARD` means that the smallest sub-step was discarded, or that the FMU asks to end."""
-
-        def attempt(start: float, size: float) -> int:
-            self._fmu.fmi2GetFMUstate(self._fmu.component, ctypes.byref(self._state))
-            status = self._do_step(component, start, size, 0)
-            if status == PENDING:
-                status = self._waited()
-            if status == DISCARD:
-                self.ends = self._asks_to_end()
-                if self.ends:
-                    return _ENDS
-                self._fmu.fmi2SetFMUstate(self._fmu.component, self._state)
-            return status
-
-        try:
-            status = attempt(time, step_size)
-            if status == DISCARD:
-                status = take_sub_steps(attempt, time, step_size)
-        except FMICallException as error:
-            raise self._failed(error.function, status=error.status) from error
-        return DISCARD if self.ends else status
-
-    def free(self) -> None:
-        """Free the state that was kept."""
-        if self._state.value is not None:
-            self._fmu.fmi2FreeFMUstate(self._fmu.component, ctypes.byref(self._state))
 
 
 def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_size: float) -> int:
@@ -170,10 +107,8 @@ def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_siz
 def discarded(function: str, last_time: float | None, smallest: int | None) -> str:
     """The text of an error for a step that was discarded.
 
-    Args:
-        function: the name of the function.
-        last_time: the last successful time in s, if the FMU tells.
-        smallest: the last attempt was a sub-step of 1/smallest of the step; None if there were no sub-steps.
+    ``last_time`` is the last successful time in s, if the FMU tells; the last attempt was a sub-step of 1/``smallest``
+    of the step, or the whole step if that is None.
     """
     tried = f" down to 1/{smallest} of the step" if smallest is not None else ""
     told = f"; the last successful time is {last_time:.12g} s" if last_time is not None else ""

@@ -41,12 +41,7 @@ class TakesDerivatives(Instance, KeepsState, Protocol):
 
 
 class LinearInputs(AroundInstance[TakesDerivatives]):
-    """An instance with inputs that change linearly within a step.
-
-    Args:
-        instance: the inner instance; `close` closes it.
-        inputs: the linear inputs.
-    """
+    """An instance with inputs that change linearly within a step."""
 
     def __init__(self, instance: TakesDerivatives, inputs: Sequence[LinearInput]) -> None:
         super().__init__(instance)
@@ -99,13 +94,13 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
 
     def get_state(self) -> object:
         """See `KeepsState`."""
-        return _LinearState(super().get_state(), _Lines(tuple(self._lines)))
+        return _LinearState(super().get_state(), tuple(self._lines))
 
     def set_state(self, state: object) -> None:
         """See `KeepsState`."""
         own = of_kind(_LinearState, state)
         super().set_state(own.inner)
-        self._lines = [*own.own.lines]
+        self._lines = [*own.lines]
 
     def free_state(self, state: object) -> None:
         """See `KeepsState`."""
@@ -114,7 +109,7 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
     def serialize_state(self, state: object) -> bytes:
         """See `KeepsState`."""
         own = of_kind(_LinearState, state)
-        return packed(own.own, super().serialize_state(own.inner))
+        return packed(own.lines, super().serialize_state(own.inner))
 
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`.
@@ -122,7 +117,7 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         Raises:
             FmuMeshError: ``data`` is no state of an instance with linear inputs.
         """
-        lines, rest = unpacked(data, _Lines, None)
+        lines, rest = unpacked(data, tuple[_Line, ...], None)
         return _LinearState(super().deserialize_state(rest), lines)
 
 
@@ -152,14 +147,8 @@ class _Line(msgspec.Struct, frozen=True):
         return self.value + self.change * ((point - self.point) / self.distance)
 
 
-class _Lines(msgspec.Struct, frozen=True):
-    """Our own part of a state."""
-
-    lines: tuple[_Line, ...]
-
-
 class _LinearState(NamedTuple):
     """A state of the inner instance, and the lines."""
 
     inner: object
-    own: _Lines
+    lines: tuple[_Line, ...]

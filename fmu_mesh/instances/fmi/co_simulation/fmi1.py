@@ -8,12 +8,12 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 
-from fmpy.fmi1 import FMICallException, FMU1Slave
+from fmpy.fmi1 import FMU1Slave
 
 from ....rings.native import StepKind
 from ...call_guard import call_named
-from ..calls import cffi_function, declared
-from ..fmi_versions import Fmi1Values
+from ..calls import cffi_function, checked_function
+from ..fmi_versions import FMI1_VALUES, Fmi1
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
 from .discarded_steps import PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
@@ -37,52 +37,38 @@ _NEW, _REPEATED = b"\x01", b"\x00"
 """`newStep` of fmiDoStep."""
 
 
-class Fmi1Instance(NativeInstance, Fmi1Values):
+class Fmi1Instance(NativeInstance, Fmi1):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
     _kind = StepKind.FMI1
-    _functions = FmuFunctions(FMU1Slave, "fmi", "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
-    _derivatives: Mapping[str, float] = {}
+    _functions = FmuFunctions(FMU1Slave, FMI1_VALUES, "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
-        if self._derivatives:
-            self._set_derivatives(self._derivatives)
-        status = self._do_step(self._self, time, step_size, _NEW)
-        if status > WARNING:
-            self._finish(time, step_size, status)
+        self._step(time, step_size, None)
 
-    def set_input_derivatives(
-        self,
-        derivatives: Mapping[str, float],
-        *,
-        continuous: bool = False,  # noqa: ARG002 for model exchange
-    ) -> None:
-        """First time derivatives (1/s) of Real inputs for the next step (FMI 1.0 CS, 3.3)."""
-        self._derivatives = derivatives  # the FMU gets them after the values of these inputs
-
-    def _instantiated(self) -> None:
+    def _instantiate(self, **arguments: object) -> None:
+        super()._instantiate(**arguments)
         dll = self._fmu.dll
-        self._do_step = cffi_function(getattr(dll, self._symbol("DoStep")), _DO_STEP)
-        self._step_status = StepStatus(dll, self._component, self._symbol(""))
+        self._do_step = cffi_function(getattr(dll, f"{self._symbols}DoStep"), _DO_STEP)
+        self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
+        self._by_calls = bool(self._options.linear_inputs)
 
-    def _needs_python(self) -> bool:
-        return bool(self._options.linear_inputs)
+    def _complete(self, step: int, status: int | None) -> None:
+        self._step(self._time_of(step), self._step_size, status)
 
-    def _take_step(self, step: int) -> None:
-        self.advance(self._time_of(step), self._step_size)
-
-    def _complete(self, step: int, status: int) -> None:
-        self._finish(self._time_of(step), self._step_size, status)
-
-    def _finish(self, time: float, step_size: float, status: int) -> None:
-        """Complete a step whose ``status`` is above warning.
+    def _step(self, time: float, step_size: float, status: int | None) -> None:
+        """Take a step, or complete it after fmiDoStep has returned ``status``.
 
         Raises:
             StepFailed: the step cannot be completed.
         """
+        if status is None:
+            if self._derivatives:
+                self._set_derivatives(self._derivatives)
+            status = self._do_step(self._self, time, step_size, _NEW)
         if status == PENDING:
-            status = self._waited()
+            status = self._step_status.wait()
         model = self._description
         repeats = status == DISCARD and model.can_handle_variable_step_size and model.can_reject_steps
         repeats = repeats and not self._options.linear_inputs  # sub-steps would need derivatives of their own
@@ -105,17 +91,11 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
             nonlocal new_step
             status = self._do_step(self._self, start, size, new_step)
             if status == PENDING:
-                status = self._waited()
+                status = self._step_status.wait()
             new_step = _REPEATED if status == DISCARD else _NEW
             return status
 
         return take_sub_steps(attempt, time, step_size)
-
-    def _waited(self) -> int:
-        status = self._step_status.wait()
-        if status is None:
-            raise self._failed("fmiDoStep returned pending, and fmiGetStatus does not tell when the step is done")
-        return status
 
     def _set_derivatives(self, derivatives: Mapping[str, float]) -> None:
         variables = [self._variables[name] for name in derivatives]
@@ -123,22 +103,16 @@ class Fmi1Instance(NativeInstance, Fmi1Values):
         references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
         orders = (ctypes.c_int * count)(*[1] * count)
         signed = [-d if v.negated else d for v, d in zip(variables, derivatives.values(), strict=True)]
-        function = declared(self._fmu.dll, self._symbol("SetRealInputDerivatives"), _SET_DERIVATIVES)
-        status = function(self._component, references, count, orders, (ctypes.c_double * count)(*signed))
-        if status > WARNING:
-            raise self._failed("fmiSetRealInputDerivatives", status=status)
+        function = checked_function(self._fmu.dll, self._symbols, "SetRealInputDerivatives", _SET_DERIVATIVES)
+        values = (ctypes.c_double * count)(*signed)
+        self._checked(lambda: function(self._component, references, count, orders, values))
 
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitializeSlave (FMI 1.0 CS, 3.3)."""
-        name = "fmiInitializeSlave"
-        function = declared(self._fmu.dll, self._symbol("InitializeSlave"), _INITIALIZE)
-        stop_time_defined = b"\x00" if stop_time is None else b"\x01"
-        status = call_named(name, function, self._component, start_time, stop_time_defined, stop_time or 0.0)
-        if status > WARNING:
-            raise self._failed(name, status=status)
+        function = checked_function(self._fmu.dll, self._symbols, "InitializeSlave", _INITIALIZE)
+        times = start_time, b"\x00" if stop_time is None else b"\x01", stop_time or 0.0
+        self._checked(lambda: call_named("fmiInitializeSlave", function, self._component, *times))
 
-    def _terminate_initialized(self) -> None:
-        function = declared(self._fmu.dll, self._symbol("TerminateSlave"), _TERMINATE)
-        status = call_named("fmiTerminateSlave", function, self._component)
-        if status > WARNING:
-            raise FMICallException(function="fmiTerminateSlave", status=status)
+    def _terminate(self) -> None:
+        function = checked_function(self._fmu.dll, self._symbols, "TerminateSlave", _TERMINATE)
+        call_named("fmiTerminateSlave", function, self._component)

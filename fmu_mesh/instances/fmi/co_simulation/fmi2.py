@@ -9,30 +9,29 @@ from collections.abc import Mapping
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
-from ....errors import TerminationRequested
 from ....rings.native import StepKind
+from ....simtime import resolvable
 from ....variables.value_types import Value
 from ..calls import cffi_function
-from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, Fmi2Values
+from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, FMI2_VALUES, Fmi2
+from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from ..model_exchange.solver import resolvable
-from ..state import Bookkeeping
-from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, RetriedSteps, StepStatus, discarded
+from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi2Instance"]
 
 _DO_STEP = "int (*)(void *, double, double, int)"
+_ENDS = 998
+"""Our own status for a discarded step with which the FMU asks to end the simulation."""
 
 
-class Fmi2Instance(NativeInstance, Fmi2Values):
+class Fmi2Instance(NativeInstance, Fmi2):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _kind = StepKind.FMI2
-    _functions = FmuFunctions(FMU2Slave, "fmi2", "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
-    _retrying: RetriedSteps | None = None
-    _derivatives: Mapping[str, float] = {}
+    _functions = FmuFunctions(FMU2Slave, FMI2_VALUES, "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
     _terminated = False
     """Whether the FMU has asked to end the simulation with the step that is complete now."""
 
@@ -50,46 +49,56 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         if not self._terminated:
             super().set_values(values)
 
-    def set_input_derivatives(
-        self,
-        derivatives: Mapping[str, float],
-        *,
-        continuous: bool = False,  # noqa: ARG002 for model exchange
-    ) -> None:
-        """First time derivatives (1/s) of Real inputs for the next step (FMI 2.0, 4.2.1)."""
-        self._derivatives = derivatives  # the FMU gets them after the values of these inputs
-
-    def _instantiated(self) -> None:
-        dll = self._fmu.dll
+    def _instantiate(self, **arguments: object) -> None:
+        super()._instantiate(**arguments)
+        dll, options = self._fmu.dll, self._options
         self._do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
-        self._step_status = StepStatus(dll, self._component, "fmi2")
-        if self._options.retry_discarded_steps:
-            self._retrying = RetriedSteps(self._fmu, self._do_step, self._waited, self._asks_to_end, self._failed)
-
-    def _needs_python(self) -> bool:
-        return bool(self._options.retry_discarded_steps or self._options.linear_inputs)
+        self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
+        self._by_calls = bool(options.retry_discarded_steps or options.linear_inputs)
+        self._kept_state = ctypes.c_void_p()
+        """That before the step, where steps are retried."""
 
     def _step_by_calls(self, step: int) -> None:
         self._check_not_terminated()
         super()._step_by_calls(step)
 
-    def _take_step(self, step: int) -> None:
-        if self._derivatives:
-            self._set_derivatives(self._derivatives)
-        take = self._retrying or self._do_step
-        status = take(self._self, self._time_of(step), self._step_size, 1)
+    def _complete(self, step: int, status: int | None) -> None:
+        time = self._time_of(step)
+        if status is None:
+            if self._derivatives:
+                self._set_derivatives(self._derivatives)
+            if self._options.retry_discarded_steps:
+                status = self._checked(lambda: self._retried(time, self._step_size))
+            else:
+                status = self._do_step(self._self, time, self._step_size, 1)
         if status > WARNING:
-            self._complete(step, status)
+            self._finish(status, time + self._step_size)
 
-    def _complete(self, step: int, status: int) -> None:
-        self._finish(status, self._time_of(step) + self._step_size)
+    def _retried(self, time: float, step_size: float) -> int:
+        """Take a step, a discarded one in smaller steps; `DISCARD`: the smallest was discarded, `_ENDS`: it is the end.
+
+        After fmi2Discard, only fmi2SetFMUstate is allowed (FMI 2.0, 4.2.4), so the state is kept before every step.
+        """
+        fmu, state = self._fmu, ctypes.byref(self._kept_state)
+
+        def attempt(start: float, size: float) -> int:
+            fmu.fmi2GetFMUstate(self._component, state)
+            status = self._do_step(self._self, start, size, 0)
+            if status == PENDING:
+                status = self._step_status.wait()
+            if status == DISCARD:
+                if self._asks_to_end():
+                    return _ENDS
+                fmu.fmi2SetFMUstate(self._component, self._kept_state)
+            return status
+
+        status = attempt(time, step_size)
+        return take_sub_steps(attempt, time, step_size) if status == DISCARD else status
 
     def _set_derivatives(self, derivatives: Mapping[str, float]) -> None:
         references = [self._variables[name].value_reference for name in derivatives]
-        try:
-            self._fmu.setRealInputDerivatives(references, [1] * len(references), list(derivatives.values()))
-        except FMICallException as error:
-            raise self._failed(error.function, status=error.status) from error
+        orders, values = [1] * len(references), list(derivatives.values())
+        self._checked(lambda: self._fmu.setRealInputDerivatives(references, orders, values))
 
     def _finish(self, status: int, end: float) -> None:
         """Complete a step to ``end`` (s) whose ``status`` is above warning (FMI 2.0, 4.2.1).
@@ -99,13 +108,14 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
             TerminationRequested: the FMU asks to end the simulation before the end of the step.
         """
         if status == PENDING:
-            status = self._waited()
+            status = self._step_status.wait()
         if status <= WARNING:
             return
-        if status != DISCARD:
+        retries = self._options.retry_discarded_steps
+        if status not in (DISCARD, _ENDS):
             raise self._failed("fmi2DoStep", status=status)
         messages = self._last_messages
-        if self._asks_to_end() if self._retrying is None else self._retrying.ends:
+        if status == _ENDS or (not retries and self._asks_to_end()):
             # The outputs are those of the last successful time: a row, if this is the end of the step.
             last_time = self._step_status.last_successful_time()
             self._terminated = last_time is not None and not resolvable(last_time, end)
@@ -113,7 +123,7 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
                 raise self._end_requested()
             self._said.note(quiet_until=-math.inf)  # `_step_by_calls` refuses the next step
             return
-        if self._retrying is not None:
+        if retries:
             raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # a message about these questions is not the reason of the failure
@@ -127,15 +137,6 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
     def _check_not_terminated(self) -> None:
         if self._terminated:
             raise self._end_requested()
-
-    def _end_requested(self) -> TerminationRequested:
-        return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
-
-    def _waited(self) -> int:
-        status = self._step_status.wait()
-        if status is None:
-            raise self._failed("fmi2DoStep returned pending, and fmi2GetStatus does not tell when the step is done")
-        return status
 
     def _asks_to_end(self) -> bool:
         """Whether a discarded step means that the FMU asks to end; most FMUs do not know this question."""
@@ -152,5 +153,5 @@ class Fmi2Instance(NativeInstance, Fmi2Values):
         self._said.note(quiet_until=math.inf)
 
     def _release(self) -> None:
-        if self._retrying is not None:
-            self._retrying.free()
+        if self._kept_state.value is not None:
+            self._fmu.fmi2FreeFMUstate(self._component, ctypes.byref(self._kept_state))

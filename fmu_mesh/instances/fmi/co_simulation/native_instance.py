@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from ....errors import NotFinite
@@ -47,6 +47,12 @@ class NativeInstance(FmuInstance):
     _do_step: Function
     """The function of the FMU, as cffi calls it."""
 
+    _by_calls = False
+    """Whether the steps have a part that the library does not know."""
+
+    _derivatives: Mapping[str, float] = {}
+    """Of the linear inputs, in 1/s, for the next step."""
+
     _native: NativeStep | None = None
     _member: MemberTable | None = None
     """The member that takes the steps of `do_step`."""
@@ -65,9 +71,14 @@ class NativeInstance(FmuInstance):
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
         super().bind(inputs, outputs, grid, points, step)
         self._native = self._member = None
-        self._in_step: tuple[Callable[[Pointer, int], int], Pointer] = self._in_python, None
+
+        def by_calls(_member: Pointer, step: int) -> int:
+            self._step_by_calls(step)
+            return 0
+
+        self._in_step: tuple[Callable[[Pointer, int], int], Pointer] = by_calls, None
         # A setter of the library has one address to read from; in a ring with more rows, it changes in every step.
-        if native.library is None or inputs.rows > 1 or self._needs_python():
+        if native.library is None or inputs.rows > 1 or self._by_calls:
             return
         buffers = [part.buffer for part in (*self._setters, *self._getters) if part.buffer is not None]
         if not all(isinstance(buffer, NumberBuffer) for buffer in buffers):
@@ -77,6 +88,10 @@ class NativeInstance(FmuInstance):
         self._member = member = self._table(self._native, outputs)
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
         self._in_step = take, pointer(ctypes.addressof(member))
+
+    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
+        """See `TakesDerivatives` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
+        self._derivatives = derivatives  # the FMU gets them after the values of these inputs
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
@@ -111,39 +126,28 @@ class NativeInstance(FmuInstance):
                 self._fail_to_get(status)
 
     @abstractmethod
-    def _needs_python(self) -> bool:
-        """Whether the steps have a part that the library does not know."""
+    def _complete(self, step: int, status: int | None) -> None:
+        """Complete own step ``step`` after the FMU has returned ``status``, or has said that there is more to do.
 
-    @abstractmethod
-    def _take_step(self, step: int) -> None:
-        """Take own step ``step`` with a call of the FMU; the inputs are set."""
-
-    @abstractmethod
-    def _complete(self, step: int, status: int) -> None:
-        """Complete own step ``step`` after the FMU has returned ``status``, or has said that there is more to do."""
-
-    def _in_python(self, _member: Pointer, step: int) -> int:
-        """In the place of the function of the library."""
-        self._step_by_calls(step)
-        return 0
+        None: it was not called yet; the inputs are set.
+        """
 
     def _step_by_calls(self, step: int) -> None:
         """`do_step` with one call for each function."""
         self._set_inputs(step)
-        self._take_step(step)
+        self._complete(step, None)
         self._said.note(step=step + 1)
         self._read_outputs(step + 1)
 
     def _tables(self) -> NativeStep:
-        sized = self._kind == StepKind.FMI3
         return NativeStep(
             kind=self._kind,
             component=self._component,
             do_step=address_of(self._do_step),
             said=ctypes.addressof(self._said),
             loads=[move for part in self._setters for move in _moves(part, load=True)],
-            setters=[part.in_table(sized=sized) for part in self._setters],
-            getters=[part.in_table(sized=sized) for part in self._getters],
+            setters=[part.in_table for part in self._setters],
+            getters=[part.in_table for part in self._getters],
             stores=[move for part in self._getters for move in _moves(part, load=False)],
             kept=(self._said, *self._setters, *self._getters),
         )

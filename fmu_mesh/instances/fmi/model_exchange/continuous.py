@@ -3,42 +3,65 @@
 Owns inputs and outputs of a model: an input that jumps is an event at a communication point (FMI 2.0, 3.1). Within a
 step inputs are constant, or linear where a connection says so; where the next line goes on from there, there is no
 event. The way from one communication point to the next is
-`fmu_mesh.instances.fmi.model_exchange.model_exchange`; the versions of FMI are in `model_instances`.
+`fmu_mesh.instances.fmi.model_exchange.model_exchange`.
 """
 
 from __future__ import annotations
 
 import ctypes
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from fmpy.fmi1 import FMICallException
+from fmpy.fmi1 import FMICallException, FMU1Model
+from fmpy.fmi2 import FMU2Model
+from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
 
-from ....errors import TerminationRequested
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ..calls import cffi_function, memory
 from ..clocks import NO_CLOCKS, Clocks
-from ..fmu_instance import FmuInstance
+from ..fmi_versions import (
+    FMI1_VALUES,
+    FMI2_NAMES,
+    FMI2_NEEDED,
+    FMI2_VALUES,
+    FMI3_NEEDED,
+    FMI3_VALUES,
+    Fmi1,
+    Fmi2,
+    Fmi3,
+)
+from ..fmu_instance import Bookkeeping, FmuInstance
 from ..fmu_values import WARNING
-from ..state import Bookkeeping
-from .model_calls import ModelCalls
+from ..loaded_fmu import FmuFunctions
+from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
 from .model_exchange import EventLoop
-from .solver import SolverFailed
 
-__all__ = ["ContinuousInstance"]
+__all__ = ["ContinuousInstance", "Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
 
-T = TypeVar("T")
 _RowBytes = tuple[bytes | list[Any], ...]
+
+_NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
+_NEEDED_1 = "fmiInstantiateModel", "fmiSetTime", "fmiInitialize", "fmiEventUpdate"
+_NEEDED_2 = *FMI2_NEEDED, "fmi2SetTime", "fmi2NewDiscreteStates", "fmi2EnterContinuousTimeMode"
+_NEEDED_3 = (
+    "fmi3InstantiateModelExchange",
+    *FMI3_NEEDED,
+    "fmi3SetTime",
+    "fmi3UpdateDiscreteStates",
+    "fmi3EnterContinuousTimeMode",
+)
 
 
 class ContinuousInstance(FmuInstance):
     """The part of model exchange that all versions share; to be named before the base class of the version."""
+
+    _calls: type[ModelCalls] = ModelCalls
+    """Those of this version."""
 
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
@@ -57,6 +80,7 @@ class ContinuousInstance(FmuInstance):
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
         """See `Instance`."""
+        self._solver = f"solver {self._options.solver.name}: "
         self._time_of_start, self._stop_time = start_time, math.inf if stop_time is None else stop_time
         super().enter_initialization(start_time, stop_time, start_values)
 
@@ -129,13 +153,9 @@ class ContinuousInstance(FmuInstance):
         next_event = math.inf if kept.next_event is None else kept.next_event
         self._checked(lambda: (self._loop or self._make_loop()).resume(kept.time or 0.0, next_event))
 
-    @abstractmethod
-    def _model_calls(self) -> ModelCalls:
-        """The functions of the model, once it is instantiated."""
-
     def _make_loop(self) -> EventLoop:
         self._loop = EventLoop(
-            self._model_calls(),
+            self._calls(self._fmu, self._description, self._symbols),
             self._options.solver,
             tell_completed_steps=self._description.tell_completed_steps,
             stop_time=self._stop_time,
@@ -157,7 +177,7 @@ class ContinuousInstance(FmuInstance):
         """
         loop = self._event_loop()
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
-            raise TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+            raise self._end_requested()
 
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.
@@ -197,24 +217,53 @@ class ContinuousInstance(FmuInstance):
         variables = [self._variables[name] for name in slopes]
         references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
         values = (ctypes.c_double * count)()
-        where, what = memory(references), memory(values)
-        function = cffi_function(self._function("Set", "Float64"), self._direct_declaration)
+        functions = self._functions.values
+        function = cffi_function(self._function("Set", "Float64"), functions.declaration)
+        arguments = [self._self, memory(references), count, memory(values), *([count] if functions.sized else [])]
         at_start = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
         pairs = list(zip(at_start, slopes.values(), strict=True))
 
         def set_inputs(time: float) -> None:
             values[:] = [value + (time - start) * slope for value, slope in pairs]
-            status = self._call_direct(function, where, count, what, count)
+            status = function(*arguments)
             if status > WARNING:
                 raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
 
         return set_inputs
 
-    def _checked(self, call: Callable[[], T]) -> T:
-        """Call the model; a failure of the model or of the solver becomes an error of this instance."""
-        try:
-            return call()
-        except FMICallException as error:
-            raise self._failed(error.function, status=error.status) from error
-        except SolverFailed as error:
-            raise self._failed(f"solver {self._options.solver.name}: {error}") from error
+
+class Fmi1ModelInstance(ContinuousInstance, Fmi1):
+    """One instance of an FMI 1.0 FMU for model exchange (FMI 1.0, 2.8)."""
+
+    _functions = FmuFunctions(FMU1Model, FMI1_VALUES, "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
+    _calls = Fmi1Calls
+
+    def _instantiate(self, **arguments: object) -> None:
+        super()._instantiate(**arguments)
+        self._own_calls = Fmi1Calls(self._fmu, self._description, self._symbols)
+
+    def _initialize(self, start_time: float, stop_time: float | None) -> None:
+        """FmiInitialize (FMI 1.0, 2.5)."""
+        tolerance = self._options.solver.relative_tolerance
+        self._checked(lambda: self._own_calls.initialize(start_time, tolerance))
+
+    def _terminate(self) -> None:
+        self._own_calls.terminate()
+
+
+class Fmi2ModelInstance(ContinuousInstance, Fmi2):
+    """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
+
+    _functions = FmuFunctions(FMU2Model, FMI2_VALUES, "fmi2FreeInstance", _NEEDED_2, FMI2_NAMES)
+
+
+class Fmi3ModelInstance(ContinuousInstance, Fmi3):
+    """One instance of an FMI 3.0 FMU for model exchange (FMI 3.0, 3.2)."""
+
+    _functions = FmuFunctions(FMU3Model, FMI3_VALUES, "fmi3FreeInstance", _NEEDED_3, {"instantiate": _NEEDED_3[0]})
+    _calls = Fmi3Calls
+
+    def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
+        super()._enter_initialization(start_time, stop_time, start_values)
+        self._clocks = Clocks(self._fmu, self._description.clocks)
+        self._clocks.start(start_time)

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
-from ..calls import declared
+from ....variables.model_description import ModelDescription
+from ..calls import checked_function
 from ..fmu_library import MISSING
-from ..fmu_values import WARNING
 
 __all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
 
@@ -42,63 +43,54 @@ class EventInfo(NamedTuple):
 
 
 class ModelCalls:
-    """The model exchange functions of one instance; `Equations` of a solver, too.
-
-    Args:
-        fmu: FMPy's object, instantiated.
-        n_states: number of continuous states.
-        n_indicators: number of event indicators.
-        prefix: what the names of the functions begin with.
+    """The model exchange functions of one instance. Arrays are given as addresses of float64 memory.
 
     Raises:
         FMICallException: by every method: the FMU returned a status above warning.
     """
 
-    def __init__(self, fmu: Any, n_states: int, n_indicators: int, prefix: str) -> None:  # noqa: ANN401 FMPy is untyped
-        self.n_states = n_states
-        self.n_indicators = n_indicators
+    _nominals = "GetNominalsOfContinuousStates"
+    _derivatives = "GetDerivatives"
+
+    def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped
+        self.n_states = description.continuous_states
+        self.n_indicators = description.event_indicators
         self._fmu = fmu
         self._component = fmu.component
-        self._prefix = prefix
-        self._set_time = self._declare("SetTime", _TIME)
-        self._set_states = self._declare("SetContinuousStates", _ARRAY)
-        self._get_states = self._declare("GetContinuousStates", _ARRAY)
-        self._get_indicators = self._declare("GetEventIndicators", _ARRAY)
-        self._get_nominals, self._get_derivatives = self._differing()
+        self._symbols = symbols
+        self._line: Callable[[float], None] | None = None
+        self._set_time = self._function("SetTime", _TIME)
+        self._set_states = self._function("SetContinuousStates", _ARRAY)
+        self._get_states = self._function("GetContinuousStates", _ARRAY)
+        self._get_indicators = self._function("GetEventIndicators", _ARRAY)
+        self._get_nominals = self._function(self._nominals, _ARRAY)
+        self._get_derivatives = self._function(self._derivatives, _ARRAY)
 
-    def _differing(self) -> tuple[Any, Any]:
-        return self._declare("GetNominalsOfContinuousStates", _ARRAY), self._declare("GetDerivatives", _ARRAY)
+    def _function(self, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
+        return checked_function(self._fmu.dll, self._symbols, name, prototype)
 
-    def _declare(self, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
-        function = declared(self._fmu.dll, self._prefix + name, prototype)
-        function.errcheck = self._checked(self._prefix.rpartition("_")[2] + name)
-        return function
-
-    @staticmethod
-    def _checked(name: str) -> Any:  # noqa: ANN401 as above
-        def check(status: int, _function: object, _arguments: object) -> int:
-            if status > WARNING:
-                raise FMICallException(function=name, status=status)
-            return status
-
-        return check
+    def follow(self, line: Callable[[float], None] | None) -> None:
+        """From now on, ``line`` sets inputs at the time of every `set_point`; None: they stay as they are."""
+        self._line = line
 
     def set_time(self, time: float) -> None:
         """Set the time in s."""
         self._set_time(self._component, time)
 
     def set_point(self, time: float, states: int) -> None:
-        """See `Equations.set_point`."""
+        """Put the model at a time in s, at these continuous states and at the inputs of this time."""
         self._set_time(self._component, time)
         if self.n_states:
             self._set_states(self._component, states, self.n_states)
+        if self._line is not None:
+            self._line(time)
 
     def get_states(self, states: int) -> None:
-        """See `Equations.get_states`."""
+        """The continuous states that the model is at."""
         self._get_states(self._component, states, self.n_states)
 
     def get_nominals(self, nominals: int) -> None:
-        """See `Equations.get_nominals`."""
+        """The nominal values of the continuous states; 1 if the library does not have this function."""
         try:
             self._get_nominals(self._component, nominals, self.n_states)
         except FMICallException as error:
@@ -107,11 +99,11 @@ class ModelCalls:
             (ctypes.c_double * self.n_states).from_address(nominals)[:] = [1.0] * self.n_states
 
     def get_derivatives(self, derivatives: int) -> None:
-        """See `Equations.get_derivatives`."""
+        """The derivatives of the continuous states where the model is."""
         self._get_derivatives(self._component, derivatives, self.n_states)
 
     def get_indicators(self, indicators: int) -> None:
-        """See `Equations.get_indicators`."""
+        """The event indicators where the model is."""
         self._get_indicators(self._component, indicators, self.n_indicators)
 
     def enter_event_mode(self) -> None:
@@ -141,12 +133,14 @@ class Fmi1Calls(ModelCalls):
     FMPy takes the status of these functions for text and does not check it, so they are called by our own prototypes.
     """
 
-    def __init__(self, fmu: Any, n_states: int, n_indicators: int) -> None:  # noqa: ANN401 FMPy is untyped
-        super().__init__(fmu, n_states, n_indicators, f"{fmu.modelIdentifier}_fmi")
-        self._event_update = self._declare("EventUpdate", _EVENT_UPDATE)
-        self._completed_step = self._declare("CompletedIntegratorStep", _COMPLETED)
-        self._initialize = self._declare("Initialize", _INITIALIZE)
-        self._terminate = self._declare("Terminate", _TERMINATE)
+    _nominals = "GetNominalContinuousStates"
+
+    def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped
+        super().__init__(fmu, description, symbols)
+        self._event_update = self._function("EventUpdate", _EVENT_UPDATE)
+        self._completed_step = self._function("CompletedIntegratorStep", _COMPLETED)
+        self._initialize = self._function("Initialize", _INITIALIZE)
+        self._terminate = self._function("Terminate", _TERMINATE)
 
     def terminate(self) -> None:
         """End the simulation."""
@@ -156,9 +150,6 @@ class Fmi1Calls(ModelCalls):
         """Compute what follows from the values that were set, at ``time`` in s (FMI 1.0, 2.5)."""
         self.set_time(time)
         self._initialize(self._component, b"\1", tolerance, ctypes.byref(fmi1EventInfo()))
-
-    def _differing(self) -> tuple[Any, Any]:
-        return self._declare("GetNominalContinuousStates", _ARRAY), self._declare("GetDerivatives", _ARRAY)
 
     def enter_event_mode(self) -> None:
         """There is no such mode."""
@@ -183,14 +174,12 @@ class Fmi1Calls(ModelCalls):
 class Fmi3Calls(ModelCalls):
     """FMI 3.0, where the FMU says itself how many states and indicators it has: it depends on structural parameters."""
 
-    def __init__(self, fmu: Any) -> None:  # noqa: ANN401 FMPy is untyped
-        super().__init__(fmu, fmu.getNumberOfContinuousStates(), fmu.getNumberOfEventIndicators(), "fmi3")
+    _derivatives = "GetContinuousStateDerivatives"
 
-    def _differing(self) -> tuple[Any, Any]:
-        return (
-            self._declare("GetNominalsOfContinuousStates", _ARRAY),
-            self._declare("GetContinuousStateDerivatives", _ARRAY),
-        )
+    def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped
+        super().__init__(fmu, description, symbols)
+        self.n_states = fmu.getNumberOfContinuousStates()
+        self.n_indicators = fmu.getNumberOfEventIndicators()
 
     def update_discrete_states(self) -> EventInfo:
         """One event iteration, in event mode."""

@@ -20,11 +20,12 @@ from typing import Final
 
 import numpy as np
 
+from ....simtime import resolvable
 from ..clocks import NO_CLOCKS, Clocks
+from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
-from .cvode import CVodeSolver
 from .model_calls import ModelCalls
-from .solver import Equations, EulerSolver, NothingToSolve, Solver, SolverFailed, resolvable
+from .solver import make_solver
 
 __all__ = ["EventLoop"]
 
@@ -35,12 +36,8 @@ EVENT_ITERATIONS: Final = 1000
 class EventLoop:
     """One model between its communication points.
 
-    Args:
-        calls: the functions of the model.
-        settings: of the solver.
-        tell_completed_steps: whether the FMU needs to know of completed integrator steps.
-        stop_time: the stop time of the FMU in s; its time is never set to a later one.
-        clocks: the clocks of the model.
+    The time of the FMU is never set to a later one than ``stop_time`` (s). It is told of completed integrator steps if
+    it needs that.
 
     Attributes:
         terminated: whether the FMU has asked to end the simulation; nothing may be advanced then.
@@ -70,8 +67,7 @@ class EventLoop:
         self._next_event = math.inf
         self._event_time = -math.inf
         self._events_there = 0
-        self._equations = _TimedEquations(calls)
-        self._solver = _make_solver(settings, self._equations)
+        self._solver = make_solver(settings, calls)
 
     def start(self, time: float) -> None:
         """Handle the first event at ``time`` (s), in event mode after Initialization Mode."""
@@ -87,26 +83,21 @@ class EventLoop:
     def set_inputs(self, set_values: Callable[[], None], line: Callable[[float], None] | None) -> None:
         """Set inputs as an `event` at the start of a step.
 
-        Args:
-            set_values: sets all inputs.
-            line: sets the inputs that change within the step, at a time in s; None if all are constant.
+        ``line`` sets the inputs that change within the step, at a time in s; None if all are constant.
         """
-        self._equations.follow(None)
+        self._calls.follow(None)
         self.event(set_values)
-        self._equations.follow(line)
+        self._calls.follow(line)
 
     def follow(self, line: Callable[[float], None]) -> None:
         """Continue with inputs that change continuously: no event, and the solver goes on (FMI 2.0, 3.2.1).
 
         If the small jump of an extrapolated input takes an event indicator over 0, that is an `event`.
-
-        Args:
-            line: see `set_inputs`.
         """
         above = self._above_zero()
         line(self._time)
         if self._above_zero() == above:
-            self._equations.follow(line)
+            self._calls.follow(line)
         else:
             self.set_inputs(lambda: line(self._time), line)
 
@@ -126,13 +117,13 @@ class EventLoop:
     def resume(self, time: float, next_event: float) -> None:
         """Continue where `place` was, in continuous-time mode; the solver starts anew."""
         self.terminated = False
-        self._equations.follow(None)
+        self._calls.follow(None)
         self._time, self._next_event = time, next_event
         self.restart()
 
     def restart(self) -> None:
         """Let the solver start anew here."""
-        self._solver.restart(self._time)
+        self._solver.restart()
 
     def close(self) -> None:
         """Free the solver."""
@@ -182,7 +173,7 @@ class EventLoop:
             self._clocks.update_intervals(self._time)
             self._next_event = min(next_event, self._clocks.next_tick)
             self._calls.enter_continuous_time_mode()
-            self._solver.restart(self._time)
+            self._solver.restart()
 
     def _iterate(self) -> tuple[bool, float]:
         """Update the discrete states until they need no update; whether the FMU asks to end, and its next time event.
@@ -196,35 +187,3 @@ class EventLoop:
             if info.terminate or not info.again:
                 return info.terminate, info.next_event
         raise SolverFailed(f"the discrete states at t = {self._time:.12g} s need more than {EVENT_ITERATIONS} updates")
-
-
-class _TimedEquations:
-    """The equations of a model whose inputs may be functions of time within a communication step."""
-
-    def __init__(self, calls: ModelCalls) -> None:
-        self.n_states = calls.n_states
-        self.n_indicators = calls.n_indicators
-        self._calls = calls
-        self._line: Callable[[float], None] | None = None
-        self.get_states = calls.get_states
-        self.get_nominals = calls.get_nominals
-        self.get_derivatives = calls.get_derivatives
-        self.get_indicators = calls.get_indicators
-
-    def follow(self, line: Callable[[float], None] | None) -> None:
-        """From now on, ``line`` sets inputs at the time of every evaluation; None: they stay as they are."""
-        self._line = line
-
-    def set_point(self, time: float, states: int) -> None:
-        """See `Equations.set_point`."""
-        self._calls.set_point(time, states)
-        if self._line is not None:
-            self._line(time)
-
-
-def _make_solver(settings: SolverSettings, equations: Equations) -> Solver:
-    if equations.n_states == 0 and equations.n_indicators == 0:
-        return NothingToSolve()
-    if settings.name == "euler":
-        return EulerSolver(equations, settings.maximum_step_size)
-    return CVodeSolver(equations, settings.relative_tolerance, settings.maximum_step_size)
