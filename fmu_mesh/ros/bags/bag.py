@@ -24,8 +24,7 @@ from ...text import listed, nearest, nearest_file
 from ...variables.model_description import ModelDescription, Value
 from ...variables.value_types import nested
 from ...wire.views import InstanceInfo
-from ..gateway.mapping import descriptions_of, message_types
-from ..gateway.resolver import Resolver
+from ..gateway.mapping import Resolver, descriptions_of, message_types
 from ..messages.definitions import MessageTypes, path_parts
 from ..messages.stamp import nanoseconds
 from ..messages.topics import Port, Topic
@@ -149,15 +148,14 @@ def topics_for(
     """As `chosen_topics`, for model descriptions by instance name."""
     there = bag.topics
     section = loaded.config.ros or RosConfig()
-    config = replace(loaded.config, ros=section)
     findings = loaded.findings()
-    types = message_types(replace(loaded, config=config), findings)
+    types = message_types(loaded, section, findings)
     findings.raise_any()
     assert types is not None
     bag.add_types(types)
     # Each choice is a section of its own: a field may go to several variables.
     sections = [replace(section, topics=[_entry(choice, there)]) for choice in choices] or [section]
-    found = [one for own in sections for one in Resolver(config, own, descriptions, types, findings).topics()]
+    found = [one for own in sections for one in Resolver(loaded.config, own, descriptions, types, findings).topics()]
     if choices and len(findings):
         problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
         raise ConfigurationError(f"`topics=...`: {problems}.")

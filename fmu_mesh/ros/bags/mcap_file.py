@@ -23,8 +23,7 @@ from ...files import Kept, open_alone
 from ...installing import importing
 from ...system.recording import Columns, Recording
 from ...variables.model_description import ModelDescription
-from ..gateway.mapping import message_types
-from ..gateway.resolver import Resolver
+from ..gateway.mapping import Resolver, message_types
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
@@ -262,19 +261,18 @@ def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
     """
     loaded, descriptions = recording.loaded, recording.descriptions
     section = loaded.config.ros or RosConfig()
-    config = replace(loaded.config, ros=section)
-    types = message_types(replace(loaded, config=config), findings)
+    types = message_types(loaded, section, findings)
     if types is None:
         return None
     recorded = _whole(recording, findings)
     wanted = set(recorded)
     # The findings about the section itself are reported where the section is checked.
-    plan = Resolver(config, section, descriptions, types, Findings(str(loaded.file))).plan()
+    plan = Resolver(loaded.config, section, descriptions, types, Findings(str(loaded.file))).plan()
     configured = tuple(topic for topic in plan.topics if _variables(topic) <= wanted) if loaded.config.ros else ()
     covered = {variable for topic in configured for variable in _variables(topic)}
     rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
     own = Findings(str(loaded.file))
-    others = Resolver(config, rest, _published(descriptions, wanted), types, own).plan().topics
+    others = Resolver(loaded.config, rest, _published(descriptions, wanted), types, own).plan().topics
     section_file = loaded.config.records[recording.place].file
     for finding in own:
         findings.add(f"{recording.place}.file", f"in '{section_file}': {finding.found}", finding.expected)

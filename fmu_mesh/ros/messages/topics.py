@@ -1,6 +1,6 @@
 """The topics of a mesh or of a node: plain values.
 
-`fmu_mesh.ros.gateway.resolver` makes them from a configuration, `fmu_mesh.ros.node.node_topics` from the parameters of
+`fmu_mesh.ros.gateway.mapping` makes them from a configuration, `fmu_mesh.ros.node.node_topics` from the parameters of
 a ROS node.
 """
 
