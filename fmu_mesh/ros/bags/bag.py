@@ -1,4 +1,6 @@
-"""Reading a bag (MCAP or SQLite, by `ros2 bag` or by a mesh) with `rosbags`, and which of its topics are inputs.
+"""Reading a bag (MCAP or SQLite, by `ros2 bag` or by a mesh), which of its topics are inputs, and bags in scenarios.
+
+`rosbags` finds the messages; our own `Disassembler` reads them, as it does in the gateway.
 
 Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a sample.
 """
@@ -6,39 +8,36 @@ Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
 from ... import files
+from ...config.findings import Findings
 from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
+from ...config.scenario_section import ScenarioSource, ScenarioValues
 from ...errors import ConfigurationError
 from ...installing import importing
 from ...system.recording import reading
+from ...system.scenario import BagValues, is_bag
 from ...text import listed, nearest, nearest_file
 from ...variables.model_description import ModelDescription, Value
-from ...variables.value_types import nested
-from ...wire.views import InstanceInfo
-from ..gateway.mapping import Resolver, descriptions_of, message_types
-from ..messages.definitions import MessageTypes, path_parts
+from ..gateway.mapping import Resolver, message_types
+from ..messages.assembling import Disassembler
+from ..messages.cdr import CdrError
+from ..messages.definitions import MessageTypes
 from ..messages.stamp import nanoseconds
-from ..messages.topics import Port, Topic
+from ..messages.topics import Topic
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
-from collections.abc import Callable
-from functools import partial
 
-from ...config.findings import Findings
-from ...config.scenario_section import ScenarioSource, ScenarioValues
-from ...system.scenario import BagValues, is_bag
-
-__all__ = ["Bag", "BagSample", "bag_values", "chosen_topics", "timed", "topics_for"]
+__all__ = ["Bag", "BagSample", "bag_values", "timed", "topics_for"]
 
 _CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
 
@@ -90,6 +89,8 @@ class Bag:
                 files.opened(path).close()  # no pipe
             self._reader: AnyReader = AnyReader([path])
             self._reader.open()
+        self._types = MessageTypes()
+        self._types.store.fielddefs.update(self._reader.typestore.fielddefs)  # its own come first
 
     def __enter__(self) -> Self:
         return self
@@ -117,27 +118,30 @@ class Bag:
         Raises:
             ConfigurationError: a message has no such array element, or an array of another size.
         """
-        wanted: dict[str, list[tuple[list[str | int], Port]]] = {}
-        for topic in topics:  # several of one name give one message to several variables
-            wanted.setdefault(topic.name, []).extend((path_parts(port.path), port) for port in topic.ports)
-        connections = [connection for connection in self._reader.connections if connection.topic in wanted]
+        wanted: dict[str, list[Disassembler]] = {}
         with reading(self.path, "bag"):
+            for topic in topics:  # several of one name give one message to several variables
+                wanted.setdefault(topic.name, []).append(Disassembler(topic, self._types))
+            connections = [connection for connection in self._reader.connections if connection.topic in wanted]
             for connection, logged, data in self._reader.messages(connections) if connections else ():
-                message: Any = self._reader.deserialize(data, connection.msgtype)
-                stamp = _header_stamp(message) if stamps == "header" else None
-                for parts, port in wanted[connection.topic]:
-                    value = _value_at(message, parts, port, connection.topic)
-                    yield BagSample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
+                for own in wanted[connection.topic]:
+                    try:
+                        values, stamp = own.values(data)
+                    except CdrError as error:
+                        raise ConfigurationError(f"a message of '{connection.topic}': {error}.") from error
+                    at = logged if stamp is None or stamps == "log" else stamp
+                    for port, value in zip(own.topic.ports, values, strict=True):
+                        yield BagSample(at, port.instance, port.variable.name, value)
 
 
-def chosen_topics(
-    loaded: LoadedConfig, infos: Mapping[str, InstanceInfo], bag: Bag, choices: Sequence[str] = ()
+def topics_for(
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], bag: Bag, choices: Sequence[str] = ()
 ) -> list[Topic]:
     """The topics of a bag that are played into inputs of a mesh.
 
     Args:
         loaded: the configuration of the mesh.
-        infos: the information of every instance, by name.
+        descriptions: the model descriptions by instance name.
         bag: the bag.
         choices: each is `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE`. Without choices, the topics are
             those that the mesh subscribes to: by its `ros` section, or by the default names of its inputs.
@@ -145,13 +149,6 @@ def chosen_topics(
     Raises:
         ConfigurationError: a choice is wrong, or the mesh subscribes to no topic of the bag.
     """
-    return topics_for(loaded, descriptions_of(infos), bag, choices)
-
-
-def topics_for(
-    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], bag: Bag, choices: Sequence[str] = ()
-) -> list[Topic]:
-    """As `chosen_topics`, for model descriptions by instance name."""
     there = bag.topics
     section = loaded.config.ros or RosConfig()
     findings = loaded.findings()
@@ -208,37 +205,6 @@ def _entry(choice: str, there: Mapping[str, str]) -> RosTopicConfig:
     return RosTopicConfig(topic=topic, type=there[topic], fields={found["field"] or "data": found["variable"]})
 
 
-def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosbags
-    """The stamp of the header in ns; None without a header, or if it is 0."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None or not (stamp.sec or stamp.nanosec):
-        return None
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _value_at(message: Any, parts: Sequence[str | int], port: Port, topic: str) -> Value:  # noqa: ANN401 of rosbags
-    """A field as the value of a variable; an array gets the shape of the variable."""
-    value = message
-    try:
-        for part in parts:
-            value = value[part] if isinstance(part, int) else getattr(value, part)
-    except IndexError as error:
-        raise ConfigurationError(f"a message of '{topic}' has no '{port.path}'.") from error
-    plain: Value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-    if not port.variable.shape:
-        return plain
-    if not isinstance(plain, list) or len(plain) != port.variable.size:
-        raise ConfigurationError(
-            f"a message of '{topic}' does not have the {port.variable.size} elements of "
-            f"'{port.instance}.{port.variable.name}'."
-        )
-    return nested(plain, port.variable.shape)
-
-
-_Key = tuple[str, str, float | None]
-"""File, stamps, and the time of the first message."""
-
-
 def bag_values(
     source: ScenarioSource, loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Findings
 ) -> dict[str, BagValues]:
@@ -250,7 +216,8 @@ def bag_values(
         descriptions: the model descriptions by instance name. What refers to no variable of them is left out.
         findings: where everything goes that is wrong with a bag.
     """
-    wanted: dict[_Key, dict[str, ScenarioValues]] = {}
+    # One reading for all that name the same file, stamps, and time of the first message.
+    wanted: dict[tuple[str, str, float | None], dict[str, ScenarioValues]] = {}
     for reference, values in source.config.values.items():
         instance, _, name = reference.partition(".")
         known = instance in descriptions and descriptions[instance].variable(name) is not None
@@ -262,8 +229,7 @@ def bag_values(
         places = {reference: f"{source.prefix}values.{reference}" for reference in entries}
         try:
             with Bag(source.resolve(file)) as bag:
-                find = partial(topics_for, loaded, descriptions, bag)
-                topics = _topics(entries, bag, find, source.prefix, findings)
+                topics = _topics(entries, bag, partial(topics_for, loaded, descriptions, bag), source.prefix, findings)
                 samples = timed(bag.samples(topics, "log" if stamps == "log" else "header"), start)
         except ConfigurationError as error:
             _add(f"{next(iter(places.values()))}.file", error, "a bag that can be read", findings)

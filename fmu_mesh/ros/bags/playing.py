@@ -23,7 +23,8 @@ from ...wire.client.mesh_client import MeshClient
 from ...wire.client.pausing import go_on, paused_at, wait_until_at
 from ...wire.client.readings import Target
 from ...wire.views import Command, MeshInfo
-from .bag import Bag, BagSample, chosen_topics, timed
+from ..gateway.mapping import descriptions_of
+from .bag import Bag, BagSample, timed, topics_for
 from .play_options import PlayOptions
 
 __all__ = ["Moment", "Played", "grid_of", "play", "play_bag", "running_configuration", "schedule"]
@@ -68,7 +69,7 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options:
     step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
     if loaded is None or options.config is not None:
         loaded = running_configuration(Path(options.config or mesh.config))
-    topics = chosen_topics(loaded, infos, bag, options.topics)
+    topics = topics_for(loaded, descriptions_of(infos), bag, options.topics)
     samples = bag.samples(topics, options.stamps)
     moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=options.start)
     names = [topic.name for topic in topics]

@@ -236,7 +236,7 @@ class Gateway:
             message = subscribed.disassembler.topic.message
             subscribed.warn(f"a message of {len(data)} bytes is no '{message}' that can be used: {error}")
             return
-        attachment = subscribed.attachment(stamp)
+        attachment = subscribed.attachment(stamp / 1_000_000_000 if stamp is not None else None)
         for key, value in zip(subscribed.keys, values, strict=True):
             self._publishers[key].put(encode_value(value), attachment=attachment)
 

@@ -17,7 +17,7 @@ from ...variables.model_description import Value
 from ...variables.value_types import DTYPES, flattened, nested
 from .cdr import CdrError, Codec, Message
 from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
-from .stamp import from_stamp, to_stamp
+from .stamp import in_nanoseconds, to_stamp
 from .topics import Port, Topic
 
 __all__ = ["Assembler", "Disassembler"]
@@ -162,8 +162,8 @@ class Disassembler:
         self._stamped = types.has_header(topic.message)
         self._paths = [path_parts(port.path) for port in topic.ports]
 
-    def values(self, data: bytes) -> tuple[list[Value], float | None]:
-        """The values of the ports, and the stamp in s; the stamp is None if it is 0 or if there is no header.
+    def values(self, data: bytes) -> tuple[list[Value], int | None]:
+        """The values of the ports, and the stamp in ns; the stamp is None if it is 0 or if there is no header.
 
         Raises:
             CdrError: the bytes are not such a message, or an element of a port is not in it.
@@ -181,8 +181,7 @@ class Disassembler:
         if not self._stamped:
             return values, None
         stamp = message["header"]["stamp"]
-        time = from_stamp(stamp["sec"], stamp["nanosec"])
-        return values, time or None
+        return values, in_nanoseconds(stamp["sec"], stamp["nanosec"]) or None
 
 
 def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -> Iterator[tuple[str, Message]]:  # noqa: ANN401 any field
