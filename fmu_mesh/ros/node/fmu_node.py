@@ -16,9 +16,8 @@ from ..messages.definitions import CLOCK
 from ..messages.topics import Topic
 from .clock_watch import CLOCK_TOPIC, ClockWatch
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
-from .fmu_topics import LOG_INTERVAL_S, FmuTopics
 from .node_settings import RESERVED, PacedTime, read_settings
-from .node_topics import topics_of
+from .node_topics import LOG_INTERVAL_S, FmuTopics, topics_of
 from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, time_message
 from .variable_parameters import (
     declare_parameters,
