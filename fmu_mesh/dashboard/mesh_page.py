@@ -15,12 +15,12 @@ from nicegui import run, ui
 from ..api.run_handle import Run
 from ..errors import FmuMeshError
 from ..printing import paragraph
-from .instance_table import InstanceTable
+from ..wire.views import InstanceStatus
 from .mesh_follower import MeshFollower, MeshView
 from .plot_card import PlotCard, first_plots
 from .setting_fields import SettingField
 
-__all__ = ["MeshPage"]
+__all__ = ["InstanceTable", "MeshPage"]
 
 _TABLE_S: Final = 1.0
 _PICTURE_S: Final = 1.0
@@ -30,6 +30,21 @@ _VALUES_S: Final = 2.0
 _FIELDS: Final = 8
 _SPANS: Final = {0: "from the start", 1: "last 1 s", 10: "last 10 s", 60: "last 60 s", 600: "last 600 s"}
 _STATES: Final = {"running": "positive", "paused": "warning", "failed": "negative"}
+_COLUMNS: Final = {
+    "instance": "instance",
+    "state": "state",
+    "point": "point",
+    "rate": "points/s",
+    "step": "step time",
+    "share": "computes, waits",
+    "restarts": "restarts",
+    "activity": "activity",
+}
+_BAR: Final = """
+<q-td :props="props"><div class="fm-bar" role="img" :title="props.row.shares" :aria-label="props.row.shares">
+<div :style="{width: props.row.share[0] + '%'}"></div><div :style="{width: props.row.share[1] + '%'}"></div>
+</div></q-td>
+"""
 
 
 class MeshPage:
@@ -293,3 +308,46 @@ def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
         except FmuMeshError:
             break  # it does not run any more
     return values
+
+
+class InstanceTable:
+    """A line for each instance, in the order of the mesh."""
+
+    def __init__(self) -> None:
+        columns = [
+            {"name": name, "label": label, "field": name, "align": "left", "sortable": name != "share"}
+            for name, label in _COLUMNS.items()
+        ]
+        self._table = ui.table(rows=[], columns=columns, row_key="instance").classes("fm-instances fm-numbers")
+        self._table.props("dense flat hide-pagination virtual-scroll :rows-per-page-options=[0]")
+        self._table.add_slot("body-cell-share", _BAR)
+
+    def show(self, view: MeshView) -> None:
+        """Show what is known now."""
+        names = [name for name in view.infos if name in view.instances]
+        rows = [_row(view.instances[name], view.before.get(name)) for name in names]
+        if rows != self._table.rows:
+            self._table.update_rows(rows)
+
+
+def _row(own: InstanceStatus, before: InstanceStatus | None) -> dict[str, Any]:
+    """The row of an instance in the table; rates and shares are those of the last second."""
+    if before is None or before.running_time >= own.running_time or before.point > own.point:  # it was restarted
+        before = InstanceStatus(own.instance, "", "", 0, 0.0, 0.0, 0.0)
+    wall_s = own.running_time - before.running_time
+    points = own.point - before.point
+    rate = points / wall_s if wall_s > 0.0 else 0.0
+    waits = min(100.0, 100.0 * max(0.0, own.wait_time - before.wait_time) / wall_s) if wall_s > 0.0 else 0.0
+    steps_s = own.step_time * own.point - before.step_time * before.point
+    computes = min(100.0 - waits, 100.0 * max(0.0, steps_s) / wall_s) if wall_s > 0.0 else 0.0
+    return {
+        "instance": own.instance,
+        "state": own.state,
+        "point": own.point,
+        "rate": round(rate),
+        "step": f"{1e6 * own.step_time:.3g} us",
+        "share": [round(computes, 1), round(waits, 1)],
+        "shares": f"{computes:.0f} % in its steps, {waits:.0f} % waiting",
+        "restarts": own.restarts,
+        "activity": own.activity.replace(f" at point {own.point}", "", 1),
+    }
