@@ -1,4 +1,4 @@
-"""The interface of a profile: how topics look to ROS, or to a bridge to ROS."""
+"""Profiles: how topics look to ROS, or to a bridge to ROS; and what those on Zenoh have in common."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Protocol
 
 import zenoh
 
-from ..messages.topics import Topic
+from ...wire.session import undeclare_all
+from ..messages.definitions import MessageTypes
+from ..messages.topics import Reliability, Topic
 
-__all__ = ["DEPTH", "Profile", "Put", "Take", "congestion_control"]
+__all__ = ["DEPTH", "Profile", "Put", "Take", "ZenohProfile"]
 
 Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
@@ -34,6 +36,52 @@ class Profile(Protocol):
         """Undeclare everything."""
 
 
-def congestion_control(topic: Topic) -> zenoh.CongestionControl:
-    """Wait for slow subscribers of a reliable topic; only the gateway waits, because its session is its own."""
-    return zenoh.CongestionControl.BLOCK if topic.reliability == "reliable" else zenoh.CongestionControl.DROP
+class ZenohProfile:
+    """Topics on Zenoh: a publisher or a subscriber, and a token that announces it to ROS.
+
+    Args:
+        session: towards ROS; the caller closes it.
+        types: message types, for their hashes.
+    """
+
+    def __init__(self, session: zenoh.Session, types: MessageTypes) -> None:
+        self._session = session
+        self._types = types
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._publishers: list[zenoh.Publisher] = []
+        self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+
+    def publish(self, topic: Topic) -> Put:
+        """Declare a publisher of ``topic``."""
+        # Wait for slow subscribers of a reliable topic; only the gateway waits, because its session is its own.
+        control = zenoh.CongestionControl
+        publisher = self._session.declare_publisher(
+            self._key(topic.name, topic.message),
+            encoding=zenoh.Encoding.APPLICATION_CDR,
+            congestion_control=control.BLOCK if topic.reliability == "reliable" else control.DROP,
+        )
+        self._publishers.append(publisher)
+        attached = self._attached(self._announce("MP", topic.name, topic.message, topic.reliability))
+        return lambda data, time: publisher.put(data, attachment=attached(time))
+
+    def subscribe(self, topic: Topic, take: Take) -> None:
+        """Declare a subscriber of ``topic``."""
+        key = self._key(topic.name, topic.message)
+        self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
+        self._announce("MS", topic.name, topic.message, topic.reliability)
+
+    def close(self) -> None:
+        """Undeclare everything, tokens first."""
+        undeclare_all(self._tokens, self._publishers, self._others)
+
+    def _key(self, name: str, message: str) -> str:
+        """The key of a topic or a service."""
+        raise NotImplementedError
+
+    def _announce(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        """Declare the token of a publisher (MP), a subscriber (MS) or a server (SS); returns the token."""
+        raise NotImplementedError
+
+    def _attached(self, token: str) -> Callable[[float], bytes | None]:
+        """What goes with a sample of a publisher with this token at a time in s."""
+        raise NotImplementedError

@@ -15,12 +15,11 @@ from collections.abc import Callable
 import zenoh
 
 from ...installing import importing
-from ...wire.session import undeclare_all
 from ..messages.cdr import CdrError, Codec, Message
 from ..messages.ros_names import dds_type
 from ..messages.stamp import nanoseconds
-from ..messages.topics import RosPlan, Topic
-from .profile import DEPTH, Put, Take, congestion_control
+from ..messages.topics import Reliability, RosPlan
+from .profile import DEPTH, ZenohProfile
 
 __all__ = ["RmwZenoh", "Service", "decode_attachment"]
 
@@ -34,8 +33,8 @@ Service = Callable[[Message, Callable[[Message], None]], None]
 """Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
 
 
-class RmwZenoh:
-    """One ROS node on Zenoh.
+class RmwZenoh(ZenohProfile):
+    """One ROS node on Zenoh; the source time of a sample is its simulation time.
 
     Args:
         session: towards ROS; the caller closes it.
@@ -44,37 +43,12 @@ class RmwZenoh:
     """
 
     def __init__(self, session: zenoh.Session, plan: RosPlan, domain: int) -> None:
-        self._session = session
-        self._types = plan.types
-        self._plan = plan
+        super().__init__(session, plan.types)
         self._domain = domain
         self._entities = itertools.count(1)
-        self._publishers: list[zenoh.Publisher] = []
-        self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
-        node = f"@ros2_lv/{domain}/{session.zid()}/0/0/NN/{self._node()}"
-        self._tokens = [session.liveliness().declare_token(node)]
-
-    def publish(self, topic: Topic) -> Put:
-        """Declare a publisher of ``topic``; the source time of a sample is its simulation time."""
-        publisher = self._session.declare_publisher(
-            self._key(topic.name, topic.message),
-            encoding=zenoh.Encoding.APPLICATION_CDR,
-            congestion_control=congestion_control(topic),
-        )
-        self._publishers.append(publisher)
-        gid = self._announce("MP", topic.name, topic.message, reliable=topic.reliability == "reliable")
-        sequence = itertools.count(1)
-
-        def put(data: bytes, time: float) -> None:
-            publisher.put(data, attachment=_ATTACHMENT.pack(next(sequence), nanoseconds(time), _GID_SIZE, gid))
-
-        return put
-
-    def subscribe(self, topic: Topic, take: Take) -> None:
-        """Declare a subscriber of ``topic``."""
-        key = self._key(topic.name, topic.message)
-        self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
-        self._announce("MS", topic.name, topic.message, reliable=topic.reliability == "reliable")
+        self._node = f"%/{_mangled(plan.namespace)}/{plan.node}"
+        node = f"@ros2_lv/{domain}/{session.zid()}/0/0/NN/{self._node}"
+        self._tokens.append(session.liveliness().declare_token(node))
 
     def serve(self, name: str, kind: str, service: Service) -> None:
         """Declare the server of the service ``name``; its type ``kind`` has to be defined in the message types."""
@@ -99,30 +73,26 @@ class RmwZenoh:
             service(request, reply)
 
         self._others.append(self._session.declare_queryable(key, answer, complete=True))
-        self._announce("SS", name, kind, reliable=True)
-
-    def close(self) -> None:
-        """Undeclare everything, tokens first."""
-        undeclare_all(self._tokens, self._publishers, self._others)
-
-    def _announce(self, kind: str, name: str, message: str, *, reliable: bool) -> bytes:
-        """Declare the token of an entity, and return the 16 bytes that identify the entity."""
-        with importing("xxhash", "topics of rmw_zenoh"):
-            import xxhash  # noqa: PLC0415  an optional dependency
-
-        qos = f"{_RELIABLE if reliable else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
-        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
-        token = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node()}/{own}"
-        self._tokens.append(self._session.liveliness().declare_token(token))
-        number = xxhash.xxh3_128_intdigest(token.encode())
-        low, high = number & (1 << 64) - 1, number >> 64
-        return struct.pack("<QQ", low, high)
-
-    def _node(self) -> str:
-        return f"%/{_mangled(self._plan.namespace)}/{self._plan.node}"
+        self._announce("SS", name, kind, "reliable")
 
     def _key(self, name: str, message: str) -> str:
         return f"{self._domain}/{name.strip('/')}/{dds_type(message)}/{self._hash(message)}"
+
+    def _announce(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        qos = f"{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
+        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
+        token = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node}/{own}"
+        self._tokens.append(self._session.liveliness().declare_token(token))
+        return token
+
+    def _attached(self, token: str) -> Callable[[float], bytes | None]:
+        with importing("xxhash", "topics of rmw_zenoh"):
+            import xxhash  # noqa: PLC0415  an optional dependency
+
+        number = xxhash.xxh3_128_intdigest(token.encode())
+        gid = struct.pack("<QQ", number & (1 << 64) - 1, number >> 64)
+        sequence = itertools.count(1)
+        return lambda time: _ATTACHMENT.pack(next(sequence), nanoseconds(time), _GID_SIZE, gid)
 
     def _hash(self, message: str) -> str:
         return _NO_HASH if self._types.distribution == "humble" else self._types.type_hash(message)

@@ -15,11 +15,12 @@ from ...config.mesh import RosProfile
 from ...variables.model_description import ModelDescription, Variable
 from .definitions import MessageTypes
 
-__all__ = ["Descriptions", "Direction", "Kind", "NodeParameter", "Port", "RosPlan", "Topic"]
+__all__ = ["Descriptions", "Direction", "Kind", "NodeParameter", "Port", "Reliability", "RosPlan", "Topic"]
 
 Descriptions = Mapping[str, ModelDescription]
 Direction = Literal["out", "in"]
 Kind = Literal["out", "in", "local"]
+Reliability = Literal["reliable", "best_effort"]
 
 
 class Port(msgspec.Struct, frozen=True):
@@ -62,7 +63,7 @@ class Topic(msgspec.Struct, frozen=True):
     ports: tuple[Port, ...]
     profile: RosProfile = "ros2dds"
     frame_id: str = ""
-    reliability: Literal["reliable", "best_effort"] = "reliable"
+    reliability: Reliability = "reliable"
     constants: tuple[tuple[str, str | float | bool], ...] = ()
 
 
