@@ -28,13 +28,12 @@ from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
-from ..messages.topics import RosPlan, Topic
+from ..messages.topics import CLOCK_TOPIC, RosPlan, Topic
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns, has_passed
 
 __all__ = ["McapFile"]
 
 _BUFFER_BYTES = 1 << 16
-_CLOCK_TOPIC = "/clock"
 _QOS = (
     "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -83,7 +82,7 @@ class McapFile:
         self._clock_points = plan.clock_points
         if self._clock_points is not None:
             self._clock = Codec(types, CLOCK)
-            self._clock_channel = self._channel(_CLOCK_TOPIC, CLOCK)
+            self._clock_channel = self._channel(CLOCK_TOPIC, CLOCK)
         self._about = {
             "metadata": msgspec.json.encode(recording.metadata).decode(),
             "recording": msgspec.json.encode(_recorded(recording, plan)).decode(),
@@ -228,7 +227,7 @@ def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:
         for topic in plan.topics
     ]
     if plan.clock_points is not None:
-        topics.append(TopicColumns(_CLOCK_TOPIC, (plan.clock_points,)))
+        topics.append(TopicColumns(CLOCK_TOPIC, (plan.clock_points,)))
     columns = []
     for (instance, name), (column, type_) in zip(recording.recorded, recording.columns, strict=True):
         variable = recording.descriptions[instance].variable_of(name)

@@ -1,9 +1,26 @@
 """The gateway: carries samples between a running mesh and ROS.
 
 It is a Zenoh client of the mesh like any other (docs/key-space.md). It has its own process and its own session towards
-ROS, so no node and no master ever waits for ROS. All work is done on the thread that calls `Gateway.run`; callbacks
-only put into a bounded queue. Samples that do not fit into the queue are left out, counted and reported.
+ROS, so no node and no master ever waits for ROS.
 """
+
+# Threads: Zenoh calls `arrived` and `take` on threads of its own, rclpy calls `take` on those of its executor. They
+# only put events into a queue. `Gateway.run` handles the events one by one on the thread of its caller, so nothing here
+# needs a lock. `Gateway.end` may be called from any thread, also while `open` waits for the master.
+#
+# What may go wrong:
+# * ROS is slower than the mesh. A callback must not wait, because the values of the mesh come on its thread. So the
+#   queue is bounded; what does not fit is left out, counted and reported. Only `run` waits for slow subscribers, on the
+#   second session, which the mesh does not know.
+# * The mesh ends while samples are on their way. The token of a follower makes the master stay until they are carried;
+#   the loss of the master's token can overtake samples (`latecomers`), so it is no reason to stop at once.
+# * The token of the mesh comes back. It belongs to another run, whose points begin again: this gateway ends.
+#
+# A variable of a slower instance holds its value between two of its points. So everything up to a point has been
+# published once every watched variable has a value that holds there, and `/clock` follows that point.
+#
+# Given up: a gateway in the process of the master, and one that the grant waits for; both let ROS slow the mesh
+# (ADR 0030).
 
 from __future__ import annotations
 
@@ -31,22 +48,22 @@ from ..messages.assembling import Assembler, Disassembler
 from ..messages.cdr import CdrError, Codec
 from ..messages.definitions import CLOCK
 from ..messages.stamp import to_stamp
-from ..messages.topics import Port, RosPlan, Topic
+from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from .parameters import ParameterServices
 from .profile import Profile, Put
 from .rmw_zenoh import RmwZenoh
 from .ros2dds import Ros2Dds
 
-__all__ = ["ClockPublisher", "Gateway", "Progress", "WarnOnce", "WatchedVariable", "clock_topic", "open_profiles"]
+__all__ = ["Gateway", "open_profiles"]
 
 log = logging.getLogger(__name__)
 
 _MAX_EVENTS = 1 << 16
+_MAX_WARNINGS = 10
 _REPEAT_S = 1.0
+"""How often `/clock` is repeated while it stands still, for new subscribers, and lost samples are reported."""
 
 Event = Callable[[], None]
-
-_MAX_WARNINGS = 10
 
 
 @contextmanager
@@ -107,7 +124,7 @@ class Gateway:
         self._mesh_ended = False
         self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._progress = Progress()
+        self._progress = _Progress()
 
     def open(self, patience_s: float = 60.0) -> None:
         """Declare all topics; every later sample is carried.
@@ -127,10 +144,11 @@ class Gateway:
         if not watched and self._plan.time_source is not None and self._plan.clock_points:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
-            put = next(iter(self._profiles.values())).publish(clock_topic(self._plan))
-            self._progress.start_clock(ClockPublisher(put, self._plan, self._grid))
+            first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
+            put = next(iter(self._profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
+            self._progress.start_clock(_ClockPublisher(put, self._plan, self._grid))
         for key, variable in watched.items():
-            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, key, variable)))
+            self._take_values(key, variable)
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         )
@@ -189,16 +207,19 @@ class Gateway:
         for index, port in enumerate(topic.ports):
             self._watch(port).outputs.append((assembler, index, put))
 
-    def _watch(self, port: Port) -> WatchedVariable:
+    def _watch(self, port: Port) -> _WatchedVariable:
         key = self._keys.variable(port.instance, port.kind, port.variable.name)
         return self._progress.watch(key, f"{port.instance}.{port.variable.name}", port.step_points)
 
-    def _value_arrived(self, key: str, variable: WatchedVariable, sample: zenoh.Sample) -> None:
-        # A sample without an attachment is a value that somebody puts on the key of an input.
-        if sample.attachment is not None and str(sample.key_expr) == key:
-            self._post(partial(self._take_value, variable, sample.payload.to_bytes(), sample.attachment.to_bytes()))
+    def _take_values(self, key: str, variable: _WatchedVariable) -> None:
+        def arrived(sample: zenoh.Sample) -> None:
+            # A sample without an attachment is a value that somebody puts on the key of an input.
+            if sample.attachment is not None and str(sample.key_expr) == key:
+                self._post(partial(self._take_value, variable, sample.payload.to_bytes(), sample.attachment.to_bytes()))
 
-    def _take_value(self, variable: WatchedVariable, data: bytes, attachment: bytes) -> None:
+        self._entities.append(self._mesh.declare_subscriber(key, arrived))
+
+    def _take_value(self, variable: _WatchedVariable, data: bytes, attachment: bytes) -> None:
         try:
             stamp = decode_json(attachment, Stamp)
         except MessageRefused:  # somebody put it on the key of an input, with a time but without a point
@@ -258,42 +279,36 @@ class Gateway:
             log.warning("%d samples were left out: the mesh is faster than ROS can receive", count)
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
-        self._events.put(self._end_mesh if sample.kind == zenoh.SampleKind.DELETE else self._meet_mesh)
+        def changed() -> None:
+            # A token after its end belongs to another run, or the connection was lost meanwhile: samples are missing.
+            self._ended = self._ended or (self._mesh_ended and not gone)
+            self._mesh_ended = self._mesh_ended or gone
+
+        gone = sample.kind == zenoh.SampleKind.DELETE
+        self._events.put(changed)
 
     def _is_over(self) -> bool:
         """Whether every sample has been carried."""
         return self._ended or not self._progress.watched or self._progress.complete >= self._grid.last_point
 
-    def _end_mesh(self) -> None:
-        self._mesh_ended = True
-
-    def _meet_mesh(self) -> None:
-        # A token after its end belongs to another run, or the connection was lost meanwhile: samples are missing.
-        self._ended = self._ended or self._mesh_ended
-
     def _end(self) -> None:
         self._ended = True
 
 
-class WarnOnce:
-    """Logs each warning about one name once, and at most ten of them.
-
-    Args:
-        name: of the topic or variable that the warnings are about.
-    """
+class _WarnOnce:
+    """Logs each warning about one topic or variable once, and at most ten of them."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._logged: set[str] = set()
 
     def warn(self, text: str) -> None:
-        """Log the warning, unless it was logged before."""
         if text not in self._logged and len(self._logged) < _MAX_WARNINGS:
             self._logged.add(text)
             log.warning("'%s': %s", self._name, text)
 
 
-class _SubscribedTopic(WarnOnce):
+class _SubscribedTopic(_WarnOnce):
     """A topic that the gateway subscribes to, and the keys of its variables."""
 
     def __init__(self, disassembler: Disassembler, keys: list[str], stop_time: float | None) -> None:
@@ -314,12 +329,8 @@ class _SubscribedTopic(WarnOnce):
         return encode_origin(stamp, self._who)
 
 
-class WatchedVariable(WarnOnce):
-    """A variable whose samples the gateway takes.
-
-    Args:
-        name: `instance.variable`.
-        step_points: base points between two of its samples.
+class _WatchedVariable(_WarnOnce):
+    """A variable whose samples the gateway takes; it has one every ``step_points`` points.
 
     Attributes:
         outputs: (assembler of a topic, index of the variable's port there, publishes its messages).
@@ -337,18 +348,11 @@ class WatchedVariable(WarnOnce):
         return self._point + self._step_points - 1 if self._point >= 0 else -1
 
     def advance(self, point: int) -> None:
-        """Note that the sample of ``point`` has been published."""
         self._point = point
 
 
-class ClockPublisher:
-    """`/clock`: the time of every n-th point, once everything up to that point has been published.
-
-    Args:
-        put: publishes a message on the topic.
-        plan: has the message types and n.
-        grid: the communication points of the run.
-    """
+class _ClockPublisher:
+    """`/clock`: the time of every n-th point, once everything up to that point has been published."""
 
     def __init__(self, put: Put, plan: RosPlan, grid: TimeGrid) -> None:
         self._put = put
@@ -384,7 +388,7 @@ class ClockPublisher:
         self._put(self._codec.encode({"clock": to_stamp(time_s)}), time_s)
 
 
-class Progress:
+class _Progress:
     """The watched variables of one gateway, and the point up to which all of their samples have been published.
 
     Attributes:
@@ -393,21 +397,20 @@ class Progress:
     """
 
     def __init__(self) -> None:
-        self.watched: dict[str, WatchedVariable] = {}
+        self.watched: dict[str, _WatchedVariable] = {}
         self.complete = -1
         self._newest = -1
         self._now = -1
-        self._clock: ClockPublisher | None = None
+        self._clock: _ClockPublisher | None = None
 
-    def start_clock(self, clock: ClockPublisher) -> None:
-        """Let ``clock`` follow."""
+    def start_clock(self, clock: _ClockPublisher) -> None:
         self._clock = clock
 
-    def watch(self, key: str, name: str, step_points: int) -> WatchedVariable:
+    def watch(self, key: str, name: str, step_points: int) -> _WatchedVariable:
         """The variable with this key; several topics share it."""
-        return self.watched.setdefault(key, WatchedVariable(name, step_points))
+        return self.watched.setdefault(key, _WatchedVariable(name, step_points))
 
-    def published(self, variable: WatchedVariable, point: int) -> None:
+    def published(self, variable: _WatchedVariable, point: int) -> None:
         """Note that the sample of ``variable`` at ``point`` has been published, and move `/clock`."""
         is_first, was_last = variable.holds_until < 0, variable.holds_until <= self.complete
         if is_first and self._clock is not None:
@@ -423,11 +426,5 @@ class Progress:
                 self._clock.advance(now)
 
     def repeat_clock(self) -> None:
-        """Publish the time again if it stands still."""
         if self._clock is not None:
             self._clock.repeat()
-
-
-def clock_topic(plan: RosPlan) -> Topic:
-    """The topic `/clock`, with the profile of the first topic."""
-    return Topic("/clock", CLOCK, "out", (), plan.topics[0].profile if plan.topics else "ros2dds")

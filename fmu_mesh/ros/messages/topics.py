@@ -15,7 +15,19 @@ from ...config.mesh import RosProfile
 from ...variables.model_description import ModelDescription, Variable
 from .definitions import MessageTypes
 
-__all__ = ["Descriptions", "Direction", "Kind", "NodeParameter", "Port", "Reliability", "RosPlan", "Topic"]
+__all__ = [
+    "CLOCK_TOPIC",
+    "Descriptions",
+    "Direction",
+    "Kind",
+    "NodeParameter",
+    "Port",
+    "Reliability",
+    "RosPlan",
+    "Topic",
+]
+
+CLOCK_TOPIC = "/clock"
 
 Descriptions = Mapping[str, ModelDescription]
 Direction = Literal["out", "in"]

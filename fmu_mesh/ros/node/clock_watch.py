@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections import Counter
 
 from ..gateway.link import two_clocks
+from ..messages.topics import CLOCK_TOPIC
 from .rclpy_modules import RosNode, steady_timer
 
-__all__ = ["CLOCK_TOPIC", "ClockWatch"]
-
-CLOCK_TOPIC = "/clock"
+__all__ = ["ClockWatch"]
 
 _INTERVAL_S = 1.0
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"

@@ -13,8 +13,8 @@ from typing import Any
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
 from ...variables.model_description import Value, Variable
 from ..messages.definitions import CLOCK
-from ..messages.topics import Topic
-from .clock_watch import CLOCK_TOPIC, ClockWatch
+from ..messages.topics import CLOCK_TOPIC, Topic
+from .clock_watch import ClockWatch
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
 from .node_settings import RESERVED, PacedTime, read_settings
 from .node_topics import LOG_INTERVAL_S, FmuTopics, topics_of
