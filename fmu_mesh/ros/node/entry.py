@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ...errors import ConfigurationError, FmuError, FmuMeshError, Interrupted
 from ...wire.client.reaching import Meshes
@@ -23,41 +23,25 @@ from .gateway_node import GatewayNode
 from .node_settings import PARAMETERS
 from .rclpy_modules import RosNode, ros_module
 
-__all__ = ["Autostart", "create_node", "main"]
-
-_END_S = 20.0
+__all__ = ["create_node", "main"]
 
 NODE_NAME = "fmi_adapter_node"
+
+_END_S = 20.0
+"""How long the end of the node, and that of ROS, may take."""
 _ATTEMPT_S = 2.0
+"""Deadline of one question to the mesh that autostart waits for."""
 _INTERVAL_S = 0.25
+"""Time between two such questions."""
 _CLOSE_S = 5.0
-
-
-class Managed(Protocol):
-    """The behaviour of a lifecycle node; the methods are its transitions, and raise `FmuMeshError`.
-
-    Attributes:
-        failure: the error with which it failed while it was active, until it is configured again.
-    """
-
-    failure: FmuMeshError | None
-
-    def configure(self) -> None: ...
-
-    def activate(self) -> None: ...
-
-    def deactivate(self) -> None: ...
-
-    def cleanup(self) -> None: ...
-
-    def close(self) -> bool: ...
+"""How long the end of the process waits for a question on its way."""
 
 
 def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN401 those of rclpy
     """Create a lifecycle node that runs an FMU or is the gateway of a mesh.
 
-    Call `rclpy.init` before it. The attribute `managed` of the node is its `Managed`; call `managed.close()` before
-    `destroy_node()`.
+    Call `rclpy.init` before it. The attribute `managed` of the node does what its transitions ask for; call
+    `managed.close()` before `destroy_node()`.
 
     Args:
         name: of the node.
@@ -86,7 +70,7 @@ def _node_class() -> Any:  # noqa: ANN401, C901 a type of rclpy; a class, not on
             descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
             for parameter, (default, description) in PARAMETERS.items():
                 self.declare_parameter(parameter, default, descriptor(description=description))
-            self.managed: Managed = FmuNode(self)
+            self.managed: FmuNode | GatewayNode = FmuNode(self)
 
         def on_configure(self, _state: object) -> object:
             return self._answer(self._configure)
@@ -169,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ConfigurationError.exit_code
     try:
         executor = executors.SingleThreadedExecutor()
-        with Autostart(node, executor):
+        with _Autostart(node, executor):
             rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
@@ -180,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         # A second Ctrl-C ends the process at once, without a traceback.
         signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
-        managed: Managed = node.managed
+        managed: FmuNode | GatewayNode = node.managed
         with _Deadline(f"the node was not closed within {_END_S:g} s", FmuError.exit_code):
             returned = managed.close()
         exit_code = managed.failure.exit_code if managed.failure is not None else 0 if returned else FmuError.exit_code
@@ -220,7 +204,7 @@ class _Deadline:
         os._exit(self._exit_code)
 
 
-class Autostart:
+class _Autostart:
     """Configures and activates a node if its parameter `autostart` is true.
 
     The gateway of a mesh waits for the mesh on another thread, so services answer meanwhile and Ctrl-C ends the wait.
@@ -231,7 +215,7 @@ class Autostart:
         executor: the executor of rclpy that spins the node; the transitions run there.
     """
 
-    def __init__(self, node: RosNode, executor: object) -> None:
+    def __init__(self, node: RosNode, executor: Any) -> None:  # noqa: ANN401 a class of rclpy
         self._node = node
         self._executor = executor
         self._log = node.get_logger()
@@ -260,34 +244,33 @@ class Autostart:
             self._node.trigger_activate()
 
     def _wait_and_start(self) -> None:
-        if self._mesh_is_there():
-            self._executor.create_task(self._start)  # type: ignore[attr-defined]  # a class of rclpy
-
-    def _mesh_is_there(self) -> bool:
-        """Wait until all instances of the mesh answer; False after the timeout, which is logged."""
+        """Start the node when all instances of the mesh answer; after the timeout only say so."""
         config = self._node.get_parameter("config").value
         timeout_s = self._node.get_parameter("autostart_timeout").value
         try:
             mesh = running_configuration(Path(config)).config.mesh
         except FmuMeshError:
-            return True  # `configure` reports what is wrong with the file
+            self._executor.create_task(self._start)  # `configure` reports what is wrong with the file
+            return
         deadline = time.monotonic() + timeout_s
         reported = False
         while not self._over.is_set():
             reason = self._absence(mesh)
             if reason is None:
-                return True
+                self._executor.create_task(self._start)
+                return
             if time.monotonic() >= deadline:
+                name = self._node.get_fully_qualified_name()
                 self._log.error(
                     f"mesh '{mesh}' did not come within {timeout_s:g} s (autostart_timeout): {reason} "
-                    f"Once it runs, configure and activate this node: {self._manual_start()}"
+                    "Once it runs, configure and activate this node: "
+                    f"`ros2 lifecycle set {name} configure`, then `ros2 lifecycle set {name} activate`."
                 )
-                return False
+                return
             if not reported:
                 reported = True
                 self._log.info(f"waiting up to {timeout_s:g} s (autostart_timeout) for mesh '{mesh}': {reason}")
             self._over.wait(_INTERVAL_S)
-        return False
 
     def _absence(self, mesh: str) -> str | None:
         """Why the gateway cannot start yet; None if it can."""
@@ -300,7 +283,3 @@ class Autostart:
         except FmuMeshError as error:
             return str(error)
         return None
-
-    def _manual_start(self) -> str:
-        name = self._node.get_fully_qualified_name()
-        return f"`ros2 lifecycle set {name} configure`, then `ros2 lifecycle set {name} activate`."

@@ -22,7 +22,6 @@ __all__ = [
     "initialize_from_parameters",
     "names_of",
     "parameter_values",
-    "undeclare_parameters",
     "undeclared",
     "value_of",
 ]
@@ -99,12 +98,6 @@ def undeclared(node: RosNode) -> dict[str, str | None]:
     overrides = node._parameter_overrides  # noqa: SLF001 rclpy has no public way to read them
     names = [name for name in overrides if not node.has_parameter(name)]
     return {name: nearest(name, there) for name in names if not name.startswith("qos_overrides.")}
-
-
-def undeclare_parameters(node: RosNode, names: Sequence[str]) -> None:
-    """Undeclare parameters, so that another FMU can declare its own."""
-    for name in names:
-        node.undeclare_parameter(name)
 
 
 def parameter_values(node: RosNode, variables: Mapping[str, Variable]) -> dict[str, Value]:
