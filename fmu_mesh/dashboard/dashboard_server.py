@@ -5,26 +5,25 @@ Only this module and `live_page` import NiceGUI, and only when a dashboard is st
 
 from __future__ import annotations
 
-import errno
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from ..errors import ConfigurationError
 from ..installing import require
-from .access import Access, is_loopback
+from ..web_server import ServedMesh, is_loopback, listening, shown_host
+from .access import Access
 from .mesh_directory import MeshDirectory
 from .mesh_follower import CurveQuestion
 
 if TYPE_CHECKING:
     from fastapi import Request
 
-__all__ = ["DashboardOptions", "serve"]
+__all__ = ["serve"]
 
 STATIC: Final = Path(__file__).parent / "static"
 _QUESTION_BYTES: Final = 64 << 10
@@ -33,29 +32,14 @@ _HISTORY: Final = 100
 _PATIENCE_S: Final = 30.0
 """A page that does not answer for this long is forgotten, and loads itself again; a busy browser needs some time."""
 _CLOSING_S: Final = 1
+_ICON: Final = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><g fill="none" stroke="#0072b2" stroke-width="1.5">'
+    '<path d="M4 4L12 6L7 12Z"/></g><g fill="#0072b2"><circle cx="4" cy="4" r="2.5"/><circle cx="12" cy="6" r="2.5"/>'
+    '<circle cx="7" cy="12" r="2.5"/></g></svg>'
+)
 
 
-class DashboardOptions(msgspec.Struct, frozen=True):
-    """What the command line says.
-
-    Attributes:
-        mesh: name or key of the only mesh; None: all that can be reached.
-        connect: Zenoh endpoints; default: the meshes of this user on this host.
-        timeout: deadline of every question to a mesh in s.
-        host: address where the server listens.
-        port: its port; 0: a free one.
-        read_only: whether nothing can be set or steered.
-    """
-
-    mesh: str | None = None
-    connect: Sequence[str] = ()
-    timeout: float = 5.0
-    host: str = "127.0.0.1"
-    port: int = 0
-    read_only: bool = False
-
-
-def serve(options: DashboardOptions, ready: Callable[[str], None]) -> None:
+def serve(options: ServedMesh, ready: Callable[[str], None]) -> None:
     """Serve the page until SIGINT, which raises KeyboardInterrupt, or SIGTERM, which ends the process.
 
     Args:
@@ -68,14 +52,14 @@ def serve(options: DashboardOptions, ready: Callable[[str], None]) -> None:
     """
     require("nicegui", "dashboards")
     with (
-        _listening(options.host, options.port) as listener,
+        listening(options.host, options.port, "the dashboard") as listener,
         MeshDirectory(options.mesh, options.connect, options.timeout) as directory,
     ):
         _serve(options, listener, directory, ready)
 
 
 def _serve(
-    options: DashboardOptions, listener: socket.socket, directory: MeshDirectory, ready: Callable[[str], None]
+    options: ServedMesh, listener: socket.socket, directory: MeshDirectory, ready: Callable[[str], None]
 ) -> None:
     import uvicorn  # noqa: PLC0415  an extra, and slow to import
     from fastapi import FastAPI, Response  # noqa: PLC0415  as above
@@ -122,7 +106,7 @@ def _serve(
         lifespan="on",
         timeout_graceful_shutdown=_CLOSING_S,
     )
-    ready(f"http://{_shown_host(options.host)}:{port}/?token={token}")
+    ready(f"http://{shown_host(options.host)}:{port}/?token={token}")
     uvicorn.Server(config).run([listener])
 
 
@@ -138,42 +122,3 @@ async def _body(request: Request) -> bytes:
         if len(body) > _QUESTION_BYTES:
             raise ValueError
     return bytes(body)
-
-
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens.
-
-    Raises:
-        ConfigurationError: the port is taken, or the address is none of this host.
-    """
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
-            listener.listen()
-        except BaseException:
-            listener.close()
-            raise
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            text = f"port {port} of {host} is taken by another program."
-            raise ConfigurationError(text, hint="`--port 0` takes a free one.") from error
-        reason = error.strerror or str(error)
-        raise ConfigurationError(f"the dashboard cannot listen at {host}, port {port}: {reason}.") from error
-    return listener
-
-
-def _shown_host(host: str) -> str:
-    """The host in the URL: a name of this host if it listens at all addresses."""
-    if host in ("0.0.0.0", "::"):  # noqa: S104  the user asked for it
-        return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
-
-
-_ICON: Final = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><g fill="none" stroke="#0072b2" stroke-width="1.5">'
-    '<path d="M4 4L12 6L7 12Z"/></g><g fill="#0072b2"><circle cx="4" cy="4" r="2.5"/><circle cx="12" cy="6" r="2.5"/>'
-    '<circle cx="7" cy="12" r="2.5"/></g></svg>'
-)

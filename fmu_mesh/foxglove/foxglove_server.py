@@ -6,7 +6,6 @@ the SDK keeps a bounded number of messages for each, and drops the oldest ones o
 
 from __future__ import annotations
 
-import errno
 import secrets
 import socket
 import threading
@@ -24,6 +23,7 @@ from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
 from ..errors import ConfigurationError
+from ..web_server import listening, shown_host
 from ..wire.views import LogLine
 from .mesh_parameters import MeshParameters
 from .mesh_topics import STATUS_SCHEMA
@@ -66,7 +66,8 @@ class FoxgloveServer:
     """
 
     def __init__(self, name: str, host: str, port: int, origins: Iterable[str] = ()) -> None:
-        listener = _listening(host, port)
+        _check_filters()
+        listener = listening(host, port, "the server for Foxglove")
         self._context = Context()
         self._listener = _Requests()
         self._server = foxglove.start_server(
@@ -80,8 +81,7 @@ class FoxgloveServer:
         )
         token = secrets.token_urlsafe(24)
         self._relay = Relay(listener, self._server.port, token, origins)
-        shown = f"[{host}]" if ":" in host else host
-        self.url = f"ws://{shown}:{listener.getsockname()[1]}/?token={token}"
+        self.url = f"ws://{shown_host(host)}:{listener.getsockname()[1]}/?token={token}"
         self._clock = threading.Lock()
         self._time_ns = -1
         self._told_at = 0.0
@@ -280,12 +280,8 @@ class _Requests(ServerListener):
             served.changed()
 
 
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens.
-
-    Raises:
-        ConfigurationError: the port is in use, the address is none of this host, or there are no socket filters.
-    """
+def _check_filters() -> None:
+    """Raise ConfigurationError if this process cannot filter what comes to a socket."""
     try:
         with socket.socket() as own:
             let_in(own, None)
@@ -293,11 +289,3 @@ def _listening(host: str, port: int) -> socket.socket:
         text = f"the kernel lets nobody protect the server with a socket filter: {error.strerror}."
         hint = "Start it with --connect where a usual Linux kernel runs; `fmu-mesh dashboard` needs no filter."
         raise ConfigurationError(text, hint=hint) from error
-    try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            text = f"port {port} of {host} is in use."
-            raise ConfigurationError(text, hint="Take another one with --port; 0 takes any free one.") from error
-        reason = error.strerror or str(error)
-        raise ConfigurationError(f"Foxglove cannot be served at {host}, port {port}: {reason}.") from error

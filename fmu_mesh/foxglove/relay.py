@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import hmac
-import ipaddress
 import os
 import socket
 import struct
@@ -21,7 +19,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["Relay", "is_loopback", "let_in"]
+from ..web_server import is_loopback, is_secret
+
+__all__ = ["Relay", "let_in"]
 
 _OURS: Final = ("https://app.foxglove.dev",)
 _HEAD_BYTES: Final = 16 << 10
@@ -46,7 +46,7 @@ class Relay:
         self._listener = listener
         self._inner = _listening_at(port)
         self._port = port
-        self._token = token.encode()
+        self._token = token
         self._origins = {*_OURS, *origins}
         let_in(self._inner, None)
         self._loop = asyncio.new_event_loop()
@@ -89,7 +89,7 @@ class Relay:
         token = parse_qs(urlsplit(path).query).get("token", [""])[0]
         origin = headers.get("origin")  # no program but a browser sends it
         known = origin is None or origin in self._origins or is_loopback(urlsplit(origin).hostname or "")
-        return method == "GET" and known and hmac.compare_digest(token.encode("utf-8", "replace"), self._token)
+        return method == "GET" and known and is_secret(token, self._token)
 
     async def _entered(
         self, head: bytes, client: asyncio.StreamWriter
@@ -115,14 +115,6 @@ async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
         while data := await reader.read(_HEAD_BYTES):
             writer.write(data)
             await writer.drain()
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only programs of this host reach a server that listens there."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _listening_at(port: int) -> socket.socket:

@@ -8,21 +8,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final
 
-import msgspec
-
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, from_report
 from ..ros.messages.stamp import nanoseconds
 from ..simtime import ENDLESS, TimeGrid
+from ..web_server import ServedMesh
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Reading, Target
 from ..wire.client.value_stream import ValueStream
 from ..wire.client.waiting import appearance
 from ..wire.views import MeshInfo, MeshStatus
-from .foxglove_server import PORT, FoxgloveServer
+from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
 from .mesh_topics import message_of, schema_of, status_message, topic_of, topics_by_instance
-from .relay import is_loopback
 
 __all__ = ["Serving", "ShownMesh", "serve"]
 
@@ -36,33 +34,16 @@ _ASK_S: Final = 0.5
 _FOREVER_S: Final = 1e9
 
 
-class Serving(msgspec.Struct, frozen=True):
+class Serving(ServedMesh, frozen=True):
     """What is served, and where.
 
     Attributes:
-        mesh: name or key of the mesh; None for the only one.
-        connect: Zenoh endpoints of the mesh or of a router; none: the meshes of this user on this host.
-        timeout_s: deadline of every question in s.
         variables: what is offered, as names with `*`; none: all outputs.
-        host: the address to listen at.
-        port: 0 for a free one.
-        read_only: whether clients cannot set anything.
         origins: further origins whose pages may connect.
     """
 
-    mesh: str | None = None
-    connect: tuple[str, ...] = ()
-    timeout_s: float = 5.0
     variables: tuple[str, ...] = ()
-    host: str = "127.0.0.1"
-    port: int = PORT
-    read_only: bool = True
     origins: tuple[str, ...] = ()
-
-    @property
-    def leaves_host(self) -> bool:
-        """Whether other hosts can connect."""
-        return not is_loopback(self.host)
 
 
 def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | None = None) -> None:
@@ -93,7 +74,7 @@ def _once(
     say(f"waiting for {which} to start")
     while not stop.is_set():
         try:
-            with Meshes(serving.connect, serving.timeout_s) as meshes:
+            with Meshes(serving.connect, serving.timeout) as meshes:
                 client = appearance(meshes, mesh, _LOOK_S)
                 with _unless_ended(client):
                     _show(serving, client, server, say)
