@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 from urllib.parse import urlencode
 
 import foxglove
@@ -29,10 +29,8 @@ from .mesh_parameters import MeshParameters
 from .mesh_topics import STATUS_SCHEMA
 from .relay import Relay, let_in
 
-__all__ = ["PORT", "FoxgloveServer"]
+__all__ = ["FoxgloveServer"]
 
-PORT: Final = 8765
-"""The port that Foxglove suggests."""
 _WAITING_MESSAGES: Final = 4096
 """Messages that wait for one client at most; of more, the oldest are lost."""
 _WAITING_LINES: Final = 1000
@@ -126,7 +124,7 @@ class FoxgloveServer:
             self._time_ns = -1
         with self._logging:
             self._lines.clear()
-        self._listener.serve(_Served(parameters, changed))
+        self._listener.serve((parameters, changed))
         self._server.clear_session()  # whereupon clients ask for parameters again
         self._variables = {
             topic: Channel(topic, schema=schema, metadata=metadata, context=self._context)
@@ -210,24 +208,17 @@ class FoxgloveServer:
         self._server.remove_status(list(about))
 
 
-class _Served(NamedTuple):
-    """A run that clients ask for: its parameters, and what is called when they want other topics."""
-
-    parameters: MeshParameters
-    changed: Callable[[], None]
-
-
 class _Requests(ServerListener):
     """What clients ask for; the SDK calls it on threads of its own."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._served: _Served | None = None
+        self._served: tuple[MeshParameters, Callable[[], None]] | None = None
         self._touched: set[str] = set()
         self._subscribed: dict[str, None] = {}
 
-    def serve(self, served: _Served | None) -> None:
-        """Answer for this run from now on; None: for none."""
+    def serve(self, served: tuple[MeshParameters, Callable[[], None]] | None) -> None:
+        """Answer from now on for a run: its parameters, and what is called when clients want other topics."""
         self._served = served
 
     def take_touched(self) -> set[str]:
@@ -240,29 +231,23 @@ class _Requests(ServerListener):
         with self._lock:
             return tuple(self._subscribed)
 
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002  the SDK passes it
+    def on_subscribe(self, _client: Client, channel: ChannelView) -> None:
         self._touch(channel.topic)
 
-    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002  the SDK passes it
+    def on_unsubscribe(self, _client: Client, channel: ChannelView) -> None:
         self._touch(channel.topic)
 
     def on_get_parameters(
-        self,
-        client: Client,  # noqa: ARG002  the SDK passes it
-        param_names: list[str],
-        request_id: str | None = None,  # noqa: ARG002  the SDK passes it
+        self, _client: Client, param_names: list[str], _request_id: str | None = None
     ) -> list[Parameter]:
         served = self._served
-        return served.parameters.values(param_names) if served is not None else []
+        return served[0].values(param_names) if served is not None else []
 
     def on_set_parameters(
-        self,
-        client: Client,  # noqa: ARG002  the SDK passes it
-        parameters: list[Parameter],
-        request_id: str | None = None,  # noqa: ARG002  the SDK passes it
+        self, _client: Client, parameters: list[Parameter], _request_id: str | None = None
     ) -> list[Parameter]:
         served = self._served
-        return served.parameters.set(parameters) if served is not None else []
+        return served[0].set(parameters) if served is not None else []
 
     def on_parameters_subscribe(self, param_names: list[str]) -> None:
         with self._lock:
@@ -277,7 +262,7 @@ class _Requests(ServerListener):
         with self._lock:
             self._touched.add(topic)
         if (served := self._served) is not None:
-            served.changed()
+            served[1]()
 
 
 def _check_filters() -> None:

@@ -1,9 +1,21 @@
-"""In front of the server of the SDK: lets programs in that know its token, and pages of known origins only.
+"""In front of the server of the SDK: lets programs in that know its token, and pages of known origins only."""
 
-The SDK asks nobody anything. So it listens where a filter in the kernel drops every packet but those of this relay, and
-the relay looks at the request that begins each connection; what follows goes through it as it is. Its thread waits for
-nobody: a client that does not read is not read for either, and the SDK drops what it cannot send.
-"""
+# The SDK serves whoever connects: it knows no token and no origin. So it listens at a port of 127.0.0.1 where a filter
+# in the kernel drops every packet but those of this relay, and the relay looks at the request that begins each
+# connection; what follows goes through it as it is.
+#
+# Threads: the relay has one, with an event loop. `close` is called on another one, and only asks the loop to stop. The
+# SDK has threads of its own. The relay waits for nobody: a client that does not read is not read for either, and the
+# SDK drops what it cannot send.
+#
+# What may go wrong:
+# * Another program of this host connects to the port of the SDK. The filter lets in one source port at a time, that of
+#   the socket with which the relay is connecting (`_connecting`), and nobody between two of these. A connection keeps
+#   the filter that it was made with, so changing it cuts nothing off.
+# * The SDK does not show its socket. It is in this process, so `/proc/self/fd` has it, and a second handle sets the
+#   filter.
+# * A kernel without socket filters: the server refuses to start, rather than to serve everybody.
+# * A client sends no request, or a long one: it has 10 s and 16 KiB.
 
 from __future__ import annotations
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Final
 
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, from_report
@@ -22,11 +23,13 @@ from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
 from .mesh_topics import message_of, schema_of, status_message, topic_of, topics_by_instance
 
-__all__ = ["Serving", "ShownMesh", "serve"]
+__all__ = ["Serving", "serve"]
 
-_LOOK_S: Final = 1.0
+_START_S: Final = 1.0
+"""Time between two looks for a mesh that does not run yet, in s."""
 _WAITING_VALUES: Final = 1 << 14
 _LOOK_S: Final = 0.05
+"""How long to wait for a value before readers and the end of the mesh are looked at, in s."""
 _LAST_LOOKS: Final = 5
 """Looks without a value after the end of the mesh, as in `latecomers`."""
 _ASK_S: Final = 0.5
@@ -61,33 +64,30 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
     name = f"fmu_mesh: {mesh}" if mesh is not None else "fmu_mesh"
     with FoxgloveServer(name, serving.host, serving.port, serving.origins) as server:
         say(f"Foxglove can connect to {server.url}, or open {server.link}")
+        is_told = False
         while not stop.is_set():
-            mesh = _once(serving, mesh, server, say, stop)
-
-
-def _once(
-    serving: Serving, mesh: str | None, server: FoxgloveServer, say: Callable[[str], None], stop: threading.Event
-) -> str | None:
-    """Wait for the mesh and serve it until it ends; returns the mesh to wait for now."""
-    which = f"mesh '{mesh.rpartition('/')[2]}'" if mesh is not None else "a mesh"
-    server.tell(f"waiting for {which} to start", about="mesh")
-    say(f"waiting for {which} to start")
-    while not stop.is_set():
-        try:
-            with Meshes(serving.connect, serving.timeout) as meshes:
-                client = appearance(meshes, mesh, _LOOK_S)
-                with _unless_ended(client):
-                    _show(serving, client, server, say)
-                return client.keys.root
-        except DeadlineExceeded:
-            stop.wait(_LOOK_S)
-    return mesh
+            if not is_told:
+                which = f"mesh '{mesh.rpartition('/')[2]}'" if mesh is not None else "a mesh"
+                server.tell(f"waiting for {which} to start", about="mesh")
+                say(f"waiting for {which} to start")
+                is_told = True
+            try:
+                with Meshes(serving.connect, serving.timeout) as meshes:
+                    client = appearance(meshes, mesh, _START_S)
+                    try:
+                        _show(serving, client, server, say)
+                    except FmuMeshError:
+                        if client.info_if_running() is not None:
+                            raise  # otherwise nobody answered because the mesh has just ended
+                    mesh, is_told = client.keys.root, False
+            except DeadlineExceeded:
+                stop.wait(_START_S)
 
 
 def _show(serving: Serving, client: MeshClient, server: FoxgloveServer, say: Callable[[str], None]) -> None:
     """Serve a mesh that runs until it ends."""
     mesh = client.keys.mesh
-    shown = ShownMesh(client, server, serving.variables, read_only=serving.read_only)
+    shown = _ShownMesh(client, server, serving.variables, read_only=serving.read_only)
     server.withdraw("mesh", "end", "lost", "refused", "shift")
     say(f"mesh '{mesh}' is shown")
     if shown.shift_s:
@@ -101,24 +101,11 @@ def _show(serving: Serving, client: MeshClient, server: FoxgloveServer, say: Cal
     say(text)
 
 
-@contextmanager
-def _unless_ended(client: MeshClient) -> Iterator[None]:
-    """In the block, a question that nobody answers because the mesh has just ended is no error."""
-    try:
-        yield
-    except FmuMeshError:
-        if client.info_if_running() is not None:
-            raise
+class _ShownMesh:
+    """A mesh, from when it was found until it ends, and what is shown of it.
 
-
-class ShownMesh:
-    """A mesh and what is shown of it.
-
-    Args:
-        client: the way into the mesh.
-        server: where it is shown.
-        patterns: what is offered, as names or patterns of names; none: all outputs.
-        read_only: whether clients cannot set anything.
+    The thread that calls `show` sends the values. Others follow the state and the log, and ask for values that nothing
+    publishes now, so that an instance that answers late does not delay the values of the others.
 
     Raises:
         ConfigurationError: no variable fits a pattern.
@@ -141,7 +128,8 @@ class ShownMesh:
         self._targets = {topic_of(target): target for target in offered}
         has_field = {one.name: one for one in everything if one.variable.type != "Binary"}  # Foxglove has none for it
         settable = {name: target for name, target in has_field.items() if target.variable.settable}
-        self._parameters = MeshParameters(client, settable, self._refused, read_only=read_only)
+        refused = partial(server.tell, about="refused", severe=True)
+        self._parameters = MeshParameters(client, settable, refused, read_only=read_only)
         self._stream = ValueStream(client, _WAITING_VALUES)
         self._without: dict[str, Target] = {}
         self._asking = False
@@ -219,12 +207,9 @@ class ShownMesh:
             self._questions.put(list(self._without.values()))
 
     def _send(self, target: Target, reading: Reading) -> None:
-        time_ns = self._time_ns(reading.time)
+        time_ns = nanoseconds(reading.time) + self._shift_ns
         self._server.show(topic_of(target), message_of(target, reading), time_ns)
         self._server.show_time(time_ns)
-
-    def _time_ns(self, time: float) -> int:
-        return nanoseconds(time) + self._shift_ns
 
     # --- other threads
 
@@ -232,14 +217,15 @@ class ShownMesh:
         with suppress(FmuMeshError), self._client.statuses(_FOREVER_S) as statuses:
             for status in statuses:
                 self._last = status
-                time_ns = self._time_ns(status.time)
+                time_ns = nanoseconds(status.time) + self._shift_ns
                 self._server.show_status(status_message(status), time_ns)
                 self._server.show_time(time_ns, at_once=True)
 
     def _follow_log(self) -> None:
         with suppress(FmuMeshError), self._client.logs(follow=True) as lines:
             for line in lines:
-                self._server.show_log(line, self._time_ns(self._grid.time(line.point)))
+                time_ns = nanoseconds(self._grid.time(line.point)) + self._shift_ns
+                self._server.show_log(line, time_ns)
 
     def _ask(self) -> None:
         """Ask for the current values of variables, and again and again for the parameters that clients follow."""
@@ -259,18 +245,8 @@ class ShownMesh:
             if (names := self._server.subscribed_parameters) and (changed := self._parameters.changes(names)):
                 self._server.show_parameters(changed)
 
-    def _refused(self, text: str) -> None:
-        self._server.tell(text, about="refused", severe=True)
-
 
 def _metadata(target: Target) -> dict[str, str]:
     """What Foxglove shows about a topic."""
-    view = target.variable
-    facts = {
-        "unit": view.unit,
-        "description": view.description,
-        "type": view.type,
-        "causality": view.causality,
-        "variability": view.variability,
-    }
-    return {name: fact for name, fact in facts.items() if fact}
+    names = ("unit", "description", "type", "causality", "variability")
+    return {name: fact for name in names if (fact := getattr(target.variable, name))}
