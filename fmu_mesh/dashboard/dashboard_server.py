@@ -21,6 +21,7 @@ from .mesh_directory import MeshDirectory
 from .mesh_follower import CurveQuestion
 
 if TYPE_CHECKING:
+    import uvicorn
     from fastapi import Request
 
 __all__ = ["serve"]
@@ -55,18 +56,19 @@ def serve(options: ServedMesh, ready: Callable[[str], None]) -> None:
         listening(options.host, options.port, "the dashboard") as listener,
         MeshDirectory(options.mesh, options.connect, options.timeout) as directory,
     ):
-        _serve(options, listener, directory, ready)
+        port, token = listener.getsockname()[1], secrets.token_urlsafe(24)
+        server = _server(options, port, token, directory)
+        ready(f"http://{shown_host(options.host)}:{port}/?token={token}")
+        server.run([listener])
 
 
-def _serve(
-    options: ServedMesh, listener: socket.socket, directory: MeshDirectory, ready: Callable[[str], None]
-) -> None:
+def _server(options: ServedMesh, port: int, token: str, directory: MeshDirectory) -> uvicorn.Server:
     import uvicorn  # noqa: PLC0415  an extra, and slow to import
     from fastapi import FastAPI, Response  # noqa: PLC0415  as above
     from fastapi.staticfiles import StaticFiles  # noqa: PLC0415  as above
     from nicegui import ui  # noqa: PLC0415  as above
 
-    from .live_page import LivePage  # noqa: PLC0415  it imports NiceGUI
+    from .live_page import register_page  # noqa: PLC0415  it imports NiceGUI
 
     application = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
@@ -82,7 +84,7 @@ def _serve(
     # Not by annotations: FastAPI would look for these names in this module.
     application.router.add_route("/dashboard/curves", curves, methods=["POST"])
     application.mount("/dashboard/static", StaticFiles(directory=STATIC))
-    LivePage(directory, read_only=options.read_only).register()
+    register_page(directory, read_only=options.read_only)
     ui.run_with(
         application,
         title="fmu_mesh",
@@ -94,8 +96,6 @@ def _serve(
         reconnect_timeout=_PATIENCE_S,
         show_welcome_message=False,
     )
-    port = listener.getsockname()[1]
-    token = secrets.token_urlsafe(24)
     names = frozenset() if is_loopback(options.host) else frozenset((socket.gethostname().lower(), socket.getfqdn()))
     config = uvicorn.Config(
         Access(application, token, options.host, port, names),
@@ -106,8 +106,7 @@ def _serve(
         lifespan="on",
         timeout_graceful_shutdown=_CLOSING_S,
     )
-    ready(f"http://{shown_host(options.host)}:{port}/?token={token}")
-    uvicorn.Server(config).run([listener])
+    return uvicorn.Server(config)
 
 
 async def _body(request: Request) -> bytes:

@@ -20,7 +20,7 @@ from .mesh_follower import MeshFollower, MeshView
 from .plot_card import PlotCard, first_plots
 from .setting_fields import SettingField
 
-__all__ = ["InstanceTable", "MeshPage"]
+__all__ = ["MeshPage"]
 
 _TABLE_S: Final = 1.0
 _PICTURE_S: Final = 1.0
@@ -102,20 +102,23 @@ class MeshPage:
             self._parts.append(columns)
             with ui.element("div").classes("fm-column"):
                 self._add_plots()
-                self._add_instances()
+                with _card("Instances"):
+                    self._table = _InstanceTable()
             with ui.element("div").classes("fm-column"):
                 if not self._read_only:
                     self._add_settings()
                 self._add_picture()
-                self._add_log()
-        self._parts.append(ui.timer(_TABLE_S, self._show_table))
+                with _card("Log"):
+                    self._log = ui.log(max_lines=500).classes("fm-log")
+                    self._log.props("role=log aria-label=Log tabindex=0")
+        self._parts.append(ui.timer(_TABLE_S, lambda: self._table.show(self._view)))
         self._parts.append(ui.timer(max(_PICTURE_S, _INSTANCE_S * len(self._view.infos)), self._draw_picture))
         if not self._read_only:
             self._parts.append(ui.timer(_VALUES_S, self._read_values))
 
     def _add_buttons(self) -> None:
-        self._pausing = _button("Pause", "pause", self._pause)
-        self._resuming = _button("Resume", "play_arrow", self._resume)
+        self._pausing = _button("Pause", "pause", partial(self._act, Run.pause))
+        self._resuming = _button("Resume", "play_arrow", partial(self._act, Run.resume))
         self._points = ui.number(value=1, min=1, precision=0, label="points").props("dense dark outlined")
         self._points.classes("fm-points")
         _button("Step", "skip_next", self._step)
@@ -129,7 +132,7 @@ class MeshPage:
 
     def _add_plots(self) -> None:
         with ui.row().classes("fm-line"):
-            span = ui.select(_SPANS, value=0, label="time", on_change=lambda event: _show_span(event.value))
+            span = ui.select(_SPANS, value=0, label="time", on_change=_show_span)
             span.props("dense outlined")
             ui.button("Add a plot", icon="add", on_click=self._add_plot).props("dense flat")
         self._charts = ui.element("div").classes("fm-column")
@@ -145,11 +148,11 @@ class MeshPage:
             plot.build()
 
     def _plot(self, names: list[str]) -> PlotCard:
-        return PlotCard(self._view.catalogue, names, self._remember, self._drop_plot)
+        def removed(plot: PlotCard) -> None:
+            self._plots.remove(plot)
+            self._remember()
 
-    def _drop_plot(self, plot: PlotCard) -> None:
-        self._plots.remove(plot)
-        self._remember()
+        return PlotCard(self._view.catalogue, names, self._remember, removed)
 
     def _remember(self) -> None:
         """Put the curves into the address of the page, so that it shows them again when it is loaded."""
@@ -157,13 +160,10 @@ class MeshPage:
         query = json.dumps([["mesh", self.key], *(["curve", curve] for curve in curves)])
         ui.run_javascript(f"history.replaceState(null, '', '/?' + new URLSearchParams({query}))")
 
-    def _add_instances(self) -> None:
-        with _card("Instances"):
-            self._table = InstanceTable()
-
     def _add_picture(self) -> None:
         with _card("Connections"):
-            ui.switch("full size", on_change=self._enlarge).props("dense").classes("fm-corner")
+            switch = ui.switch("full size", on_change=lambda: self._picture.classes(toggle="fm-full"))
+            switch.props("dense").classes("fm-corner")
             self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
             self._picture.props("role=img aria-label='the instances and their connections' tabindex=0")
 
@@ -176,13 +176,10 @@ class MeshPage:
             first = [name for name, v in settable.items() if not v.shape][:_FIELDS] or [*settable][:_FIELDS]
             if len(settable) > len(first):
                 choice = ui.select([*settable], value=first, multiple=True, label="variables", with_input=True)
-                choice.props("dense outlined use-chips").style("width: 100%").on_value_change(self._choose_fields)
+                choice.props("dense outlined use-chips").style("width: 100%")
+                choice.on_value_change(lambda event: self._show_fields(event.value or []))
             self._settings = ui.element("div").classes("fm-column").style("gap: 4px")
             self._show_fields(first)
-
-    def _add_log(self) -> None:
-        with _card("Log"):
-            self._log = ui.log(max_lines=500).classes("fm-log").props("role=log aria-label=Log tabindex=0")
 
     # --- what it shows
 
@@ -212,9 +209,6 @@ class MeshPage:
             self._buttons.set_visibility(not view.ended)
         self._show_log()
 
-    def _show_table(self) -> None:
-        self._table.show(self._view)
-
     def _show_log(self) -> None:
         for line in self._follower.log:
             if line.number > self._last_line:
@@ -222,18 +216,12 @@ class MeshPage:
                 message = paragraph(line.message)
                 self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {message}")
 
-    def _enlarge(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
-        self._picture.classes(add="fm-full") if event.value else self._picture.classes(remove="fm-full")
-
     async def _draw_picture(self) -> None:
         picture = await run.io_bound(self._follower.picture)
         if picture is not None and picture != self._picture.content:
             self._picture.set_content(picture)
 
     # --- what it does
-
-    def _choose_fields(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
-        self._show_fields(event.value or [])
 
     def _show_fields(self, names: Sequence[str]) -> None:
         settable = self._view.catalogue.settable
@@ -256,12 +244,6 @@ class MeshPage:
         if answer is not None and (field := self._fields.get(name)) is not None:
             field.say(f"from t = {answer.time:.6g} s")
 
-    async def _pause(self) -> None:
-        await self._act(Run.pause)
-
-    async def _resume(self) -> None:
-        await self._act(Run.resume)
-
     async def _step(self) -> None:
         points = int(self._points.value or 1)
         await self._act(lambda mesh: mesh.step(points))
@@ -273,7 +255,7 @@ class MeshPage:
     async def _act(self, action: Callable[[Run], Any]) -> Any:  # noqa: ANN401  the answers of a Run
         """Do something to the mesh; None if it refuses, after saying why."""
         try:
-            return await run.io_bound(_act, self._follower, action)
+            return await run.io_bound(self._follower.ask, action)
         except FmuMeshError as error:
             ui.notify(str(error), type="negative", close_button=True, timeout=10000)
             return None
@@ -291,12 +273,8 @@ def _button(text: str, icon: str, act: Callable[[], Any], color: str = "secondar
     return ui.button(text, icon=icon, color=color, on_click=act).props(f"dense unelevated aria-label={text}")
 
 
-def _show_span(seconds: int) -> None:
-    ui.run_javascript(f"fmuMeshPlots.span({seconds})")
-
-
-def _act(follower: MeshFollower, action: Callable[[Run], Any]) -> Any:  # noqa: ANN401  the answers of a Run
-    return follower.ask(action)
+def _show_span(event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
+    ui.run_javascript(f"fmuMeshPlots.span({event.value})")  # nobody awaits what it returns
 
 
 def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
@@ -310,7 +288,7 @@ def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
     return values
 
 
-class InstanceTable:
+class _InstanceTable:
     """A line for each instance, in the order of the mesh."""
 
     def __init__(self) -> None:

@@ -8,13 +8,14 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from ..wire.views import VariableView
 from .mesh_follower import Catalogue
 
 __all__ = ["PlotCard", "first_plots"]
 
 _PLOTS: Final = 4
 _CURVES: Final = 5
+_HELD: Final = ("parameter", "calculatedParameter")
+"""Their values hold until they get others, whatever their variability is."""
 
 
 class PlotCard:
@@ -102,18 +103,13 @@ def _options(catalogue: Catalogue, names: Sequence[str]) -> dict[str, Any]:
                 "type": "line",
                 "name": f"{name} in {v.unit}" if v.unit and unit is None else name,
                 "showSymbol": False,
-                "step": "end" if _holds(v) else False,
+                "step": "end" if v.variability != "continuous" or v.causality in _HELD else False,
                 "lineStyle": {"width": 1, "join": "bevel"},
                 "data": [],
             }
             for name, v in zip(names, variables, strict=True)
         ],
     }
-
-
-def _holds(variable: VariableView) -> bool:
-    """Whether a variable keeps its value until it gets another one."""
-    return variable.variability != "continuous" or variable.causality in ("parameter", "calculatedParameter")
 
 
 def first_plots(catalogue: Catalogue) -> list[list[str]]:
