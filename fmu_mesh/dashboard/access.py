@@ -35,13 +35,6 @@ class Access:
       rebinding), but the browser then says that name.
     * `Origin`, which browsers send from scripts, must be the page itself.
     * The token is in the first URL, and in a cookie from then on, so it is in no further URL.
-
-    Args:
-        application: what is protected.
-        token: the secret.
-        host: where the server listens.
-        port: of the server; part of the cookie's name, since cookies do not know ports.
-        names: further names of this host.
     """
 
     def __init__(self, application: Application, token: str, host: str, port: int, names: frozenset[str]) -> None:
@@ -49,6 +42,7 @@ class Access:
         self._token = token
         self._local = is_loopback(host)
         self._names = names | {"localhost", host.lower()}
+        # Cookies do not know ports, so the name of this one has it.
         self._cookie = f"fmu_mesh_dashboard_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

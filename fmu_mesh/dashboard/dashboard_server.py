@@ -43,9 +43,7 @@ _ICON: Final = (
 def serve(options: ServedMesh, ready: Callable[[str], None]) -> None:
     """Serve the page until SIGINT, which raises KeyboardInterrupt, or SIGTERM, which ends the process.
 
-    Args:
-        options: what is served, and where.
-        ready: called with the URL as soon as it can be opened.
+    ``ready`` is called with the URL as soon as it can be opened.
 
     Raises:
         ConfigurationError: NiceGUI is not installed, the port is taken, or the mesh does not run.

@@ -22,12 +22,7 @@ _BUSY_S: Final = 60.0
 
 
 def register_page(directory: MeshDirectory, *, read_only: bool) -> None:
-    """Let NiceGUI serve the page at `/` to any number of browsers.
-
-    Args:
-        directory: the meshes.
-        read_only: whether nothing can be set or steered.
-    """
+    """Let NiceGUI serve the page at `/` to any number of browsers."""
 
     @ui.page("/", response_timeout=_BUSY_S)
     async def opened(request: Request) -> None:

@@ -19,13 +19,7 @@ _MOST_MESHES: Final = 32
 
 
 class MeshDirectory:
-    """Followers of meshes by key, as long as the `with` block lasts.
-
-    Args:
-        mesh: name or key of the only one; None: all that can be reached.
-        connect: Zenoh endpoints, as those of `attach`.
-        timeout: deadline of every question in s.
-    """
+    """Followers of meshes by key, as long as the `with` block lasts."""
 
     def __init__(self, mesh: str | None, connect: Sequence[str], timeout: float) -> None:
         self._mesh = mesh

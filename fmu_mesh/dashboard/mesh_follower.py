@@ -123,13 +123,7 @@ class CurveQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeshFollower:
-    """Follows a mesh, also through its end and its next run, until it is closed.
-
-    Args:
-        key: name or key of the mesh.
-        connect: Zenoh endpoints, as those of `attach`.
-        timeout: deadline of every question in s.
-    """
+    """Follows a mesh, also through its end and its next run, until it is closed."""
 
     def __init__(self, key: str, connect: Sequence[str], timeout: float) -> None:
         self._key = key

@@ -48,14 +48,7 @@ _BAR: Final = """
 
 
 class MeshPage:
-    """One run of a mesh on one page.
-
-    Args:
-        follower: of the mesh.
-        view: what is known of it.
-        plots: the curves of each plot; empty: the first outputs, by unit.
-        read_only: whether nothing can be set or steered.
-    """
+    """One run of a mesh on one page."""
 
     def __init__(self, follower: MeshFollower, view: MeshView, plots: list[list[str]], *, read_only: bool) -> None:
         self.key = view.key
@@ -164,8 +157,10 @@ class MeshPage:
         with _card("Connections"):
             switch = ui.switch("full size", on_change=lambda: self._picture.classes(toggle="fm-full"))
             switch.props("dense").classes("fm-corner")
-            self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
-            self._picture.props("role=img aria-label='the instances and their connections' tabindex=0")
+            self._picture: ui.html = ui.html("", sanitize=False)  # our own SVG, in which names are escaped
+            self._picture.classes("fm-graph").props(
+                "role=img aria-label='the instances and their connections' tabindex=0"
+            )
 
     def _add_settings(self) -> None:
         settable = self._view.catalogue.settable

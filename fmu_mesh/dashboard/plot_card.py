@@ -21,12 +21,6 @@ _HELD: Final = ("parameter", "calculatedParameter")
 class PlotCard:
     """One plot: a choice of variables above their curves.
 
-    Args:
-        catalogue: the variables that there are.
-        names: those that it shows first.
-        changed: called when others are chosen.
-        removed: called when somebody has removed it.
-
     Attributes:
         names: the variables that it shows.
     """

@@ -27,11 +27,6 @@ class SettingField:
     * a number with a minimum and a maximum: a slider and a field
     * any other number: a field
     * a text, or an array as JSON: a field
-
-    Args:
-        name: `instance.variable`.
-        variable: what it is.
-        apply: called with the name and the value that a person gave.
     """
 
     def __init__(self, name: str, variable: VariableView, apply: Callable[[str, object], Awaitable[None]]) -> None:

@@ -49,12 +49,6 @@ _LEVELS: Final = {
 class FoxgloveServer:
     """Serves clients from when it was made until it is closed, whether a mesh runs or not.
 
-    Args:
-        name: what clients show as the name of the source.
-        host: the address to listen at.
-        port: 0 for a free one.
-        origins: further origins whose pages may connect.
-
     Attributes:
         url: where clients connect to; has a token.
 

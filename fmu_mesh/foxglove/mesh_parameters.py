@@ -25,14 +25,7 @@ _INT64: Final = range(-(2**63), 2**63)
 
 
 class MeshParameters:
-    """The parameters of one run of a mesh.
-
-    Args:
-        client: the way into the mesh.
-        targets: what may be set, by `instance.variable`.
-        tell: called with a sentence about what was refused.
-        read_only: whether to refuse all.
-    """
+    """The parameters of one run of a mesh."""
 
     def __init__(
         self, client: MeshClient, targets: Mapping[str, Target], tell: Callable[[str], None], *, read_only: bool

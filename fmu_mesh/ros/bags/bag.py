@@ -61,10 +61,7 @@ class BagSample(msgspec.Struct, frozen=True):
 
 
 class Bag:
-    """A bag that is open for reading; use it as a context manager.
-
-    Args:
-        path: an MCAP file, or the folder of a `ros2 bag`.
+    """A bag (an MCAP file, or the folder of a `ros2 bag`) that is open for reading; use it as a context manager.
 
     Raises:
         ConfigurationError: the file cannot be read, or `rosbags` is not installed.
@@ -210,11 +207,7 @@ def bag_values(
 ) -> dict[str, BagValues]:
     """Read the bags of a scenario; the result has the values by `instance.variable`, in the order of their times.
 
-    Args:
-        source: the scenario.
-        loaded: the configuration, whose section `ros` has the message types.
-        descriptions: the model descriptions by instance name. What refers to no variable of them is left out.
-        findings: where everything goes that is wrong with a bag.
+    What refers to no variable of ``descriptions`` is left out; what is wrong with a bag is added to ``findings``.
     """
     # One reading for all that name the same file, stamps, and time of the first message.
     wanted: dict[tuple[str, str, float | None], dict[str, ScenarioValues]] = {}

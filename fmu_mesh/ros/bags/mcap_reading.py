@@ -49,11 +49,7 @@ def read_mcap(path: Path) -> Columns:
 
 
 class _ColumnReader:
-    """Collects the values of the columns from the records of all chunks.
-
-    Args:
-        recording: which column is where.
-    """
+    """Collects the values of the columns from the records of all chunks."""
 
     def __init__(self, recording: RecordedMcap) -> None:
         self._recording = recording

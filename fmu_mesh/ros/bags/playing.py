@@ -73,8 +73,13 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options:
     samples = bag.samples(topics, options.stamps)
     moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=options.start)
     names = [topic.name for topic in topics]
+    if not moments and beyond:
+        raise ConfigurationError(
+            f"all {beyond} values of {', '.join(names)} in '{bag.path}' are at or after the end of the simulation.",
+            hint="Say when the first one is, as with `start=0.0`.",
+        )
     if not moments:
-        raise _nothing(bag.path, ", ".join(names), beyond)
+        raise ConfigurationError(f"there is no message of {', '.join(names)} in '{bag.path}'.")
     count, first = play(client, moments, step_points, options.timeout)
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)
@@ -90,15 +95,6 @@ def running_configuration(path: Path) -> LoadedConfig:
     if any(finding.path.partition(".")[0] != "simulation" for finding in findings):
         findings.raise_any()
     return loaded
-
-
-def _nothing(file: Path, names: str, beyond: int) -> ConfigurationError:
-    if beyond:
-        return ConfigurationError(
-            f"all {beyond} values of {names} in '{file}' are at or after the end of the simulation.",
-            hint="Say when the first one is, as with `start=0.0`.",
-        )
-    return ConfigurationError(f"there is no message of {names} in '{file}'.")
 
 
 class Moment(msgspec.Struct, frozen=True):

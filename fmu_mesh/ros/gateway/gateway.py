@@ -70,18 +70,7 @@ Event = Callable[[], None]
 def open_profiles(
     section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys
 ) -> Iterator[dict[str, Profile]]:
-    """Open the profiles that a plan needs, and the parameter services of the node if it is one of rmw_zenoh.
-
-    Args:
-        section: the section `ros` of the configuration.
-        ros: the session towards ROS.
-        plan: the topics and the parameters.
-        mesh: a session that reaches the mesh.
-        keys: the keys of the mesh.
-
-    Yields:
-        The profiles by name, that of the section first.
-    """
+    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the parameter services."""
     profiles: dict[str, Profile] = {}
     with ExitStack() as stack:
         for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
@@ -98,14 +87,9 @@ def open_profiles(
 class Gateway:
     """Carries topics between one mesh and ROS.
 
-    Call `open`, then `run`, then `close`.
+    The caller closes the session and the profiles; the first of these has `/clock`.
 
-    Args:
-        plan: the topics.
-        mesh: a session that reaches the mesh; the caller closes it.
-        keys: the keys of the mesh.
-        grid: the communication points of the run.
-        profiles: the profiles of the topics by name, that of `/clock` first; the caller closes them.
+    Call `open`, then `run`, then `close`.
     """
 
     def __init__(
@@ -128,9 +112,6 @@ class Gateway:
 
     def open(self, patience_s: float = 60.0) -> None:
         """Declare all topics; every later sample is carried.
-
-        Args:
-            patience_s: how long to wait for the master, in s.
 
         Raises:
             MeshLost: the master does not answer.

@@ -50,15 +50,7 @@ def two_clocks(other: str, setting: str) -> str:
 
 
 class RosLink:
-    """Watches the link of one gateway. Call `open` first and `close` last.
-
-    Args:
-        section: has the endpoints of the link.
-        ros: the session towards ROS; the caller closes it.
-        mesh: a session that reaches the mesh; the caller closes it.
-        keys: the keys of the mesh.
-        clock: whether this gateway publishes `/clock`.
-    """
+    """Watches the link of one gateway. Call `open` first and `close` last. The caller closes both sessions."""
 
     def __init__(self, section: RosConfig, ros: zenoh.Session, mesh: zenoh.Session, keys: Keys, *, clock: bool) -> None:
         self._section = section

@@ -60,10 +60,7 @@ def message_types(loaded: LoadedConfig, section: RosConfig, findings: Findings) 
 def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings) -> RosPlan | None:
     """Make the plan of the `ros` section.
 
-    Args:
-        loaded: the configuration.
-        descriptions: the model descriptions by instance name; a topic whose description is missing is not checked.
-        findings: where the findings go.
+    A topic of an instance without a description is not checked.
 
     Returns:
         The plan; None without a section or without message types. After findings it is incomplete.
@@ -134,15 +131,7 @@ def _check_section(config: Config, section: RosConfig, findings: Findings) -> No
 
 
 class Resolver:
-    """Resolves the topics of one section.
-
-    Args:
-        config: the configuration.
-        section: its section `ros`, or another one in its place.
-        descriptions: the model descriptions by instance name.
-        types: the message types; None checks names only.
-        findings: where the findings go.
-    """
+    """Resolves the topics of a section `ros`, or of another one in its place; without types, only names are checked."""
 
     def __init__(
         self,

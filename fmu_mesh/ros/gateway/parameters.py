@@ -16,6 +16,7 @@ from typing import Any
 import zenoh
 
 from ...errors import FmuMeshError
+from ...system.settable import why_not_settable
 from ...variables.model_description import Value, Variable
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
@@ -49,10 +50,7 @@ _VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "doubl
 class ParameterServices:
     """Answers for the parameters of one mesh, on its own thread, because the mesh may answer slowly.
 
-    Args:
-        plan: the parameters; the messages of the services are added to its types.
-        mesh: a session that reaches the mesh; the caller closes it.
-        keys: the keys of the mesh.
+    The messages of the services are added to the types of the plan. The caller closes the session.
     """
 
     def __init__(self, plan: RosPlan, mesh: zenoh.Session, keys: Keys) -> None:
@@ -177,7 +175,7 @@ def _descriptor(name: str, parameter: NodeParameter | None) -> Message:
         "type": _kind(variable) if variable is not None else _NOT_SET,
         "description": (variable.description or "") if variable is not None else "",
         "additional_constraints": f"unit: {variable.unit}" if variable is not None and variable.unit else "",
-        "read_only": variable is None or variable.variability != "tunable",
+        "read_only": variable is None or why_not_settable(variable, None) is not None,
         "dynamic_typing": False,
         "floating_point_range": ranges if double else [],
         "integer_range": [] if double else [{name: int(limit) for name, limit in own.items()} for own in ranges],

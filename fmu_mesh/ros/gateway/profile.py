@@ -37,12 +37,7 @@ class Profile(Protocol):
 
 
 class ZenohProfile:
-    """Topics on Zenoh: a publisher or a subscriber, and a token that announces it to ROS.
-
-    Args:
-        session: towards ROS; the caller closes it.
-        types: message types, for their hashes.
-    """
+    """Topics on Zenoh: a publisher or a subscriber, and a token that shows it to ROS. The caller closes the session."""
 
     def __init__(self, session: zenoh.Session, types: MessageTypes) -> None:
         self._session = session

@@ -34,13 +34,7 @@ Service = Callable[[Message, Callable[[Message], None]], None]
 
 
 class RmwZenoh(ZenohProfile):
-    """One ROS node on Zenoh; the source time of a sample is its simulation time.
-
-    Args:
-        session: towards ROS; the caller closes it.
-        plan: name and namespace of the node, and the message types.
-        domain: ROS_DOMAIN_ID.
-    """
+    """One ROS node on Zenoh; the source time of a sample is its simulation time."""
 
     def __init__(self, session: zenoh.Session, plan: RosPlan, domain: int) -> None:
         super().__init__(session, plan.types)

@@ -23,7 +23,6 @@ from .topics import Port, Topic
 __all__ = ["Assembler", "Disassembler"]
 
 _MAX_WAITING = 1 << 14
-_FLOATS = {"NaN": float("nan"), "INF": float("inf"), "-INF": float("-inf")}
 
 
 class Assembler:
@@ -31,10 +30,6 @@ class Assembler:
 
     A message belongs to one point. If the variables have different step sizes, every point of one of them has a
     message, with the values that hold at that point.
-
-    Args:
-        topic: the topic.
-        types: the message types.
 
     Raises:
         CdrError: messages of this type cannot be encoded.
@@ -58,16 +53,7 @@ class Assembler:
                 header["frame_id"] = topic.frame_id
 
     def add(self, port: int, point: int, time: float, value: Value) -> Iterator[tuple[bytes, float]]:
-        """Take the value of a port at a point, and yield every message that is complete now.
-
-        Args:
-            port: index of the port.
-            point: of the value.
-            time: of the point, in s.
-            value: of the variable.
-
-        Yields:
-            Each message in CDR, and its time in s.
+        """Take the value of a port at a point, and yield every message that is complete now, in CDR, and its time in s.
 
         Raises:
             CdrError: a value does not fit into its field.
@@ -119,7 +105,7 @@ class Assembler:
                 elements = value if isinstance(value, np.ndarray) else flattened(value, len(shape))
                 container[last] = np.asarray(elements, dtype)  # "-INF" becomes a float, too
             else:
-                container[last] = _FLOATS[value] if floats and isinstance(value, str) else value
+                container[last] = float(value) if floats and isinstance(value, str) else value
 
         return put
 
@@ -149,12 +135,7 @@ class Assembler:
 
 
 class Disassembler:
-    """Reads the values of the variables from the messages of one subscribed topic.
-
-    Args:
-        topic: the topic.
-        types: the message types.
-    """
+    """Reads the values of the variables from the messages of one subscribed topic."""
 
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
         self.topic = topic

@@ -59,10 +59,6 @@ class CdrError(ValueError):
 class Codec:
     """Encodes and decodes the messages of one type.
 
-    Args:
-        types: has the definition of the type.
-        message: full name of the type.
-
     Raises:
         UnknownType: there is no such type.
         CdrError: the type has a field that cannot be encoded here (wstring, float128).

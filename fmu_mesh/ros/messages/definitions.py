@@ -122,7 +122,10 @@ class MessageTypes:
         for name, text in (custom or {}).items():
             self.define(name, text)
         for name in custom or {}:
-            self._check_references(name)
+            try:
+                list(self.paths(name))
+            except UnknownType as error:
+                raise ConfigurationError(f"the definition of '{name}': {error}") from error
 
     def define(self, name: str, text: str) -> None:
         """Add a definition in the syntax of a `.msg` file.
@@ -225,13 +228,6 @@ class MessageTypes:
         self.fields(message)
         text, _md5 = self.store.generate_msgdef(message, ros_version=2)
         return text
-
-    def _check_references(self, message: str) -> None:
-        try:
-            for _ in self.paths(message):
-                pass
-        except UnknownType as error:
-            raise ConfigurationError(f"the definition of '{message}': {error}") from error
 
 
 def path_parts(path: str) -> list[str | int]:

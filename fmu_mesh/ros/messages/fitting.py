@@ -87,14 +87,7 @@ def carries(target: str, source: str) -> bool:
 
 
 def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> None:
-    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants.
-
-    Args:
-        entry: where the topic stands in the configuration.
-        topic: the topic, whose message type may be unknown.
-        types: the message types.
-        findings: where the findings go.
-    """
+    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants."""
     before = len(findings)
     for port in topic.ports:
         _check_port(entry, topic, port, types, findings)

@@ -18,12 +18,7 @@ _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 
 class ClockWatch:
-    """Warns once of every other node that publishes `/clock`.
-
-    Args:
-        node: a node that publishes `/clock` itself; the caller destroys it.
-        setting: the setting that stops this node from publishing it.
-    """
+    """Warns once of every other node that publishes `/clock`, and says which setting stops this node from it."""
 
     def __init__(self, node: RosNode, setting: str) -> None:
         self._node = node

@@ -76,9 +76,6 @@ class FmuDriver:
     The time of the FMU is 0.0 at the first update, and stands still between the last update before a pause and
     `resume`.
 
-    Args:
-        settings: how the FMU is driven.
-
     Raises:
         CallRefused: a setting is out of range.
         LoadFailed: the FMU cannot be read, extracted or instantiated.
@@ -232,7 +229,7 @@ class FmuDriver:
         return self._steps - before, behind
 
 
-class FmuThread:
+class FmuThread(ThreadPoolExecutor):
     """The only thread that calls one FMU, whatever executor the node is in (FMI does not require thread safety).
 
     The services of the node answer while the FMU computes. Call `close` last.
@@ -240,13 +237,11 @@ class FmuThread:
 
     def __init__(self) -> None:
         self._thread: threading.Thread | None = None
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fmu", initializer=self._keep_thread)
 
-    def submit(
-        self, function: Callable[Parameters, Result], *args: Parameters.args, **kwargs: Parameters.kwargs
-    ) -> Future[Result]:
-        """Call a function on the thread later, after all earlier calls."""
-        return self._pool.submit(function, *args, **kwargs)
+        def keep() -> None:
+            self._thread = threading.current_thread()
+
+        super().__init__(1, thread_name_prefix="fmu", initializer=keep)
 
     def call(
         self, function: Callable[Parameters, Result], *args: Parameters.args, **kwargs: Parameters.kwargs
@@ -273,11 +268,8 @@ class FmuThread:
 
     def close(self) -> bool:
         """Cancel the calls that have not started, and wait up to 5 s; returns whether the thread has ended."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self.shutdown(wait=False, cancel_futures=True)
         if self._thread is None:
             return True
         self._thread.join(_CLOSE_S)
         return not self._thread.is_alive()
-
-    def _keep_thread(self) -> None:
-        self._thread = threading.current_thread()

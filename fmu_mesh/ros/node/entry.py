@@ -179,12 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Deadline:
-    """Ends the process if what is inside takes longer than `_END_S`; says so, and what every thread does.
-
-    Args:
-        what: has not happened then.
-        exit_code: of the process then.
-    """
+    """Ends the process if what is inside takes longer than `_END_S`; says so, and what every thread does."""
 
     def __init__(self, what: str, exit_code: int) -> None:
         self._what = what
@@ -209,10 +204,6 @@ class _Autostart:
 
     The gateway of a mesh waits for the mesh on another thread, so services answer meanwhile and Ctrl-C ends the wait.
     Use it as a context manager around the spinning of the node.
-
-    Args:
-        node: the lifecycle node.
-        executor: the executor of rclpy that spins the node; the transitions run there.
     """
 
     def __init__(self, node: RosNode, executor: Any) -> None:  # noqa: ANN401 a class of rclpy

@@ -38,9 +38,6 @@ class FmuNode:
 
     The methods are the transitions of the node; one thread at a time calls them.
 
-    Args:
-        node: the lifecycle node, with `PARAMETERS` declared.
-
     Attributes:
         failure: the error with which the FMU failed; None again after `configure`.
     """

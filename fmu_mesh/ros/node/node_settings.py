@@ -90,11 +90,7 @@ def read_settings(node: RosNode) -> NodeSettings:
 
 
 class PacedTime:
-    """Simulated time that starts at 0 and runs at a multiple of wall-clock time; it starts paused.
-
-    Args:
-        factor: simulated over wall-clock time.
-    """
+    """Simulated time that starts at 0 and runs at a multiple of wall-clock time; it starts paused."""
 
     def __init__(self, factor: float) -> None:
         self._factor = factor

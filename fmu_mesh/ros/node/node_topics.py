@@ -106,15 +106,9 @@ def topics_of(
 
 
 def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> None:  # noqa: ANN401 a ROS message
-    """Set the fields of a message to the values of their variables, and the stamp of its headers.
+    """Set the fields of a message to the values of their variables, and the stamp of its headers to ``time`` in ns.
 
     Sequences are made as long as the paths need them.
-
-    Args:
-        topic: the topic.
-        message: a new message of the type of the topic.
-        values: by variable.
-        time: the stamp, in ns.
     """
     _set_stamp(message, time)
     for port in topic.ports:
@@ -234,11 +228,6 @@ def _place(message: Any, path: str, passed: Callable[[Any], None] = lambda _owne
 
     Sequences on the way are made as long as the path needs them.
 
-    Args:
-        message: a ROS message.
-        path: such as `poses[0].position.x`.
-        passed: called with every message on the way that is an element of an array.
-
     Raises:
         AttributeError: there is no such field.
         IndexError: an array cannot have so many elements; its text is the largest number of elements.
@@ -282,12 +271,6 @@ class FmuTopics:
     """Publishes the outputs of an FMU, and takes its inputs.
 
     While the node is inactive, only the last message of each topic is kept, for `start`.
-
-    Args:
-        node: the node; the caller destroys it.
-        driver: the FMU.
-        thread: calls the FMU.
-        now: returns the time that the FMU follows, in ns.
     """
 
     def __init__(self, node: RosNode, driver: FmuDriver, thread: FmuThread, now: Callable[[], int]) -> None:
@@ -372,16 +355,13 @@ class FmuTopics:
                 throttle_duration_sec=LOG_INTERVAL_S,
             )
             return
-        self._thread.submit(self._take_waiting, topic, message, arrived)
+        self._thread.submit(self._take, topic, message, arrived, waited=1)
 
     # --- on the thread of the FMU
 
-    def _take_waiting(self, topic: Topic, message: Any, arrived: int) -> None:  # noqa: ANN401 a ROS message
+    def _take(self, topic: Topic, message: Any, arrived: int, waited: int = 0) -> None:  # noqa: ANN401 a ROS message
         with self._count:
-            self._waiting -= 1
-        self._take(topic, message, arrived)
-
-    def _take(self, topic: Topic, message: Any, arrived: int) -> None:  # noqa: ANN401 a ROS message
+            self._waiting -= waited
         if self._closed:
             return
         try:
