@@ -4,24 +4,40 @@ Keys are `<domain>/<name>/<type in DDS>/<hash>`. Tokens are
 `@ros2_lv/<domain>/<zid>/<node>/<entity>/<kind>/<enclave>/<namespace>/<node name>/<name>/<type>/<hash>/<qos>` with `%`
 for every slash within a part. Every sample, request and response has an attachment: sequence number, time in ns, and
 the 16 bytes that identify its sender (rmw_zenoh, docs/design.md).
+
+Services of this node are how ROS reads and sets the parameters of all instances.
 """
 
 from __future__ import annotations
 
 import itertools
+import logging
+import queue
 import struct
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import zenoh
 
+from ...errors import FmuMeshError
 from ...installing import importing
+from ...system.settable import why_not_settable
+from ...variables.model_description import Value, Variable
+from ...wire.keys import Keys
+from ...wire.messages import decode_json
+from ...wire.session import Question, ask
+from ...wire.values import encode_origin, encode_value
 from ..messages.cdr import CdrError, Codec, Message
-from ..messages.ros_names import dds_type
+from ..messages.ros_names import absolute, dds_type
 from ..messages.stamp import nanoseconds
-from ..messages.topics import Reliability, RosPlan
+from ..messages.topics import NodeParameter, Reliability, RosPlan
 from .profile import DEPTH, ZenohProfile
 
-__all__ = ["RmwZenoh", "Service", "decode_attachment"]
+__all__ = ["SERVICES", "ParameterServices", "RmwZenoh", "Service", "decode_attachment"]
+
+log = logging.getLogger(__name__)
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _SHORT_ATTACHMENT = struct.Struct("<qq16s")
@@ -31,6 +47,21 @@ _NO_HASH = "TypeHashNotSupported"
 
 Service = Callable[[Message, Callable[[Message], None]], None]
 """Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
+
+SERVICES = {
+    "GetParameters": ("string[] names\n", "rcl_interfaces/ParameterValue[] values\n"),
+    "GetParameterTypes": ("string[] names\n", "uint8[] types\n"),
+    "SetParameters": ("rcl_interfaces/Parameter[] parameters\n", "rcl_interfaces/SetParametersResult[] results\n"),
+    "ListParameters": ("string[] prefixes\nuint64 depth\n", "rcl_interfaces/ListParametersResult result\n"),
+    "DescribeParameters": ("string[] names\n", "rcl_interfaces/ParameterDescriptor[] descriptors\n"),
+}
+"""Request and response of each service (package rcl_interfaces)."""
+
+_ANSWER_S = 2.0
+_WHO = "ros set_parameters"
+_CLOSE_S = 2.0
+_NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING = range(5)
+_VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "double_value", _STRING: "string_value"}
 
 
 class RmwZenoh(ZenohProfile):
@@ -110,3 +141,144 @@ def decode_attachment(attachment: zenoh.ZBytes | None) -> tuple[int, int, bytes]
 
 def _mangled(name: str) -> str:
     return name.replace("/", "%")
+
+
+class ParameterServices:
+    """Answers for the parameters of one mesh, on its own thread, because the mesh may answer slowly.
+
+    A parameter is named `<instance>.<variable>`. If the mesh refuses a value (a fixed parameter, a value out of range),
+    the service answers with the same reason.
+
+    The messages of the services are added to the types of the plan. The caller closes the session.
+    """
+
+    def __init__(self, plan: RosPlan, mesh: zenoh.Session, keys: Keys) -> None:
+        self._plan = plan
+        self._mesh = mesh
+        self._keys = keys
+        self._parameters = {parameter.name: parameter for parameter in plan.parameters}
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        for name, (request, response) in SERVICES.items():
+            plan.types.define_service(f"rcl_interfaces/srv/{name}", request, response)
+        self._no_value = Codec(plan.types, "rcl_interfaces/msg/ParameterValue").empty()
+        self._no_descriptor = Codec(plan.types, "rcl_interfaces/msg/ParameterDescriptor").empty()
+
+    @contextmanager
+    def served_by(self, node: RmwZenoh) -> Iterator[None]:
+        """Offer the services of ``node`` within the context."""
+        thread = threading.Thread(target=self._run, name="parameters", daemon=True)
+        thread.start()
+        for name, kind, answer in (
+            ("get_parameters", "GetParameters", self._get),
+            ("get_parameter_types", "GetParameterTypes", self._get_types),
+            ("set_parameters", "SetParameters", self._set),
+            ("list_parameters", "ListParameters", self._list),
+            ("describe_parameters", "DescribeParameters", self._describe),
+        ):
+            full_name = absolute(f"{self._plan.node}/{name}", self._plan.namespace)
+            node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._queued(answer))
+        try:
+            yield
+        finally:
+            self._jobs.put(None)
+            thread.join(_CLOSE_S)
+
+    def _queued(self, answer: Callable[[Message], Message]) -> Service:
+        def service(request: Message, reply: Callable[[Message], None]) -> None:
+            self._jobs.put(lambda: reply(answer(request)))
+
+        return service
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except zenoh.ZError as error:  # the client is gone
+                log.info("answer_not_sent", extra={"error": str(error)})
+
+    # --- the services
+
+    def _get(self, request: Message) -> Message:
+        return {"values": [self._value(name) for name in request["names"]]}
+
+    def _get_types(self, request: Message) -> Message:
+        kinds = [self._parameters.get(name) for name in request["names"]]
+        return {"types": [_kind(own.variable) if own is not None else _NOT_SET for own in kinds]}
+
+    def _set(self, request: Message) -> Message:
+        results = [self._set_one(own["name"], own["value"]) for own in request["parameters"]]
+        return {"results": [{"successful": not reason, "reason": reason} for reason in results]}
+
+    def _list(self, request: Message) -> Message:
+        wanted = [
+            name
+            for name in self._parameters
+            if not request["prefixes"] or any(name == p or name.startswith(f"{p}.") for p in request["prefixes"])
+        ]
+        return {"result": {"names": wanted, "prefixes": sorted({name.partition(".")[0] for name in wanted})}}
+
+    def _describe(self, request: Message) -> Message:
+        return {"descriptors": [self._descriptor(name) for name in request["names"]]}
+
+    def _descriptor(self, name: str) -> Message:
+        parameter = self._parameters.get(name)
+        if parameter is None:
+            return {**self._no_descriptor, "name": name, "read_only": True}
+        variable = parameter.variable
+        ranges: list[Message] = []
+        if variable.minimum is not None and variable.maximum is not None:
+            ranges = [{"from_value": variable.minimum, "to_value": variable.maximum, "step": 0.0}]
+        double = _kind(variable) == _DOUBLE
+        return {
+            "name": name,
+            "type": _kind(variable),
+            "description": variable.description or "",
+            "additional_constraints": f"unit: {variable.unit}" if variable.unit else "",
+            "read_only": why_not_settable(variable, None) is not None,
+            "dynamic_typing": False,
+            "floating_point_range": ranges if double else [],
+            "integer_range": [] if double else [{name: int(limit) for name, limit in own.items()} for own in ranges],
+        }
+
+    # --- the mesh
+
+    def _value(self, name: str) -> Message:
+        parameter = self._parameters.get(name)
+        value = self._ask(parameter)[0] if parameter is not None else None
+        if parameter is None or value is None:
+            return self._no_value
+        kind = _kind(parameter.variable)
+        return {**self._no_value, "type": kind, _VALUE_FIELDS[kind]: float(value) if kind == _DOUBLE else value}
+
+    def _set_one(self, name: str, value: Message) -> str:
+        """Set one parameter; returns why it was refused, or an empty text."""
+        parameter = self._parameters.get(name)
+        if parameter is None:
+            return f"there is no parameter '{name}'"
+        field = _VALUE_FIELDS.get(value["type"])
+        if field is None:
+            return f"'{name}' takes one value, a {parameter.variable.type}"
+        return self._ask(parameter, value[field])[1]
+
+    def _ask(self, parameter: NodeParameter, value: Value | None = None) -> tuple[Any, str]:
+        """Get the value, or set a new one; returns the answer of the mesh, and why it refused or an empty text."""
+        key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
+        payload = encode_value(value) if value is not None else None
+        question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload, encode_origin(None, _WHO))
+        try:
+            return decode_json(ask(self._mesh, question), object), ""
+        except FmuMeshError as error:
+            return None, error.message
+
+
+def _kind(variable: Variable) -> int:
+    """The number of the parameter type in ROS (`rcl_interfaces/msg/ParameterType`)."""
+    match variable.type:
+        case "Boolean":
+            return _BOOL
+        case "String":
+            return _STRING
+        case "Float64" | "Float32":
+            return _DOUBLE
+        case _:
+            return _INTEGER
