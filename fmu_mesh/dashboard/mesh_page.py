@@ -19,7 +19,7 @@ from ..wire.views import InstanceStatus
 from .mesh_follower import Catalogue, MeshFollower, MeshView
 from .setting_fields import SettingField
 
-__all__ = ["MeshPage", "PlotCard", "first_plots"]
+__all__ = ["MeshPage"]
 
 _TABLE_S: Final = 1.0
 _PICTURE_S: Final = 1.0
@@ -60,9 +60,8 @@ class MeshPage:
         self._view = view
         self._read_only = read_only
         known = [[name for name in names if name in view.catalogue.elements] for names in plots]
-        self._plots = [
-            self._plot(names) for names in [names for names in known if names] or first_plots(view.catalogue)
-        ]
+        self._chosen = [names for names in known if names] or _first_plots(view.catalogue)
+        self._plots: list[_PlotCard] = []
         self._fields: dict[str, SettingField] = {}
         self._last_line = 0
         self._parts: list[Any] = []
@@ -130,25 +129,19 @@ class MeshPage:
         with ui.row().classes("fm-line"):
             span = ui.select(_SPANS, value=0, label="time", on_change=_show_span)
             span.props("dense outlined")
-            ui.button("Add a plot", icon="add", on_click=self._add_plot).props("dense flat")
+            ui.button("Add a plot", icon="add", on_click=lambda: self._add_plot([])).props("dense flat")
         self._charts = ui.element("div").classes("fm-column")
-        with self._charts:
-            for plot in self._plots:
-                plot.build()
+        for names in self._chosen:
+            self._add_plot(names)
         self._remember()
 
-    def _add_plot(self) -> None:
-        plot = self._plot([])
-        self._plots.append(plot)
-        with self._charts:
-            plot.build()
-
-    def _plot(self, names: list[str]) -> PlotCard:
-        def removed(plot: PlotCard) -> None:
+    def _add_plot(self, names: list[str]) -> None:
+        def removed(plot: _PlotCard) -> None:
             self._plots.remove(plot)
             self._remember()
 
-        return PlotCard(self._view.catalogue, names, self._remember, removed)
+        with self._charts:
+            self._plots.append(_PlotCard(self._view.catalogue, names, self._remember, removed))
 
     def _remember(self) -> None:
         """Put the curves into the address of the page, so that it shows them again when it is loaded."""
@@ -329,8 +322,8 @@ def _row(own: InstanceStatus, before: InstanceStatus | None) -> dict[str, Any]:
     }
 
 
-class PlotCard:
-    """One plot: a choice of variables above their curves.
+class _PlotCard:
+    """One plot: a choice of variables above their curves, which `static/plots.js` draws.
 
     Attributes:
         names: the variables that it shows.
@@ -341,24 +334,22 @@ class PlotCard:
         catalogue: Catalogue,
         names: list[str],
         changed: Callable[[], None],
-        removed: Callable[[PlotCard], None],
+        removed: Callable[[_PlotCard], None],
     ) -> None:
         self.names = names
         self._catalogue = catalogue
         self._changed = changed
         self._removed = removed
-
-    def build(self) -> None:
-        """Make its elements."""
-        elements = self._catalogue.elements
         with ui.card().classes("fm-card fm-plot-card").props("flat bordered") as self._card:
             with ui.row().classes("items-center no-wrap").style("width: 100%"):
-                choice = ui.select([*elements], value=self.names, multiple=True, label="variables", with_input=True)
+                choice = ui.select(
+                    [*catalogue.elements], value=names, multiple=True, label="variables", with_input=True
+                )
                 choice.props("dense outlined use-chips").classes("col").on_value_change(self._choose)
                 ui.button(icon="close", on_click=self._remove).props(
                     "dense flat round aria-label='Remove this plot'"
                 ).tooltip("Remove this plot")
-            self._chart = ui.echart(_options(self._catalogue, self.names)).classes("fm-plot").props("role=img")
+            self._chart = ui.echart(_options(catalogue, names)).classes("fm-plot").props("role=img")
         self._tell()
 
     def _choose(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
@@ -417,7 +408,7 @@ def _options(catalogue: Catalogue, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def first_plots(catalogue: Catalogue) -> list[list[str]]:
+def _first_plots(catalogue: Catalogue) -> list[list[str]]:
     """The first outputs, those with the same unit in one plot."""
     groups: dict[str | None, list[str]] = {}
     for name, (variable, _) in catalogue.elements.items():
