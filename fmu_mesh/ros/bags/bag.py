@@ -1,6 +1,6 @@
 """Reading a bag (MCAP or SQLite, by `ros2 bag` or by a mesh), which of its topics are inputs, and bags in scenarios.
 
-`rosbags` finds the messages; our own `Disassembler` reads them, as it does in the gateway.
+`rosbags` finds messages and definitions; our own `Disassembler` reads them, as it does in the gateway.
 
 Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a sample.
 """
@@ -35,7 +35,8 @@ from ..messages.stamp import nanoseconds
 from ..messages.topics import Topic
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces.typing import Typesdict
+    from rosbags.rosbag2 import Reader
 
 __all__ = ["Bag", "BagSample", "bag_values", "timed", "topics_for"]
 
@@ -69,7 +70,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         with importing("rosbags", "bags of ROS"):
-            from rosbags.highlevel import AnyReader  # noqa: PLC0415 an optional dependency
+            from rosbags.rosbag2 import Reader  # noqa: PLC0415 an optional dependency
         self.path = path
         if not files.exists(path):
             near = nearest_file(path)
@@ -84,10 +85,15 @@ class Bag:
         with reading(path, "bag"):
             if not files.is_folder(path):
                 files.opened(path).close()  # no pipe
-            self._reader: AnyReader = AnyReader([path])
+            self._reader = Reader(path)
             self._reader.open()
+            try:
+                self._definitions = _definitions(self._reader)
+            except BaseException:
+                self._reader.close()
+                raise
         self._types = MessageTypes()
-        self._types.store.fielddefs.update(self._reader.typestore.fielddefs)  # its own come first
+        self._types.store.fielddefs.update(self._definitions)  # its own come first
 
     def __enter__(self) -> Self:
         return self
@@ -102,7 +108,7 @@ class Bag:
 
     def add_types(self, types: MessageTypes) -> None:
         """Add the message types of this bag to ``types``."""
-        for name, definition in self._reader.typestore.fielddefs.items():
+        for name, definition in self._definitions.items():
             types.store.fielddefs.setdefault(name, definition)
 
     def samples(self, topics: Sequence[Topic], stamps: StampSource) -> Iterator[BagSample]:
@@ -129,6 +135,25 @@ class Bag:
                     at = logged if stamp is None or stamps == "log" else stamp
                     for port, value in zip(own.topic.ports, values, strict=True):
                         yield BagSample(at, port.instance, port.variable.name, value)
+
+
+def _definitions(reader: Reader) -> Typesdict:
+    """The message types that a bag defines. The reader for all kinds of bags would run code that it makes of them."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415 an optional dependency
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415 as above
+
+    found: Typesdict = {}
+    for connection in reader.connections:
+        text, kind = connection.msgdef.data, connection.msgdef.format
+        if kind == MessageDefinitionFormat.MSG:
+            found |= get_types_from_msg(text, connection.msgtype)
+        elif kind == MessageDefinitionFormat.IDL:
+            # Several files have lines of `=` between them, and each begins with its name.
+            for file in filter(None, text.split("=" * 80 + "\n")):
+                found |= get_types_from_idl(file.partition("\n")[2] if file.startswith("IDL: ") else file)
+    if reader.connections and not found:
+        raise ConfigurationError(f"the bag '{reader.path}' has no definitions of its messages.")
+    return found
 
 
 def topics_for(
