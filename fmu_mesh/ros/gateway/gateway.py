@@ -49,9 +49,8 @@ from ..messages.cdr import CdrError, Codec
 from ..messages.definitions import CLOCK
 from ..messages.stamp import to_stamp
 from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
-from .profile import Profile, Put
+from .profile import Profile, Put, Ros2Dds
 from .rmw_zenoh import ParameterServices, RmwZenoh
-from .ros2dds import Ros2Dds
 
 __all__ = ["Gateway", "open_profiles"]
 

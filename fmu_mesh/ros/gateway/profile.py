@@ -1,4 +1,10 @@
-"""Profiles: how topics look to ROS, or to a bridge to ROS; and what those on Zenoh have in common."""
+"""Profiles: how topics look to ROS, or to a bridge to ROS; what those on Zenoh have in common, and that of a bridge.
+
+Keys of zenoh-bridge-ros2dds are topic names, payloads are CDR, and tokens announce topics as a bridge does. A token is
+`@/<zid>/@ros2_lv/MP/<key>/<type>/<qos>` (MS for a subscriber), with `§` for every slash within a part. Its QoS is
+`<keyless>:<reliability>:<durability>:<history>,<depth>:<user data>` in the numbers of Cyclone DDS; the user data
+contain the type hash, as in ROS since Iron.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +17,7 @@ from ...wire.session import undeclare_all
 from ..messages.definitions import MessageTypes
 from ..messages.topics import Reliability, Topic
 
-__all__ = ["DEPTH", "Profile", "Put", "Take", "ZenohProfile"]
+__all__ = ["DEPTH", "Profile", "Put", "Ros2Dds", "Take", "ZenohProfile"]
 
 Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
@@ -21,6 +27,8 @@ Take = Callable[[bytes], None]
 
 DEPTH = 1000
 """History depth: how many samples a DDS writer keeps at most for a reader that has not acknowledged them."""
+_RELIABLE, _BEST_EFFORT = 1, 0
+_VOLATILE, _KEEP_LAST = 0, 0
 
 
 class Profile(Protocol):
@@ -74,9 +82,29 @@ class ZenohProfile:
         raise NotImplementedError
 
     def _announce(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
-        """Declare the token of a publisher (MP), a subscriber (MS) or a server (SS); returns the token."""
+        """Declare the token of a publisher (MP), a subscriber (MS) or a server (SS), and return it."""
+        token = self._token(kind, name, message, reliability)
+        self._tokens.append(self._session.liveliness().declare_token(token))
+        return token
+
+    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        """The token of a topic or a service."""
         raise NotImplementedError
 
-    def _attached(self, token: str) -> Callable[[float], bytes | None]:
+    def _attached(self, token: str) -> Callable[[float], bytes | None]:  # noqa: ARG002  another profile needs it
         """What goes with a sample of a publisher with this token at a time in s."""
-        raise NotImplementedError
+        return lambda _time: None
+
+
+class Ros2Dds(ZenohProfile):
+    """Topics as a bridge between Zenoh and DDS expects them."""
+
+    def _key(self, name: str, message: str) -> str:  # noqa: ARG002  the name says all
+        return name.removeprefix("/")
+
+    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        qos = f":{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}"
+        if self._types.distribution != "humble":
+            qos += f":typehash={self._types.type_hash(message)};"
+        parts = (self._key(name, message).replace("/", "§"), message.replace("/", "§"), qos)
+        return f"@/{self._session.zid()}/@ros2_lv/{kind}/{'/'.join(parts)}"

@@ -103,12 +103,10 @@ class RmwZenoh(ZenohProfile):
     def _key(self, name: str, message: str) -> str:
         return f"{self._domain}/{name.strip('/')}/{dds_type(message)}/{self._hash(message)}"
 
-    def _announce(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
         qos = f"{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
         own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
-        token = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node}/{own}"
-        self._tokens.append(self._session.liveliness().declare_token(token))
-        return token
+        return f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node}/{own}"
 
     def _attached(self, token: str) -> Callable[[float], bytes | None]:
         with importing("xxhash", "topics of rmw_zenoh"):
