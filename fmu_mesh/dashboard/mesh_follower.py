@@ -5,8 +5,8 @@ is made of what is there, and never waits for the mesh.
 """
 
 # Threads:
-# * `follow KEY` lives as long as the follower: it attaches to the mesh, asks for its status four times a second until
-#   it ends, and attaches again. Everything else is started and stopped from here.
+# * `follow KEY` lives as long as the follower: it attaches to the mesh, requests its status four times a second
+#   until it ends, and attaches again. Everything else is started and stopped from here.
 # * `sample`, one for each run, feeds curves: from the result file, or by questions for what is in no file. It goes on
 #   after the end of the run, since a page may still choose curves from the file, and ends with the next run.
 # * `log`, one for each run, collects the log; it ends with the mesh or with its session, so nobody joins it.
@@ -18,8 +18,8 @@ is made of what is there, and never waits for the mesh.
 #   cleared, and a page says with each question which run its curves are of.
 # * The result file is replaced while it is read (a run that was restarted in place): all curves begin anew.
 # * The end comes between two looks. `until_end` wakes the threads; how the run ended is known only if the handle has
-#   asked once before (`wait(0.0)`), because nobody answers afterwards.
-# * Many pages ask for many variables: of more than 64, the curve that nobody has asked for longest is dropped.
+#   requested it once before (`wait(0.0)`), because nobody answers afterwards.
+# * Many pages request many variables: of more than 64, the curve that no page has requested for longest is dropped.
 #
 # Given up: to push changes to pages, and to follow the values of nodes instead of the file (ADR 0061).
 
@@ -54,7 +54,7 @@ _LOOK_S: Final = 0.25
 _SAMPLE_S: Final = 0.05
 """Time between two looks for new values while the mesh runs, in s."""
 _AGAIN_S: Final = 1.0
-"""Time until a mesh that has ended is looked for again, and how long its failure may take to be told, in s."""
+"""Time until a mesh that has ended is looked for again, and how long the report of its failure may take, in s."""
 _ASKED_S: Final = 10.0
 """A value that is in no result file is asked for this long after the last page has shown it."""
 _LOG_LINES: Final = 500

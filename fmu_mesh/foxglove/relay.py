@@ -4,9 +4,9 @@
 # in the kernel drops every packet but those of this relay, and the relay looks at the request that begins each
 # connection; what follows goes through it as it is.
 #
-# Threads: the relay has one, with an event loop. `close` is called on another one, and only asks the loop to stop. The
-# SDK has threads of its own. The relay waits for nobody: a client that does not read is not read for either, and the
-# SDK drops what it cannot send.
+# Threads: the relay has one, with an event loop. `close` is called on another one, and only requests the stop of the
+# loop. The SDK has threads of its own. The relay waits for nobody: a client that does not read is not read for either,
+# and the SDK drops what it cannot send.
 #
 # What may go wrong:
 # * Another program of this host connects to the port of the SDK. The filter lets in one source port at a time, that of

@@ -64,13 +64,13 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
     name = f"fmu_mesh: {mesh}" if mesh is not None else "fmu_mesh"
     with FoxgloveServer(name, serving.host, serving.port, serving.origins) as server:
         say(f"Foxglove can connect to {server.url}, or open {server.link}")
-        is_told = False
+        is_reported = False
         while not stop.is_set():
-            if not is_told:
+            if not is_reported:
                 which = f"mesh '{mesh.rpartition('/')[2]}'" if mesh is not None else "a mesh"
                 server.tell(f"waiting for {which} to start", about="mesh")
                 say(f"waiting for {which} to start")
-                is_told = True
+                is_reported = True
             try:
                 with Meshes(serving.connect, serving.timeout) as meshes:
                     client = appearance(meshes, mesh, _START_S)
@@ -79,7 +79,7 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
                     except FmuMeshError:
                         if client.info_if_running() is not None:
                             raise  # otherwise nobody answered because the mesh has just ended
-                    mesh, is_told = client.keys.root, False
+                    mesh, is_reported = client.keys.root, False
             except DeadlineExceeded:
                 stop.wait(_START_S)
 

@@ -111,7 +111,9 @@ class RosLink:
             clocks = self._other_clocks() if linked else ()
             self._view = self._seen(linked=linked, clocks=clocks)
             self._warn_of_link(linked=linked)
-            self._warn_of_clocks(clocks)
+            for other in sorted({*clocks} - self._warned_clocks):
+                self._warned_clocks.add(other)
+                self._warn(two_clocks(other, "`clock_rate: null` in the section `ros`"))
             self._was_linked = self._was_linked or linked
             if self._over.wait(_INTERVAL_S):
                 return
@@ -155,12 +157,6 @@ class RosLink:
             what = f"the link to {self._where} was lost" if self._was_linked else self._view.activity
             nothing = f"so ROS gets nothing of mesh '{name}', which runs on"
             self._warn(f"{what}, {nothing}. {self._hint} The gateway keeps trying.")
-
-    def _warn_of_clocks(self, clocks: tuple[str, ...]) -> None:
-        for other in clocks:
-            if other not in self._warned_clocks:
-                self._warned_clocks.add(other)
-                self._warn(two_clocks(other, "`clock_rate: null` in the section `ros`"))
 
     def _warn(self, text: str) -> None:
         self._warnings += 1

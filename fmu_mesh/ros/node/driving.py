@@ -169,7 +169,10 @@ class FmuDriver:
             elif jumped_back:
                 self._shift = time - self._adapter.simulation_time_ns
         if not self._started:
-            self._begin(time)
+            self._start = time
+            self._steps = 0
+            self._adapter.exit_initialization_mode(Nanoseconds(time))
+            self._started = True
         steps, behind = self._advance(time - self._shift)
         return Update(
             time=self._adapter.simulation_time_ns + self._shift,
@@ -200,12 +203,6 @@ class FmuDriver:
             exact = steps_between(0.0, stop_time, adapter.step_size)
             self._last_step = math.floor(stop_time / adapter.step_size) if exact is None else exact
         return adapter
-
-    def _begin(self, time: int) -> None:
-        self._start = time
-        self._steps = 0
-        self._adapter.exit_initialization_mode(Nanoseconds(time))
-        self._started = True
 
     def _restart(self) -> None:
         """Replace the FMU by a new instance, and set again every variable that was set."""

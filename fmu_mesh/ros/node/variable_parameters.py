@@ -14,7 +14,7 @@ from ...errors import CallRefused, ConfigurationError
 from ...text import nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import nested
-from ..messages.ros_names import NameProblem, name_problems, ros_name
+from ..messages.ros_names import collision, name_problems, ros_name
 from .rclpy_modules import RosNode, ros_module
 
 __all__ = [
@@ -43,7 +43,7 @@ def names_of(variables: Sequence[Variable], names: Mapping[str, str] | None = No
             problems.append(f"'{chosen}', the name given to '{name}', is no ROS name")
         sharing = [other for other, taken in result.items() if taken == chosen]
         if len(sharing) > 1 and sharing[0] == name:
-            problems.append(str(NameProblem(chosen, tuple(sharing), "collision")))
+            problems.append(str(collision(chosen, sharing)))
     if problems:
         raise ConfigurationError(
             f"the FMU's variables cannot be named in ROS: {'; '.join(problems)}.",
