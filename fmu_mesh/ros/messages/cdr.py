@@ -30,6 +30,9 @@ ByteOrder = Literal["<", ">"]
 MAX_MESSAGE_SIZE: Final = 4 * 2**20
 """Largest size of a message, in bytes."""
 
+_ZEROS: Final = bytes(MAX_MESSAGE_SIZE)
+"""The decoder makes an empty message of them; the operating system gives no memory for what nobody writes."""
+
 _HEADER_SIZE: Final = 4
 """Size of the header, in bytes; alignment counts from its end."""
 
@@ -70,18 +73,17 @@ class Codec:
     """
 
     def __init__(self, types: MessageTypes, message: str) -> None:
-        self.message = message
         self._types = types
         self._field = _field_of(types, Nested(message), "")
 
     def empty(self) -> Message:
         """A message in which every number is 0, and every string and every sequence is empty."""
-        message: Message = self._field.empty()
+        message: Message = self._field.decode(_Reader(_ZEROS, "<"))
         return message
 
     def empty_field(self, kind: FieldType) -> Any:  # noqa: ANN401 a value of any type
         """The value of a field of this kind in an empty message."""
-        return _field_of(self._types, kind, "").empty()
+        return _field_of(self._types, kind, "").decode(_Reader(_ZEROS, "<"))
 
     def encode(self, message: Mapping[str, Any]) -> bytes:
         """The bytes of a message, little endian.
@@ -149,8 +151,6 @@ class _Field(Protocol):
 
     def decode(self, reader: _Reader) -> Any: ...  # noqa: ANN401 as above
 
-    def empty(self) -> Any: ...  # noqa: ANN401 as above
-
 
 def _field_of(types: MessageTypes, kind: FieldType, name: str) -> _Field:
     """The field of this kind; ``name`` is its path, for errors.
@@ -190,9 +190,6 @@ class _NumberField:
         start = reader.take(self._size, self._size, self._name)
         return self._structs[reader.byte_order].unpack_from(reader.data, start)[0]
 
-    def empty(self) -> Any:  # noqa: ANN401 a number
-        return self._structs["<"].unpack(bytes(self._size))[0]
-
 
 class _StringField:
     def __init__(self, bound: int, name: str) -> None:
@@ -226,9 +223,6 @@ class _StringField:
             raise CdrError(f"'{self._name}' has more than {self._bound} characters")
         return text
 
-    def empty(self) -> str:
-        return ""
-
 
 class _MessageField:
     def __init__(self, types: MessageTypes, message: str, name: str) -> None:
@@ -245,9 +239,6 @@ class _MessageField:
 
     def decode(self, reader: _Reader) -> Message:
         return {own: field.decode(reader) for own, field in self._fields}
-
-    def empty(self) -> Message:
-        return {own: field.empty() for own, field in self._fields}
 
 
 class _ArrayField:
@@ -291,9 +282,6 @@ class _ElementsField(_ArrayField):
         reader.count_elements(count, self._name)
         return [self._element.decode(reader) for _ in range(count)]
 
-    def empty(self) -> list[Any]:
-        return [self._element.empty() for _ in range(self._fixed or 0)]
-
 
 class _NumbersField(_ArrayField):
     def __init__(self, basic: str, kind: Array | Sequence, name: str) -> None:
@@ -316,9 +304,6 @@ class _NumbersField(_ArrayField):
         sent = self._sent[reader.byte_order]
         start = reader.take(count * sent.itemsize, sent.itemsize, self._name)
         return np.frombuffer(reader.data, sent, count, start).astype(self._dtype)
-
-    def empty(self) -> np.ndarray[Any, np.dtype[Any]]:
-        return np.zeros(self._fixed or 0, self._dtype)
 
     def _array(self, value: Any) -> np.ndarray[Any, np.dtype[Any]]:  # noqa: ANN401 any sequence
         """The elements as numbers; whole numbers must fit."""
