@@ -38,13 +38,12 @@ class RclpyProfile:
 
     def __init__(self, node: RosNode) -> None:
         self._node = node
-        self._publishers: list[Any] = []
-        self._subscriptions: list[Any] = []
+        self._entities = ExitStack()
 
     def publish(self, topic: Topic) -> Put:
         """Create a publisher of ``topic``."""
         publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
-        self._publishers.append(publisher)
+        self._entities.callback(self._node.destroy_publisher, publisher)
 
         def put(data: bytes, _time: float) -> None:
             try:
@@ -59,15 +58,12 @@ class RclpyProfile:
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Create a subscription of ``topic``."""
         kind = message_class(topic.message)
-        self._subscriptions.append(self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True))
+        subscription = self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True)
+        self._entities.callback(self._node.destroy_subscription, subscription)
 
     def close(self) -> None:
         """Destroy everything."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        for publisher in self._publishers:
-            self._node.destroy_publisher(publisher)
-        self._subscriptions, self._publishers = [], []
+        self._entities.close()
 
 
 class GatewayNode:
