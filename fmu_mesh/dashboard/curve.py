@@ -3,6 +3,9 @@
 Knows neither meshes nor pages.
 """
 
+# Threads: the values of a curve come on the thread of the samples of its mesh, and the event loop of the server reads
+# what has changed for each page. A lock for each curve is held for one addition or one answer (ADR 0061).
+
 from __future__ import annotations
 
 import itertools

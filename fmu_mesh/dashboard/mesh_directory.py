@@ -1,5 +1,8 @@
 """The meshes that a dashboard shows: one that was named, or all that run now and later."""
 
+# Threads: `meshes` looks for new meshes once a second, and each follower has threads of its own. The event loop of the
+# server reads `followers` meanwhile without a lock: the mapping is replaced, never changed (ADR 0061).
+
 from __future__ import annotations
 
 import threading

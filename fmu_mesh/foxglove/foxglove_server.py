@@ -4,6 +4,10 @@ Owns what is on the wire between runs of the mesh, and the time that clients are
 the SDK keeps a bounded number of messages for each, and drops the oldest ones of a client that does not read.
 """
 
+# Threads: the SDK calls `_Requests` on threads of its own; the threads of a shown mesh call everything else. Each lock
+# is held for a moment: `_Requests._lock` for what clients want, `_clock` for the time, which must not go back, and
+# `_logging` for the order of log messages.
+
 from __future__ import annotations
 
 import secrets

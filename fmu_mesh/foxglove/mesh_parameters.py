@@ -4,6 +4,9 @@ Owns what Foxglove is told that a parameter is: a value that was set is shown at
 point on. Called on threads of the SDK.
 """
 
+# Threads: the SDK calls `values` and `set`, and the thread that asks for values calls `changes`. The lock is for the
+# values that were set and are not in effect yet; nobody holds it while the mesh is asked.
+
 from __future__ import annotations
 
 import threading

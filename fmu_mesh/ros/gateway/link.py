@@ -5,6 +5,10 @@ this thread. A router does not pass tokens on between peers, and the gateway is 
 is opened as soon as the router answers, to see the tokens of others.
 """
 
+# Threads: `ros-link` looks at the link four times a second and writes `_view`; Zenoh calls `_token_changed` and
+# `_answer` on threads of its own, which take the lock of the tokens or read `_view`. Nobody waits for `ros-link` but
+# `close`, at most 3 s: to open a session may take long where nobody answers (ADR 0030).
+
 from __future__ import annotations
 
 import logging

@@ -8,6 +8,9 @@ the 16 bytes that identify its sender (rmw_zenoh, docs/design.md).
 Services of this node are how ROS reads and sets the parameters of all instances.
 """
 
+# Threads: Zenoh calls `answer` on a thread of its own, which only puts a job into a queue, because the mesh may answer
+# slowly and the callbacks of other topics must not wait for it. `parameters` does the jobs one by one (ADR 0030).
+
 from __future__ import annotations
 
 import itertools

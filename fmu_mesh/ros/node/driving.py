@@ -4,6 +4,11 @@ Owns the `FMIAdapter`, the limit on catching up, pauses, the stop time and jumps
 ROS parameters and rclpy. All times are in ns of the clock of the node.
 """
 
+# Threads: an FMU is only called by the thread of its `FmuThread`. The executor of rclpy, with any number of threads,
+# submits calls: from its timer, its subscriptions and its services, which answer while the FMU computes. An FMU that
+# does not return cannot be stopped: `close` gives it 5 s, then its files are removed, and the process ends without it
+# (ADR 0031).
+
 from __future__ import annotations
 
 import math

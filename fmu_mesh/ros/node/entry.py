@@ -3,6 +3,11 @@
 With the parameter `fmu_path` the node runs an FMU; with `config` it is the gateway of the mesh in that file.
 """
 
+# Threads: the main thread spins the executor and makes the transitions. `autostart` waits for a mesh, so that services
+# answer and Ctrl-C works meanwhile; it only creates a task for the executor. A timer ends the process if an FMU or the
+# middleware does not return at the end. rclpy has a thread for SIGINT, which shuts ROS down while callbacks still use
+# it; from the end on, SIGINT is ours and ends the process at once (ADR 0031).
+
 from __future__ import annotations
 
 import faulthandler

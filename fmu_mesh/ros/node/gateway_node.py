@@ -4,6 +4,11 @@
 parameters of the node.
 """
 
+# Threads: `gateway` runs the gateway and publishes; Zenoh calls its callbacks. The executor of rclpy makes the
+# transitions, looks four times a second whether the gateway has ended, takes messages, and sets parameters, for which
+# it waits for the mesh. The exit stacks undo what a transition did in the order in which the threads need it: first no
+# more looks, then the end of the thread, then the subscribers and the publishers that it used (ADR 0030, 0031).
+
 from __future__ import annotations
 
 import threading

@@ -4,6 +4,10 @@ Owns the parameters `names`, `messages` and `stamped` of the node. Knows nothing
 messages are objects of the user's own ROS, with the default values that ROS gives their fields.
 """
 
+# Threads: rclpy calls `arrived` on threads of its executor. Messages go through the queue of the `FmuThread`, which
+# takes inputs and publishes outputs; `_count` is the lock for the number of those that wait, because a queue without
+# a limit would take all memory while an FMU hangs (ADR 0031).
+
 from __future__ import annotations
 
 import re
