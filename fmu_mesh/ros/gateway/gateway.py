@@ -107,6 +107,7 @@ class Gateway:
         self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._progress = _Progress()
+        self._clock: _ClockPublisher | None = None
 
     def open(self, patience_s: float = 60.0) -> None:
         """Declare all topics; every later sample is carried.
@@ -125,7 +126,7 @@ class Gateway:
         if self._plan.clock_points is not None:
             first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
             put = next(iter(self._profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
-            self._progress.start_clock(_ClockPublisher(put, self._plan, self._grid))
+            self._clock = _ClockPublisher(put, self._plan, self._grid)
         for key, variable in watched.items():
             self._take_values(key, variable)
         self._entities.append(
@@ -141,7 +142,8 @@ class Gateway:
             if now >= due:
                 due = now + _REPEAT_S
                 self._report_left_out()
-                self._progress.repeat_clock()
+                if self._clock is not None:
+                    self._clock.repeat()
             try:
                 event = self._events.get(timeout=due - now if due > now else 0)
             except queue.Empty:
@@ -188,7 +190,8 @@ class Gateway:
 
     def _watch(self, port: Port) -> _WatchedVariable:
         key = self._keys.variable(port.instance, port.kind, port.variable.name)
-        return self._progress.watch(key, f"{port.instance}.{port.variable.name}", port.step_points)
+        variable = _WatchedVariable(f"{port.instance}.{port.variable.name}", port.step_points)
+        return self._progress.watched.setdefault(key, variable)  # several topics share it
 
     def _take_values(self, key: str, variable: _WatchedVariable) -> None:
         def arrived(sample: zenoh.Sample) -> None:
@@ -214,7 +217,11 @@ class Gateway:
                     put(message, time_s)
             except CdrError as error:
                 variable.warn(f"{value!r} cannot be sent on '{assembler.topic.name}': {error}")
-        self._progress.published(variable, stamp.point)
+        if self._clock is not None and variable.holds_until < 0:
+            self._clock.begin(stamp.point)
+        now = self._progress.published(variable, stamp.point)
+        if self._clock is not None:
+            self._clock.advance(now)
 
     # --- from ROS to the mesh
 
@@ -379,31 +386,12 @@ class _Progress:
         self.watched: dict[str, _WatchedVariable] = {}
         self.complete = -1
         self._newest = -1
-        self._now = -1
-        self._clock: _ClockPublisher | None = None
 
-    def start_clock(self, clock: _ClockPublisher) -> None:
-        self._clock = clock
-
-    def watch(self, key: str, name: str, step_points: int) -> _WatchedVariable:
-        """The variable with this key; several topics share it."""
-        return self.watched.setdefault(key, _WatchedVariable(name, step_points))
-
-    def published(self, variable: _WatchedVariable, point: int) -> None:
-        """Note that the sample of ``variable`` at ``point`` has been published, and move `/clock`."""
-        is_first, was_last = variable.holds_until < 0, variable.holds_until <= self.complete
-        if is_first and self._clock is not None:
-            self._clock.begin(point)
+    def published(self, variable: _WatchedVariable, point: int) -> int:
+        """Note that the sample of ``variable`` at ``point`` has been published; returns how far everything has been."""
+        was_last = variable.holds_until <= self.complete
         variable.advance(point)
         self._newest = max(self._newest, point)
         if was_last:
             self.complete = min(other.holds_until for other in self.watched.values())
-        now = min(self._newest, self.complete)
-        if now > self._now:
-            self._now = now
-            if self._clock is not None:
-                self._clock.advance(now)
-
-    def repeat_clock(self) -> None:
-        if self._clock is not None:
-            self._clock.repeat()
+        return min(self._newest, self.complete)
