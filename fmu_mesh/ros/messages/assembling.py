@@ -16,7 +16,7 @@ import numpy as np
 from ...variables.model_description import Value
 from ...variables.value_types import DTYPES, flattened, nested
 from .cdr import CdrError, Codec, Message
-from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
+from .definitions import FLOATS, HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
 from .stamp import in_nanoseconds, to_stamp
 from .topics import Port, Topic
 
@@ -91,7 +91,7 @@ class Assembler:
         container, last = self._place(port.path, types)
         kind = types.field(self.topic.message, port.path)
         element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
-        floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
+        floats = isinstance(element, Basic) and element.kind in FLOATS
         dtype = np.float64 if floats else DTYPES[port.variable.type]
         shape = port.variable.shape
         if shape and "layout" in self._message:

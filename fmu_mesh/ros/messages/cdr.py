@@ -19,7 +19,7 @@ import numpy as np
 
 from .definitions import MAX_ELEMENTS, Array, Basic, FieldType, MessageTypes, Nested, Sequence
 
-__all__ = ["MAX_MESSAGE_SIZE", "CdrError", "Codec", "Message"]
+__all__ = ["HEADER_SIZE", "MAX_MESSAGE_SIZE", "CdrError", "Codec", "Message"]
 
 Message = dict[str, Any]
 """A decoded message."""
@@ -33,7 +33,7 @@ MAX_MESSAGE_SIZE: Final = 4 * 2**20
 _ZEROS: Final = bytes(MAX_MESSAGE_SIZE)
 """The decoder makes an empty message of them; the operating system gives no memory for what nobody writes."""
 
-_HEADER_SIZE: Final = 4
+HEADER_SIZE: Final = 4
 """Size of the header, in bytes; alignment counts from its end."""
 
 _BYTE_ORDERS: Mapping[bytes, ByteOrder] = {b"\x00\x00": ">", b"\x00\x01": "<"}
@@ -103,12 +103,12 @@ class Codec:
         """
         if len(data) > MAX_MESSAGE_SIZE:
             raise CdrError(f"{len(data)} bytes are too many for a message")
-        byte_order = _BYTE_ORDERS.get(data[:2]) if len(data) >= _HEADER_SIZE else None
+        byte_order = _BYTE_ORDERS.get(data[:2]) if len(data) >= HEADER_SIZE else None
         if byte_order is None:
-            raise CdrError(f"it does not start as CDR does ({data[:_HEADER_SIZE].hex(' ')})")
+            raise CdrError(f"it does not start as CDR does ({data[:HEADER_SIZE].hex(' ')})")
         reader = _Reader(data, byte_order)
         message: Message = self._field.decode(reader)
-        if reader.rest >= _HEADER_SIZE:  # up to three bytes may fill a word
+        if reader.rest >= HEADER_SIZE:  # up to three bytes may fill a word
             raise CdrError(f"{reader.rest} bytes are left behind the message")
         return message
 
@@ -121,7 +121,7 @@ class _Reader:
     def __init__(self, data: bytes, byte_order: ByteOrder) -> None:
         self.data = data
         self.byte_order = byte_order
-        self._position = _HEADER_SIZE
+        self._position = HEADER_SIZE
         self._elements = MAX_ELEMENTS
 
     @property
@@ -131,7 +131,7 @@ class _Reader:
 
     def take(self, size: int, alignment: int, name: str) -> int:
         """Read the next ``size`` bytes at a multiple of ``alignment`` after the header; returns their position."""
-        start = self._position + (_HEADER_SIZE - self._position) % alignment
+        start = self._position + (HEADER_SIZE - self._position) % alignment
         if size > len(self.data) - start:
             raise CdrError(f"the message ends in '{name}'")
         self._position = start + size
@@ -327,4 +327,4 @@ def _format(basic: str) -> str:
 
 
 def _align(data: bytearray, size: int) -> None:
-    data += _PADDING[(_HEADER_SIZE - len(data)) % size]
+    data += _PADDING[(HEADER_SIZE - len(data)) % size]

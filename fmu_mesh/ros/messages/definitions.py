@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CLOCK",
+    "FLOATS",
     "HEADER",
     "MAX_ELEMENTS",
+    "NUMBERS",
     "TIME",
     "Array",
     "Basic",
@@ -42,6 +44,10 @@ HEADER = "std_msgs/msg/Header"
 
 MAX_ELEMENTS: Final = 1 << 16
 """Largest number of strings and nested messages in all arrays of one message; every index is below it."""
+
+FLOATS: Final = frozenset({"float32", "float64"})
+NUMBERS: Final = FLOATS | {"bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+"""Kinds of fields that numpy has by the same names; `byte` and `char` are other names of `uint8`."""
 
 Distribution = Literal["humble", "jazzy", "kilted", "lyrical"]
 
