@@ -13,16 +13,16 @@ from html import escape
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
-from ..dashboard.access import is_loopback
-from ..dashboard.dashboard_server import DashboardOptions, serve
+from ..dashboard.dashboard_server import serve
 from ..errors import Interrupted
+from ..web_server import ServedMesh, is_loopback
 from .arguments import Runs
 
 __all__ = ["RUNS"]
 
 
 def _dashboard(arguments: argparse.Namespace) -> int:
-    options = DashboardOptions(
+    options = ServedMesh(
         mesh=arguments.mesh,
         connect=arguments.connect,
         timeout=arguments.timeout,

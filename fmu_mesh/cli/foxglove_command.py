@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from ..installing import importing
+from ..web_server import is_loopback
 from .arguments import Runs
 
 __all__ = ["RUNS"]
@@ -17,14 +18,14 @@ def _foxglove(arguments: argparse.Namespace) -> int:
     serving = Serving(
         mesh=arguments.mesh,
         connect=tuple(arguments.connect),
-        timeout_s=arguments.timeout,
+        timeout=arguments.timeout,
         variables=tuple(arguments.variables),
         host=arguments.host,
         port=arguments.port,
         read_only=not arguments.steer,
         origins=tuple(arguments.origin),
     )
-    if serving.leaves_host:
+    if not is_loopback(serving.host):
         can = "read" if serving.read_only else "read and set"
         who = f"whoever can reach this host at {serving.host}, port {serving.port} and knows the address"
         print(f"fmu-mesh: warning: {who} can {can} this mesh; it is not encrypted", file=sys.stderr, flush=True)

@@ -5,14 +5,15 @@ Knows requests only, not what they ask for.
 
 from __future__ import annotations
 
-import hmac
 import ipaddress
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-__all__ = ["Access", "is_loopback"]
+from ..web_server import is_loopback, is_secret
+
+__all__ = ["Access"]
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -34,13 +35,6 @@ class Access:
       rebinding), but the browser then says that name.
     * `Origin`, which browsers send from scripts, must be the page itself.
     * The token is in the first URL, and in a cookie from then on, so it is in no further URL.
-
-    Args:
-        application: what is protected.
-        token: the secret.
-        host: where the server listens.
-        port: of the server; part of the cookie's name, since cookies do not know ports.
-        names: further names of this host.
     """
 
     def __init__(self, application: Application, token: str, host: str, port: int, names: frozenset[str]) -> None:
@@ -48,6 +42,7 @@ class Access:
         self._token = token
         self._local = is_loopback(host)
         self._names = names | {"localhost", host.lower()}
+        # Cookies do not know ports, so the name of this one has it.
         self._cookie = f"fmu_mesh_dashboard_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -60,9 +55,9 @@ class Access:
         given = query.pop(_TOKEN, [""])[0]
         if not self._is_ours(headers):
             await _refuse(scope, receive, send, "this is not a name of the host of the dashboard")
-        elif scope["type"] == "http" and self._is_token(given):
+        elif scope["type"] == "http" and is_secret(given, self._token):
             await self._enter(query, send)
-        elif self._is_token(self._cookie_of(headers)):
+        elif is_secret(self._cookie_of(headers), self._token):
             await self._application(scope, receive, _with_headers(send))
         else:
             await _refuse(scope, receive, send, "open the address that `fmu-mesh dashboard` printed: it has a token")
@@ -70,7 +65,10 @@ class Access:
     def _is_ours(self, headers: Mapping[str, str]) -> bool:
         host = headers.get("host", "")
         origin = headers.get("origin")
-        name = _name_of(host)
+        try:
+            name = urlsplit(f"//{host}").hostname  # without the port
+        except ValueError:
+            return False
         if name is None or (origin is not None and urlsplit(origin).netloc.lower() != host.lower()):
             return False
         if name in self._names:
@@ -80,9 +78,6 @@ class Access:
         except ValueError:
             return False
         return address.is_loopback or not self._local  # an address cannot be rebound
-
-    def _is_token(self, text: str) -> bool:
-        return hmac.compare_digest(text.encode("utf-8", "replace"), self._token.encode())
 
     def _cookie_of(self, headers: Mapping[str, str]) -> str:
         try:
@@ -99,24 +94,6 @@ class Access:
         headers = [(b"location", location.encode()), (b"set-cookie", cookie.encode()), *_HEADERS]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only programs of this host reach a server that listens there."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def _name_of(host: str) -> str | None:
-    """The name in a `Host` header, without the port."""
-    try:
-        return urlsplit(f"//{host}").hostname
-    except ValueError:
-        return None
 
 
 def _with_headers(send: Send) -> Send:

@@ -3,6 +3,9 @@
 Knows neither meshes nor pages.
 """
 
+# Threads: the values of a curve come on the thread of the samples of its mesh, and the event loop of the server reads
+# what has changed for each page. A lock for each curve is held for one addition or one answer (ADR 0061).
+
 from __future__ import annotations
 
 import itertools
@@ -116,11 +119,7 @@ class BoundedCurve:
 
 
 class Looks:
-    """Which values were looked at in the look before, so that none that could be had is missing between them.
-
-    Args:
-        usual: the time between two looks in s; it follows that of a slow source.
-    """
+    """Which values were looked at in the look before, so that none that could be had is missing between them."""
 
     def __init__(self, usual: float) -> None:
         self._least = self._usual = usual
@@ -130,6 +129,7 @@ class Looks:
 
     def begin(self, now: float) -> None:
         """Begin a look at a wall-clock time in s."""
+        # A slow source has a longer time between two looks.
         self._usual += 0.1 * (min(max(now - self._began, self._least), 2.0 * self._usual) - self._usual)
         self._number, self._began = self._number + 1, now
 
@@ -149,13 +149,7 @@ class Looks:
 
 
 class _Intervals:
-    """The smallest and the largest value of each of some intervals.
-
-    Args:
-        numbers: of the interval at each place.
-        start: the start time in s.
-        width: length of an interval in s at first.
-    """
+    """The smallest and the largest value of each of some intervals."""
 
     def __init__(self, numbers: NDArray[np.int32 | np.int64], start: float, width: float) -> None:
         count = len(numbers)

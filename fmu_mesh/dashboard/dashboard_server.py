@@ -5,26 +5,26 @@ Only this module and `live_page` import NiceGUI, and only when a dashboard is st
 
 from __future__ import annotations
 
-import errno
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from ..errors import ConfigurationError
 from ..installing import require
-from .access import Access, is_loopback
+from ..web_server import ServedMesh, is_loopback, listening, shown_host
+from .access import Access
 from .mesh_directory import MeshDirectory
 from .mesh_follower import CurveQuestion
 
 if TYPE_CHECKING:
+    import uvicorn
     from fastapi import Request
 
-__all__ = ["DashboardOptions", "serve"]
+__all__ = ["serve"]
 
 STATIC: Final = Path(__file__).parent / "static"
 _QUESTION_BYTES: Final = 64 << 10
@@ -33,34 +33,17 @@ _HISTORY: Final = 100
 _PATIENCE_S: Final = 30.0
 """A page that does not answer for this long is forgotten, and loads itself again; a busy browser needs some time."""
 _CLOSING_S: Final = 1
+_ICON: Final = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><g fill="none" stroke="#0072b2" stroke-width="1.5">'
+    '<path d="M4 4L12 6L7 12Z"/></g><g fill="#0072b2"><circle cx="4" cy="4" r="2.5"/><circle cx="12" cy="6" r="2.5"/>'
+    '<circle cx="7" cy="12" r="2.5"/></g></svg>'
+)
 
 
-class DashboardOptions(msgspec.Struct, frozen=True):
-    """What the command line says.
-
-    Attributes:
-        mesh: name or key of the only mesh; None: all that can be reached.
-        connect: Zenoh endpoints; default: the meshes of this user on this host.
-        timeout: deadline of every question to a mesh in s.
-        host: address where the server listens.
-        port: its port; 0: a free one.
-        read_only: whether nothing can be set or steered.
-    """
-
-    mesh: str | None = None
-    connect: Sequence[str] = ()
-    timeout: float = 5.0
-    host: str = "127.0.0.1"
-    port: int = 0
-    read_only: bool = False
-
-
-def serve(options: DashboardOptions, ready: Callable[[str], None]) -> None:
+def serve(options: ServedMesh, ready: Callable[[str], None]) -> None:
     """Serve the page until SIGINT, which raises KeyboardInterrupt, or SIGTERM, which ends the process.
 
-    Args:
-        options: what is served, and where.
-        ready: called with the URL as soon as it can be opened.
+    ``ready`` is called with the URL as soon as it can be opened.
 
     Raises:
         ConfigurationError: NiceGUI is not installed, the port is taken, or the mesh does not run.
@@ -68,21 +51,22 @@ def serve(options: DashboardOptions, ready: Callable[[str], None]) -> None:
     """
     require("nicegui", "dashboards")
     with (
-        _listening(options.host, options.port) as listener,
+        listening(options.host, options.port, "the dashboard") as listener,
         MeshDirectory(options.mesh, options.connect, options.timeout) as directory,
     ):
-        _serve(options, listener, directory, ready)
+        port, token = listener.getsockname()[1], secrets.token_urlsafe(24)
+        server = _server(options, port, token, directory)
+        ready(f"http://{shown_host(options.host)}:{port}/?token={token}")
+        server.run([listener])
 
 
-def _serve(
-    options: DashboardOptions, listener: socket.socket, directory: MeshDirectory, ready: Callable[[str], None]
-) -> None:
+def _server(options: ServedMesh, port: int, token: str, directory: MeshDirectory) -> uvicorn.Server:
     import uvicorn  # noqa: PLC0415  an extra, and slow to import
     from fastapi import FastAPI, Response  # noqa: PLC0415  as above
     from fastapi.staticfiles import StaticFiles  # noqa: PLC0415  as above
     from nicegui import ui  # noqa: PLC0415  as above
 
-    from .live_page import LivePage  # noqa: PLC0415  it imports NiceGUI
+    from .live_page import register_page  # noqa: PLC0415  it imports NiceGUI
 
     application = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
@@ -98,7 +82,7 @@ def _serve(
     # Not by annotations: FastAPI would look for these names in this module.
     application.router.add_route("/dashboard/curves", curves, methods=["POST"])
     application.mount("/dashboard/static", StaticFiles(directory=STATIC))
-    LivePage(directory, read_only=options.read_only).register()
+    register_page(directory, read_only=options.read_only)
     ui.run_with(
         application,
         title="fmu_mesh",
@@ -110,8 +94,6 @@ def _serve(
         reconnect_timeout=_PATIENCE_S,
         show_welcome_message=False,
     )
-    port = listener.getsockname()[1]
-    token = secrets.token_urlsafe(24)
     names = frozenset() if is_loopback(options.host) else frozenset((socket.gethostname().lower(), socket.getfqdn()))
     config = uvicorn.Config(
         Access(application, token, options.host, port, names),
@@ -122,8 +104,7 @@ def _serve(
         lifespan="on",
         timeout_graceful_shutdown=_CLOSING_S,
     )
-    ready(f"http://{_shown_host(options.host)}:{port}/?token={token}")
-    uvicorn.Server(config).run([listener])
+    return uvicorn.Server(config)
 
 
 async def _body(request: Request) -> bytes:
@@ -138,42 +119,3 @@ async def _body(request: Request) -> bytes:
         if len(body) > _QUESTION_BYTES:
             raise ValueError
     return bytes(body)
-
-
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens.
-
-    Raises:
-        ConfigurationError: the port is taken, or the address is none of this host.
-    """
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(address)
-            listener.listen()
-        except BaseException:
-            listener.close()
-            raise
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            text = f"port {port} of {host} is taken by another program."
-            raise ConfigurationError(text, hint="`--port 0` takes a free one.") from error
-        reason = error.strerror or str(error)
-        raise ConfigurationError(f"the dashboard cannot listen at {host}, port {port}: {reason}.") from error
-    return listener
-
-
-def _shown_host(host: str) -> str:
-    """The host in the URL: a name of this host if it listens at all addresses."""
-    if host in ("0.0.0.0", "::"):  # noqa: S104  the user asked for it
-        return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
-
-
-_ICON: Final = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><g fill="none" stroke="#0072b2" stroke-width="1.5">'
-    '<path d="M4 4L12 6L7 12Z"/></g><g fill="#0072b2"><circle cx="4" cy="4" r="2.5"/><circle cx="12" cy="6" r="2.5"/>'
-    '<circle cx="7" cy="12" r="2.5"/></g></svg>'
-)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 from fastapi import Request
@@ -15,7 +14,7 @@ from .mesh_directory import MeshDirectory
 from .mesh_follower import MeshView
 from .mesh_page import MeshPage
 
-__all__ = ["LivePage"]
+__all__ = ["register_page"]
 
 # A status comes four times a second, so a shorter time shows nothing new.
 _REDRAW_S: Final = 0.25
@@ -23,29 +22,19 @@ _BUSY_S: Final = 60.0
 """On a busy machine, a page may take this long to be made."""
 
 
-class LivePage:
-    """The page at `/`, for any number of browsers.
+def register_page(directory: MeshDirectory, *, read_only: bool) -> None:
+    """Let NiceGUI serve the page at `/` to any number of browsers."""
 
-    Args:
-        directory: the meshes.
-        read_only: whether nothing can be set or steered.
-    """
-
-    def __init__(self, directory: MeshDirectory, *, read_only: bool) -> None:
-        self._directory = directory
-        self._read_only = read_only
-
-    def register(self) -> None:
-        """Let NiceGUI serve it."""
-        ui.page("/", response_timeout=_BUSY_S)(self._open)
-
-    async def _open(self, request: Request) -> None:
+    @ui.page("/", response_timeout=_BUSY_S)
+    async def opened(request: Request) -> None:
         """A browser opens the page: `?mesh=KEY&curve=0:instance.variable` says what it shows."""
         ui.add_head_html('<link rel="stylesheet" href="/dashboard/static/dashboard.css">')
         ui.add_head_html('<script src="/dashboard/static/plots.js"></script>')
-        wanted = request.query_params.get("mesh")
-        chosen = [text.partition(":")[::2] for text in request.query_params.getlist("curve")]
-        content = _Content(self._directory, wanted, _grouped(chosen), read_only=self._read_only)
+        plots: dict[str, list[str]] = {}
+        for text in request.query_params.getlist("curve"):
+            number, _, name = text.partition(":")
+            plots.setdefault(number, []).append(name)
+        content = _Content(directory, request.query_params.get("mesh"), [*plots.values()], read_only=read_only)
         await ui.context.client.connected()
         content.look()
         ui.timer(_REDRAW_S, content.look)
@@ -54,11 +43,8 @@ class LivePage:
 class _Content:
     """What is on one page: a choice of meshes above one of them.
 
-    Args:
-        directory: the meshes.
-        wanted: key of the mesh to show first.
-        plots: the curves of each plot; empty: the page chooses.
-        read_only: whether nothing can be set or steered.
+    The key of the mesh to show first, and the curves of each plot, are what the address says; without them, the page
+    chooses.
     """
 
     def __init__(
@@ -82,7 +68,9 @@ class _Content:
         """Show what is known now."""
         followers = self._directory.followers
         if [*followers] != [*self._choice.options]:
-            names = _short_names([*followers])
+            short = [key.rpartition("/")[2] for key in followers]
+            # Where two have the same name, each is shown by its key.
+            names = {k: name if short.count(name) == 1 else k for k, name in zip(followers, short, strict=True)}
             value = self._choice.value if self._choice.value in followers else None
             value = value or (self._wanted if self._wanted in followers else next(iter(followers), None))
             self._choice.set_options(names, value=value)
@@ -112,17 +100,3 @@ class _Content:
             self._plots = self._page.plots if self._page.key == self._choice.value else []
             self._page.remove()
             self._page = None
-
-
-def _grouped(chosen: Sequence[Sequence[str]]) -> list[list[str]]:
-    """The curves of each plot, from pairs of the number of a plot and the name of a variable."""
-    plots: dict[str, list[str]] = {}
-    for number, name in chosen:
-        plots.setdefault(number, []).append(name)
-    return [*plots.values()]
-
-
-def _short_names(keys: Sequence[str]) -> dict[str, str]:
-    """By key the name of a mesh, and its key where two have the same name."""
-    names = [key.rpartition("/")[2] for key in keys]
-    return {key: name if names.count(name) == 1 else key for key, name in zip(keys, names, strict=True)}

@@ -1,11 +1,13 @@
 """The meshes that a dashboard shows: one that was named, or all that run now and later."""
 
+# Threads: `meshes` looks for new meshes once a second, and each follower has threads of its own. The event loop of the
+# server reads `followers` meanwhile without a lock: the mapping is replaced, never changed (ADR 0061).
+
 from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from types import TracebackType
 from typing import Final, Self
 
 from ..errors import FmuMeshError
@@ -21,13 +23,7 @@ _MOST_MESHES: Final = 32
 
 
 class MeshDirectory:
-    """Followers of meshes by key, as long as the `with` block lasts.
-
-    Args:
-        mesh: name or key of the only one; None: all that can be reached.
-        connect: Zenoh endpoints, as those of `attach`.
-        timeout: deadline of every question in s.
-    """
+    """Followers of meshes by key, as long as the `with` block lasts."""
 
     def __init__(self, mesh: str | None, connect: Sequence[str], timeout: float) -> None:
         self._mesh = mesh
@@ -53,9 +49,7 @@ class MeshDirectory:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()

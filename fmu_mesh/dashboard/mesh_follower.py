@@ -4,6 +4,25 @@ Owns the handle of the mesh, the history of chosen variables, and the log. Pages
 is made of what is there, and never waits for the mesh.
 """
 
+# Threads:
+# * `follow KEY` lives as long as the follower: it attaches to the mesh, requests its status four times a second
+#   until it ends, and attaches again. Everything else is started and stopped from here.
+# * `sample`, one for each run, feeds curves: from the result file, or by questions for what is in no file. It goes on
+#   after the end of the run, since a page may still choose curves from the file, and ends with the next run.
+# * `log`, one for each run, collects the log; it ends with the mesh or with its session, so nobody joins it.
+# * Pages: the event loop of the server calls `view`, `log` and `changes`, which take a lock for a moment and never
+#   wait; `ask` and `picture` may take long, and pages call them on other threads.
+#
+# What may go wrong:
+# * The thread of the samples of one run adds values to the curves of the next one. So it is joined before these are
+#   cleared, and a page says with each question which run its curves are of.
+# * The result file is replaced while it is read (a run that was restarted in place): all curves begin anew.
+# * The end comes between two looks. `until_end` wakes the threads; how the run ended is known only if the handle has
+#   requested it once before (`wait(0.0)`), because nobody answers afterwards.
+# * Many pages request many variables: of more than 64, the curve that no page has requested for longest is dropped.
+#
+# Given up: to push changes to pages, and to follow the values of nodes instead of the file (ADR 0061).
+
 from __future__ import annotations
 
 import threading
@@ -30,10 +49,12 @@ __all__ = ["MOST_CURVES", "Catalogue", "CurveQuestion", "MeshFollower", "MeshVie
 
 MOST_CURVES: Final = 64
 """Variables whose history is kept for one mesh; beyond it, that of the one that no page has asked for longest goes."""
-# A status is published four times a second, so a shorter time shows nothing new.
 _STATUS_S: Final = 0.25
+"""Time between two looks at the status, in s: it is published four times a second."""
 _SAMPLE_S: Final = 0.05
+"""Time between two looks for new values while the mesh runs, in s."""
 _AGAIN_S: Final = 1.0
+"""Time until a mesh that has ended is looked for again, and how long the report of its failure may take, in s."""
 _ASKED_S: Final = 10.0
 """A value that is in no result file is asked for this long after the last page has shown it."""
 _LOG_LINES: Final = 500
@@ -102,13 +123,7 @@ class CurveQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeshFollower:
-    """Follows a mesh, also through its end and its next run, until it is closed.
-
-    Args:
-        key: name or key of the mesh.
-        connect: Zenoh endpoints, as those of `attach`.
-        timeout: deadline of every question in s.
-    """
+    """Follows a mesh, also through its end and its next run, until it is closed."""
 
     def __init__(self, key: str, connect: Sequence[str], timeout: float) -> None:
         self._key = key
@@ -234,8 +249,13 @@ class MeshFollower:
                     ended.wait(_STATUS_S)
             finally:
                 if not self._closing.is_set():
-                    failure, last = _failure(run), {n: _at_its_end(own) for n, own in self._view.instances.items()}
-                    self._change(ended=True, failure=failure, instances=last, before=last)
+                    last = {
+                        name: msgspec.structs.replace(
+                            own, state=own.state if own.state in ("done", "failed") else "ended", activity=""
+                        )
+                        for name, own in self._view.instances.items()
+                    }
+                    self._change(ended=True, failure=_failure(run), instances=last, before=last)
                 self._run = None
         # The thread of the log ends with the mesh, or with the session that `attach` closes.
 
@@ -335,12 +355,6 @@ def _failure(run: Run) -> str | None:
     except FmuMeshError as error:
         return None if isinstance(error, DeadlineExceeded | Interrupted) else str(error)
     return None
-
-
-def _at_its_end(own: InstanceStatus) -> InstanceStatus:
-    """What is known of an instance that runs no more."""
-    state = own.state if own.state in ("done", "failed") else "ended"
-    return msgspec.structs.replace(own, state=state, activity="")
 
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:

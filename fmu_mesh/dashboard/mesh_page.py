@@ -15,9 +15,8 @@ from nicegui import run, ui
 from ..api.run_handle import Run
 from ..errors import FmuMeshError
 from ..printing import paragraph
-from .instance_table import InstanceTable
-from .mesh_follower import MeshFollower, MeshView
-from .plot_card import PlotCard, first_plots
+from ..wire.views import InstanceStatus
+from .mesh_follower import Catalogue, MeshFollower, MeshView
 from .setting_fields import SettingField
 
 __all__ = ["MeshPage"]
@@ -30,17 +29,29 @@ _VALUES_S: Final = 2.0
 _FIELDS: Final = 8
 _SPANS: Final = {0: "from the start", 1: "last 1 s", 10: "last 10 s", 60: "last 60 s", 600: "last 600 s"}
 _STATES: Final = {"running": "positive", "paused": "warning", "failed": "negative"}
+_COLUMNS: Final = {
+    "instance": "instance",
+    "state": "state",
+    "point": "point",
+    "rate": "points/s",
+    "step": "step time",
+    "share": "computes, waits",
+    "restarts": "restarts",
+    "activity": "activity",
+}
+_BAR: Final = """
+<q-td :props="props"><div class="fm-bar" role="img" :title="props.row.shares" :aria-label="props.row.shares">
+<div :style="{width: props.row.share[0] + '%'}"></div><div :style="{width: props.row.share[1] + '%'}"></div>
+</div></q-td>
+"""
+_PLOTS: Final = 4
+_CURVES: Final = 5
+_HELD: Final = ("parameter", "calculatedParameter")
+"""Their values hold until they get others, whatever their variability is."""
 
 
 class MeshPage:
-    """One run of a mesh on one page.
-
-    Args:
-        follower: of the mesh.
-        view: what is known of it.
-        plots: the curves of each plot; empty: the first outputs, by unit.
-        read_only: whether nothing can be set or steered.
-    """
+    """One run of a mesh on one page."""
 
     def __init__(self, follower: MeshFollower, view: MeshView, plots: list[list[str]], *, read_only: bool) -> None:
         self.key = view.key
@@ -49,9 +60,8 @@ class MeshPage:
         self._view = view
         self._read_only = read_only
         known = [[name for name in names if name in view.catalogue.elements] for names in plots]
-        self._plots = [
-            self._plot(names) for names in [names for names in known if names] or first_plots(view.catalogue)
-        ]
+        self._chosen = [names for names in known if names] or _first_plots(view.catalogue)
+        self._plots: list[_PlotCard] = []
         self._fields: dict[str, SettingField] = {}
         self._last_line = 0
         self._parts: list[Any] = []
@@ -87,20 +97,23 @@ class MeshPage:
             self._parts.append(columns)
             with ui.element("div").classes("fm-column"):
                 self._add_plots()
-                self._add_instances()
+                with _card("Instances"):
+                    self._table = _InstanceTable()
             with ui.element("div").classes("fm-column"):
                 if not self._read_only:
                     self._add_settings()
                 self._add_picture()
-                self._add_log()
-        self._parts.append(ui.timer(_TABLE_S, self._show_table))
+                with _card("Log"):
+                    self._log = ui.log(max_lines=500).classes("fm-log")
+                    self._log.props("role=log aria-label=Log tabindex=0")
+        self._parts.append(ui.timer(_TABLE_S, lambda: self._table.show(self._view)))
         self._parts.append(ui.timer(max(_PICTURE_S, _INSTANCE_S * len(self._view.infos)), self._draw_picture))
         if not self._read_only:
             self._parts.append(ui.timer(_VALUES_S, self._read_values))
 
     def _add_buttons(self) -> None:
-        self._pausing = _button("Pause", "pause", self._pause)
-        self._resuming = _button("Resume", "play_arrow", self._resume)
+        self._pausing = _button("Pause", "pause", partial(self._act, Run.pause))
+        self._resuming = _button("Resume", "play_arrow", partial(self._act, Run.resume))
         self._points = ui.number(value=1, min=1, precision=0, label="points").props("dense dark outlined")
         self._points.classes("fm-points")
         _button("Step", "skip_next", self._step)
@@ -114,27 +127,21 @@ class MeshPage:
 
     def _add_plots(self) -> None:
         with ui.row().classes("fm-line"):
-            span = ui.select(_SPANS, value=0, label="time", on_change=lambda event: _show_span(event.value))
+            span = ui.select(_SPANS, value=0, label="time", on_change=_show_span)
             span.props("dense outlined")
-            ui.button("Add a plot", icon="add", on_click=self._add_plot).props("dense flat")
+            ui.button("Add a plot", icon="add", on_click=lambda: self._add_plot([])).props("dense flat")
         self._charts = ui.element("div").classes("fm-column")
-        with self._charts:
-            for plot in self._plots:
-                plot.build()
+        for names in self._chosen:
+            self._add_plot(names)
         self._remember()
 
-    def _add_plot(self) -> None:
-        plot = self._plot([])
-        self._plots.append(plot)
+    def _add_plot(self, names: list[str]) -> None:
+        def removed(plot: _PlotCard) -> None:
+            self._plots.remove(plot)
+            self._remember()
+
         with self._charts:
-            plot.build()
-
-    def _plot(self, names: list[str]) -> PlotCard:
-        return PlotCard(self._view.catalogue, names, self._remember, self._drop_plot)
-
-    def _drop_plot(self, plot: PlotCard) -> None:
-        self._plots.remove(plot)
-        self._remember()
+            self._plots.append(_PlotCard(self._view.catalogue, names, self._remember, removed))
 
     def _remember(self) -> None:
         """Put the curves into the address of the page, so that it shows them again when it is loaded."""
@@ -142,15 +149,14 @@ class MeshPage:
         query = json.dumps([["mesh", self.key], *(["curve", curve] for curve in curves)])
         ui.run_javascript(f"history.replaceState(null, '', '/?' + new URLSearchParams({query}))")
 
-    def _add_instances(self) -> None:
-        with _card("Instances"):
-            self._table = InstanceTable()
-
     def _add_picture(self) -> None:
         with _card("Connections"):
-            ui.switch("full size", on_change=self._enlarge).props("dense").classes("fm-corner")
-            self._picture = ui.html("", sanitize=False).classes("fm-graph")  # our own SVG, in which names are escaped
-            self._picture.props("role=img aria-label='the instances and their connections' tabindex=0")
+            switch = ui.switch("full size", on_change=lambda: self._picture.classes(toggle="fm-full"))
+            switch.props("dense").classes("fm-corner")
+            self._picture: ui.html = ui.html("", sanitize=False)  # our own SVG, in which names are escaped
+            self._picture.classes("fm-graph").props(
+                "role=img aria-label='the instances and their connections' tabindex=0"
+            )
 
     def _add_settings(self) -> None:
         settable = self._view.catalogue.settable
@@ -161,13 +167,10 @@ class MeshPage:
             first = [name for name, v in settable.items() if not v.shape][:_FIELDS] or [*settable][:_FIELDS]
             if len(settable) > len(first):
                 choice = ui.select([*settable], value=first, multiple=True, label="variables", with_input=True)
-                choice.props("dense outlined use-chips").style("width: 100%").on_value_change(self._choose_fields)
+                choice.props("dense outlined use-chips").style("width: 100%")
+                choice.on_value_change(lambda event: self._show_fields(event.value or []))
             self._settings = ui.element("div").classes("fm-column").style("gap: 4px")
             self._show_fields(first)
-
-    def _add_log(self) -> None:
-        with _card("Log"):
-            self._log = ui.log(max_lines=500).classes("fm-log").props("role=log aria-label=Log tabindex=0")
 
     # --- what it shows
 
@@ -197,9 +200,6 @@ class MeshPage:
             self._buttons.set_visibility(not view.ended)
         self._show_log()
 
-    def _show_table(self) -> None:
-        self._table.show(self._view)
-
     def _show_log(self) -> None:
         for line in self._follower.log:
             if line.number > self._last_line:
@@ -207,18 +207,12 @@ class MeshPage:
                 message = paragraph(line.message)
                 self._log.push(f"{line.instance} at point {line.point}: {line.status.lower()}: {message}")
 
-    def _enlarge(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
-        self._picture.classes(add="fm-full") if event.value else self._picture.classes(remove="fm-full")
-
     async def _draw_picture(self) -> None:
         picture = await run.io_bound(self._follower.picture)
         if picture is not None and picture != self._picture.content:
             self._picture.set_content(picture)
 
     # --- what it does
-
-    def _choose_fields(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
-        self._show_fields(event.value or [])
 
     def _show_fields(self, names: Sequence[str]) -> None:
         settable = self._view.catalogue.settable
@@ -241,12 +235,6 @@ class MeshPage:
         if answer is not None and (field := self._fields.get(name)) is not None:
             field.say(f"from t = {answer.time:.6g} s")
 
-    async def _pause(self) -> None:
-        await self._act(Run.pause)
-
-    async def _resume(self) -> None:
-        await self._act(Run.resume)
-
     async def _step(self) -> None:
         points = int(self._points.value or 1)
         await self._act(lambda mesh: mesh.step(points))
@@ -258,7 +246,7 @@ class MeshPage:
     async def _act(self, action: Callable[[Run], Any]) -> Any:  # noqa: ANN401  the answers of a Run
         """Do something to the mesh; None if it refuses, after saying why."""
         try:
-            return await run.io_bound(_act, self._follower, action)
+            return await run.io_bound(self._follower.ask, action)
         except FmuMeshError as error:
             ui.notify(str(error), type="negative", close_button=True, timeout=10000)
             return None
@@ -276,12 +264,8 @@ def _button(text: str, icon: str, act: Callable[[], Any], color: str = "secondar
     return ui.button(text, icon=icon, color=color, on_click=act).props(f"dense unelevated aria-label={text}")
 
 
-def _show_span(seconds: int) -> None:
-    ui.run_javascript(f"fmuMeshPlots.span({seconds})")
-
-
-def _act(follower: MeshFollower, action: Callable[[Run], Any]) -> Any:  # noqa: ANN401  the answers of a Run
-    return follower.ask(action)
+def _show_span(event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
+    ui.run_javascript(f"fmuMeshPlots.span({event.value})")  # nobody awaits what it returns
 
 
 def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
@@ -293,3 +277,144 @@ def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
         except FmuMeshError:
             break  # it does not run any more
     return values
+
+
+class _InstanceTable:
+    """A line for each instance, in the order of the mesh."""
+
+    def __init__(self) -> None:
+        columns = [
+            {"name": name, "label": label, "field": name, "align": "left", "sortable": name != "share"}
+            for name, label in _COLUMNS.items()
+        ]
+        self._table = ui.table(rows=[], columns=columns, row_key="instance").classes("fm-instances fm-numbers")
+        self._table.props("dense flat hide-pagination virtual-scroll :rows-per-page-options=[0]")
+        self._table.add_slot("body-cell-share", _BAR)
+
+    def show(self, view: MeshView) -> None:
+        """Show what is known now."""
+        names = [name for name in view.infos if name in view.instances]
+        rows = [_row(view.instances[name], view.before.get(name)) for name in names]
+        if rows != self._table.rows:
+            self._table.update_rows(rows)
+
+
+def _row(own: InstanceStatus, before: InstanceStatus | None) -> dict[str, Any]:
+    """The row of an instance in the table; rates and shares are those of the last second."""
+    if before is None or before.running_time >= own.running_time or before.point > own.point:  # it was restarted
+        before = InstanceStatus(own.instance, "", "", 0, 0.0, 0.0, 0.0)
+    wall_s = own.running_time - before.running_time
+    points = own.point - before.point
+    rate = points / wall_s if wall_s > 0.0 else 0.0
+    waits = min(100.0, 100.0 * max(0.0, own.wait_time - before.wait_time) / wall_s) if wall_s > 0.0 else 0.0
+    steps_s = own.step_time * own.point - before.step_time * before.point
+    computes = min(100.0 - waits, 100.0 * max(0.0, steps_s) / wall_s) if wall_s > 0.0 else 0.0
+    return {
+        "instance": own.instance,
+        "state": own.state,
+        "point": own.point,
+        "rate": round(rate),
+        "step": f"{1e6 * own.step_time:.3g} us",
+        "share": [round(computes, 1), round(waits, 1)],
+        "shares": f"{computes:.0f} % in its steps, {waits:.0f} % waiting",
+        "restarts": own.restarts,
+        "activity": own.activity.replace(f" at point {own.point}", "", 1),
+    }
+
+
+class _PlotCard:
+    """One plot: a choice of variables above their curves, which `static/plots.js` draws.
+
+    Attributes:
+        names: the variables that it shows.
+    """
+
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        names: list[str],
+        changed: Callable[[], None],
+        removed: Callable[[_PlotCard], None],
+    ) -> None:
+        self.names = names
+        self._catalogue = catalogue
+        self._changed = changed
+        self._removed = removed
+        with ui.card().classes("fm-card fm-plot-card").props("flat bordered") as self._card:
+            with ui.row().classes("items-center no-wrap").style("width: 100%"):
+                choice = ui.select(
+                    [*catalogue.elements], value=names, multiple=True, label="variables", with_input=True
+                )
+                choice.props("dense outlined use-chips").classes("col").on_value_change(self._choose)
+                ui.button(icon="close", on_click=self._remove).props(
+                    "dense flat round aria-label='Remove this plot'"
+                ).tooltip("Remove this plot")
+            self._chart = ui.echart(_options(catalogue, names)).classes("fm-plot").props("role=img")
+        self._tell()
+
+    def _choose(self, event: Any) -> None:  # noqa: ANN401  an event of NiceGUI
+        self.names = list(event.value or [])
+        self._chart.options.clear()
+        self._chart.options.update(_options(self._catalogue, self.names))
+        self._chart.update()
+        self._tell()
+        self._changed()
+
+    def _tell(self) -> None:
+        self._chart.props["aria-label"] = f"curves over time of {', '.join(self.names) or 'no variable'}"
+        ui.run_javascript(f"fmuMeshPlots.plot({self._chart.id}, {json.dumps(self.names)})")
+
+    def _remove(self) -> None:
+        ui.run_javascript(f"fmuMeshPlots.drop({self._chart.id})")
+        self._card.delete()
+        self._removed(self)
+
+
+def _options(catalogue: Catalogue, names: Sequence[str]) -> dict[str, Any]:
+    """The options of ECharts for these curves, which have no values yet."""
+    variables = [catalogue.variables[catalogue.elements[name][0]] for name in names]
+    units = {v.unit for v in variables}
+    unit = next(iter(units)) if len(units) == 1 else None
+    return {
+        "animation": False,
+        "grid": {"left": 70, "right": 20, "top": 34, "bottom": 44},
+        "legend": {"type": "scroll", "top": 0},
+        "tooltip": {"trigger": "axis", "transitionDuration": 0},
+        "toolbox": {
+            "feature": {"dataZoom": {"yAxisIndex": "none"}, "restore": {}},
+            "right": 0,
+            "top": 0,
+            "itemSize": 11,
+        },
+        "xAxis": {
+            "type": "value",
+            "name": "time in s",
+            "nameLocation": "middle",
+            "nameGap": 24,
+            "axisLabel": {"showMaxLabel": False, "showMinLabel": False},
+        },
+        "yAxis": {"type": "value", "scale": True, "name": f"in {unit}" if unit else "", "nameLocation": "end"},
+        "series": [
+            {
+                "type": "line",
+                "name": f"{name} in {v.unit}" if v.unit and unit is None else name,
+                "showSymbol": False,
+                "step": "end" if v.variability != "continuous" or v.causality in _HELD else False,
+                "lineStyle": {"width": 1, "join": "bevel"},
+                "data": [],
+            }
+            for name, v in zip(names, variables, strict=True)
+        ],
+    }
+
+
+def _first_plots(catalogue: Catalogue) -> list[list[str]]:
+    """The first outputs, those with the same unit in one plot."""
+    groups: dict[str | None, list[str]] = {}
+    for name, (variable, _) in catalogue.elements.items():
+        own = catalogue.variables[variable]
+        if own.causality == "output" and (len(groups) < _PLOTS or own.unit in groups):
+            group = groups.setdefault(own.unit, [])
+            if len(group) < _CURVES:
+                group.append(name)
+    return [*groups.values()]

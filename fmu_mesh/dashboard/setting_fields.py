@@ -27,11 +27,6 @@ class SettingField:
     * a number with a minimum and a maximum: a slider and a field
     * any other number: a field
     * a text, or an array as JSON: a field
-
-    Args:
-        name: `instance.variable`.
-        variable: what it is.
-        apply: called with the name and the value that a person gave.
     """
 
     def __init__(self, name: str, variable: VariableView, apply: Callable[[str, object], Awaitable[None]]) -> None:
@@ -82,22 +77,15 @@ class SettingField:
             return choice.on_value_change(lambda event: self._send(event.value))
         value = start if isinstance(start, int | float) else 0
         field = ui.number(value=value, format="%.7g", min=variable.minimum, max=variable.maximum)
-        if self._has_range:
+        low, high = variable.minimum, variable.maximum
+        if low is not None and high is not None and math.isfinite(high - low) and low < high:
             with ui.row().classes("no-wrap items-center").style("gap: 12px"):
-                self._slider = self._make_slider(value)
+                self._slider = self._make_slider(low, high, value)
                 field.move(ui.context.slot.parent)
                 field.style("width: 104px")
         return self._field(field, float if variable.type in _REALS else int)
 
-    @property
-    def _has_range(self) -> bool:
-        low, high = self._variable.minimum, self._variable.maximum
-        return low is not None and high is not None and math.isfinite(high - low) and low < high
-
-    def _make_slider(self, value: float) -> Any:  # noqa: ANN401  an element of NiceGUI
-        low, high = self._variable.minimum, self._variable.maximum
-        assert low is not None  # it has a range
-        assert high is not None  # as above
+    def _make_slider(self, low: float, high: float, value: float) -> Any:  # noqa: ANN401  an element of NiceGUI
         whole = self._variable.type not in _REALS
         step = max(1.0, round((high - low) / _STEPS)) if whole else (high - low) / _STEPS
         slider = ui.slider(min=low, max=high, step=step, value=value).style("min-width: 90px")

@@ -4,17 +4,19 @@ Owns what is on the wire between runs of the mesh, and the time that clients are
 the SDK keeps a bounded number of messages for each, and drops the oldest ones of a client that does not read.
 """
 
+# Threads: the SDK calls `_Requests` on threads of its own; the threads of a shown mesh call everything else. Each lock
+# is held for a moment: `_Requests._lock` for what clients want, `_clock` for the time, which must not go back, and
+# `_logging` for the order of log messages.
+
 from __future__ import annotations
 
-import errno
 import secrets
 import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from types import TracebackType
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 from urllib.parse import urlencode
 
 import foxglove
@@ -24,15 +26,14 @@ from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
 from ..errors import ConfigurationError
+from ..web_server import listening, shown_host
 from ..wire.views import LogLine
 from .mesh_parameters import MeshParameters
 from .mesh_topics import STATUS_SCHEMA
 from .relay import Relay, let_in
 
-__all__ = ["PORT", "FoxgloveServer"]
+__all__ = ["FoxgloveServer"]
 
-PORT: Final = 8765
-"""The port that Foxglove suggests."""
 _WAITING_MESSAGES: Final = 4096
 """Messages that wait for one client at most; of more, the oldest are lost."""
 _WAITING_LINES: Final = 1000
@@ -52,12 +53,6 @@ _LEVELS: Final = {
 class FoxgloveServer:
     """Serves clients from when it was made until it is closed, whether a mesh runs or not.
 
-    Args:
-        name: what clients show as the name of the source.
-        host: the address to listen at.
-        port: 0 for a free one.
-        origins: further origins whose pages may connect.
-
     Attributes:
         url: where clients connect to; has a token.
 
@@ -66,7 +61,8 @@ class FoxgloveServer:
     """
 
     def __init__(self, name: str, host: str, port: int, origins: Iterable[str] = ()) -> None:
-        listener = _listening(host, port)
+        _check_filters()
+        listener = listening(host, port, "the server for Foxglove")
         self._context = Context()
         self._listener = _Requests()
         self._server = foxglove.start_server(
@@ -80,8 +76,7 @@ class FoxgloveServer:
         )
         token = secrets.token_urlsafe(24)
         self._relay = Relay(listener, self._server.port, token, origins)
-        shown = f"[{host}]" if ":" in host else host
-        self.url = f"ws://{shown}:{listener.getsockname()[1]}/?token={token}"
+        self.url = f"ws://{shown_host(host)}:{listener.getsockname()[1]}/?token={token}"
         self._clock = threading.Lock()
         self._time_ns = -1
         self._told_at = 0.0
@@ -94,9 +89,7 @@ class FoxgloveServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._relay.close()
         self._server.stop()
 
@@ -126,7 +119,7 @@ class FoxgloveServer:
             self._time_ns = -1
         with self._logging:
             self._lines.clear()
-        self._listener.serve(_Served(parameters, changed))
+        self._listener.serve((parameters, changed))
         self._server.clear_session()  # whereupon clients ask for parameters again
         self._variables = {
             topic: Channel(topic, schema=schema, metadata=metadata, context=self._context)
@@ -210,24 +203,17 @@ class FoxgloveServer:
         self._server.remove_status(list(about))
 
 
-class _Served(NamedTuple):
-    """A run that clients ask for: its parameters, and what is called when they want other topics."""
-
-    parameters: MeshParameters
-    changed: Callable[[], None]
-
-
 class _Requests(ServerListener):
     """What clients ask for; the SDK calls it on threads of its own."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._served: _Served | None = None
+        self._served: tuple[MeshParameters, Callable[[], None]] | None = None
         self._touched: set[str] = set()
         self._subscribed: dict[str, None] = {}
 
-    def serve(self, served: _Served | None) -> None:
-        """Answer for this run from now on; None: for none."""
+    def serve(self, served: tuple[MeshParameters, Callable[[], None]] | None) -> None:
+        """Answer from now on for a run: its parameters, and what is called when clients want other topics."""
         self._served = served
 
     def take_touched(self) -> set[str]:
@@ -240,29 +226,23 @@ class _Requests(ServerListener):
         with self._lock:
             return tuple(self._subscribed)
 
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002  the SDK passes it
+    def on_subscribe(self, _client: Client, channel: ChannelView) -> None:
         self._touch(channel.topic)
 
-    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002  the SDK passes it
+    def on_unsubscribe(self, _client: Client, channel: ChannelView) -> None:
         self._touch(channel.topic)
 
     def on_get_parameters(
-        self,
-        client: Client,  # noqa: ARG002  the SDK passes it
-        param_names: list[str],
-        request_id: str | None = None,  # noqa: ARG002  the SDK passes it
+        self, _client: Client, param_names: list[str], _request_id: str | None = None
     ) -> list[Parameter]:
         served = self._served
-        return served.parameters.values(param_names) if served is not None else []
+        return served[0].values(param_names) if served is not None else []
 
     def on_set_parameters(
-        self,
-        client: Client,  # noqa: ARG002  the SDK passes it
-        parameters: list[Parameter],
-        request_id: str | None = None,  # noqa: ARG002  the SDK passes it
+        self, _client: Client, parameters: list[Parameter], _request_id: str | None = None
     ) -> list[Parameter]:
         served = self._served
-        return served.parameters.set(parameters) if served is not None else []
+        return served[0].set(parameters) if served is not None else []
 
     def on_parameters_subscribe(self, param_names: list[str]) -> None:
         with self._lock:
@@ -277,15 +257,11 @@ class _Requests(ServerListener):
         with self._lock:
             self._touched.add(topic)
         if (served := self._served) is not None:
-            served.changed()
+            served[1]()
 
 
-def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens.
-
-    Raises:
-        ConfigurationError: the port is in use, the address is none of this host, or there are no socket filters.
-    """
+def _check_filters() -> None:
+    """Raise ConfigurationError if this process cannot filter what comes to a socket."""
     try:
         with socket.socket() as own:
             let_in(own, None)
@@ -293,11 +269,3 @@ def _listening(host: str, port: int) -> socket.socket:
         text = f"the kernel lets nobody protect the server with a socket filter: {error.strerror}."
         hint = "Start it with --connect where a usual Linux kernel runs; `fmu-mesh dashboard` needs no filter."
         raise ConfigurationError(text, hint=hint) from error
-    try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            text = f"port {port} of {host} is in use."
-            raise ConfigurationError(text, hint="Take another one with --port; 0 takes any free one.") from error
-        reason = error.strerror or str(error)
-        raise ConfigurationError(f"Foxglove cannot be served at {host}, port {port}: {reason}.") from error

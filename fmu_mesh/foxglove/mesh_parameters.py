@@ -4,6 +4,9 @@ Owns what Foxglove is told that a parameter is: a value that was set is shown at
 point on. Called on threads of the SDK.
 """
 
+# Threads: the SDK calls `values` and `set`, and the thread that asks for values calls `changes`. The lock is for the
+# values that were set and are not in effect yet; nobody holds it while the mesh is asked.
+
 from __future__ import annotations
 
 import threading
@@ -25,14 +28,7 @@ _INT64: Final = range(-(2**63), 2**63)
 
 
 class MeshParameters:
-    """The parameters of one run of a mesh.
-
-    Args:
-        client: the way into the mesh.
-        targets: what may be set, by `instance.variable`.
-        tell: called with a sentence about what was refused.
-        read_only: whether to refuse all.
-    """
+    """The parameters of one run of a mesh."""
 
     def __init__(
         self, client: MeshClient, targets: Mapping[str, Target], tell: Callable[[str], None], *, read_only: bool

@@ -61,7 +61,7 @@ def schema_of(target: Target) -> dict[str, Any]:
     value: dict[str, Any] = {"type": _JSON_TYPES.get(type_) or ("number" if is_float(type_) else "integer")}
     for _ in view.shape:
         value = {"type": "array", "items": value}
-    if text := _description(view):
+    if text := " in ".join(filter(None, (view.description, view.unit))):  # such as `angle in rad`
         value["description"] = text
     point = {"type": "integer", "description": "the communication point of the value"}
     return {
@@ -79,17 +79,9 @@ def message_of(target: Target, reading: Reading) -> bytes:
 
 def status_message(status: MeshStatus) -> bytes:
     """The message of a status of the mesh."""
-    return msgspec.json.encode(
-        {
-            "state": status.state,
-            "point": status.point,
-            "time": status.time,
-            "points_per_second": status.points_per_second,
-            "real_time_factor": status.real_time_factor,
-            "overruns": status.overruns,
-            "error": status.error.message if status.error is not None else "",
-        }
-    )
+    facts = {name: getattr(status, name) for name in STATUS_SCHEMA["properties"]}
+    facts["error"] = status.error.message if status.error is not None else ""
+    return msgspec.json.encode(facts)
 
 
 def topics_by_instance(
@@ -103,11 +95,6 @@ def topics_by_instance(
             for source in (connection.source, *([element[0]] if element is not None else ())):
                 readers.setdefault(source, {})[name] = None
     return {topic_of(target): (target.instance, tuple(readers.get(target.name, ()))) for target in targets}
-
-
-def _description(view: VariableView) -> str:
-    """Such as `angle in rad`."""
-    return " in ".join(text for text in (view.description, view.unit) if text)
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401  plain JSON

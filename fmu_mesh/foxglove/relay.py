@@ -1,16 +1,26 @@
-"""In front of the server of the SDK: lets programs in that know its token, and pages of known origins only.
+"""In front of the server of the SDK: lets programs in that know its token, and pages of known origins only."""
 
-The SDK asks nobody anything. So it listens where a filter in the kernel drops every packet but those of this relay, and
-the relay looks at the request that begins each connection; what follows goes through it as it is. Its thread waits for
-nobody: a client that does not read is not read for either, and the SDK drops what it cannot send.
-"""
+# The SDK serves whoever connects: it knows no token and no origin. So it listens at a port of 127.0.0.1 where a filter
+# in the kernel drops every packet but those of this relay, and the relay looks at the request that begins each
+# connection; what follows goes through it as it is.
+#
+# Threads: the relay has one, with an event loop. `close` is called on another one, and only requests the stop of the
+# loop. The SDK has threads of its own. The relay waits for nobody: a client that does not read is not read for either,
+# and the SDK drops what it cannot send.
+#
+# What may go wrong:
+# * Another program of this host connects to the port of the SDK. The filter lets in one source port at a time, that of
+#   the socket with which the relay is connecting (`_connecting`), and nobody between two of these. A connection keeps
+#   the filter that it was made with, so changing it cuts nothing off.
+# * The SDK does not show its socket. It is in this process, so `/proc/self/fd` has it, and a second handle sets the
+#   filter.
+# * A kernel without socket filters: the server refuses to start, rather than to serve everybody.
+# * A client sends no request, or a long one: it has 10 s and 16 KiB.
 
 from __future__ import annotations
 
 import asyncio
 import ctypes
-import hmac
-import ipaddress
 import os
 import socket
 import struct
@@ -21,7 +31,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["Relay", "is_loopback", "let_in"]
+from ..web_server import is_loopback, is_secret
+
+__all__ = ["Relay", "let_in"]
 
 _OURS: Final = ("https://app.foxglove.dev",)
 _HEAD_BYTES: Final = 16 << 10
@@ -46,7 +58,7 @@ class Relay:
         self._listener = listener
         self._inner = _listening_at(port)
         self._port = port
-        self._token = token.encode()
+        self._token = token
         self._origins = {*_OURS, *origins}
         let_in(self._inner, None)
         self._loop = asyncio.new_event_loop()
@@ -89,7 +101,7 @@ class Relay:
         token = parse_qs(urlsplit(path).query).get("token", [""])[0]
         origin = headers.get("origin")  # no program but a browser sends it
         known = origin is None or origin in self._origins or is_loopback(urlsplit(origin).hostname or "")
-        return method == "GET" and known and hmac.compare_digest(token.encode("utf-8", "replace"), self._token)
+        return method == "GET" and known and is_secret(token, self._token)
 
     async def _entered(
         self, head: bytes, client: asyncio.StreamWriter
@@ -115,14 +127,6 @@ async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
         while data := await reader.read(_HEAD_BYTES):
             writer.write(data)
             await writer.drain()
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only programs of this host reach a server that listens there."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _listening_at(port: int) -> socket.socket:

@@ -202,7 +202,7 @@ def _scenario(
         return None
     if source is None:
         return None
-    from ..ros.bags.scenario_bags import bag_values  # noqa: PLC0415 as above
+    from ..ros.bags.bag import bag_values  # noqa: PLC0415 as above
 
     own = findings if source.prefix else source.findings()
     bags = bag_values(source, loaded, descriptions, own)

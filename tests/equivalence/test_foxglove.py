@@ -247,7 +247,7 @@ def test_wrong_usage_is_said_in_one_sentence(place: Place) -> None:
     number = place.run("foxglove", "--port", "70000")
 
     assert [done.wait() for done in (taken, pattern, number)] == [2, 2, 2]
-    assert f"port {port} of 127.0.0.1 is in use. Take another one with --port" in taken.message
+    assert f"port {port} of 127.0.0.1 is taken by another program. `--port 0` takes a free one." in taken.message
     assert "has no variable 'nothing'" in pattern.message
     assert "'70000' is no port: expected 0 to 65535" in number.message
     for done in (taken, pattern, number):

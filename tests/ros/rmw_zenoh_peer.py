@@ -19,7 +19,7 @@ from typing import Any, TextIO
 import numpy as np
 import zenoh
 
-from fmu_mesh.ros.gateway.parameters import SERVICES
+from fmu_mesh.ros.gateway.rmw_zenoh import SERVICES
 from fmu_mesh.ros.messages.definitions import MessageTypes
 
 

@@ -11,9 +11,13 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
-from fmu_mesh.ros.bags.bag import BagSample
+from fmu_mesh.ros.bags.bag import Bag, BagSample
 from fmu_mesh.ros.bags.playing import Played, schedule
+from fmu_mesh.ros.messages.cdr import Codec
+from fmu_mesh.ros.messages.definitions import MessageTypes
+from fmu_mesh.ros.messages.topics import Port, Topic
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.variables.model_description import Variable
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, Launched, Place, rows_of, wait_until, write_config
 
@@ -359,6 +363,41 @@ def test_what_cannot_be_played_is_told(
     for complaint, (code, error) in said.items():
         assert code == 2, error
         assert complaint in error
+
+
+WHEEL = "builtin_interfaces/Time stamp\nfloat64 speed\n"
+WHEEL_IDL = f"""{"=" * 80}
+IDL: lab_msgs/msg/Wheel
+module lab_msgs {{ module msg {{ struct Wheel {{ builtin_interfaces::msg::Time stamp; double speed; }}; }}; }};
+{"=" * 80}
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces {{ module msg {{ struct Time {{ long sec; unsigned long nanosec; }}; }}; }};
+"""
+
+
+@pytest.mark.parametrize("definition", [WHEEL, WHEEL_IDL], ids=["msg", "idl"])
+def test_messages_are_read_by_the_definitions_in_the_bag_without_running_them(definition: str, tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 an optional dependency
+
+    types = MessageTypes(custom={"lab_msgs/msg/Wheel": WHEEL})
+    message = {"stamp": {"sec": 1, "nanosec": 2}, "speed": 0.5}
+    with Writer(tmp_path / "wheel", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection(
+            "/wheel",
+            "lab_msgs/msg/Wheel",
+            msgdef=definition,
+            rihs01=types.type_hash("lab_msgs/msg/Wheel"),
+        )
+        writer.write(connection, 7, Codec(types, "lab_msgs/msg/Wheel").encode(message))
+    variable = Variable("u", 0, "Float64", "input", "continuous")
+    topic = Topic("/wheel", "lab_msgs/msg/Wheel", "in", (Port("speed", "gain", variable, "in"),))
+    sys.modules.pop("rosbags.usertypes", None)  # what rosbags makes of definitions that it registers
+
+    with Bag(tmp_path / "wheel") as bag:
+        found = list(bag.samples([topic], "header"))
+
+    assert found == [BagSample(7, "gain", "u", 0.5)]
+    assert "rosbags.usertypes" not in sys.modules
 
 
 # ---- a bag in a scenario ----

@@ -229,4 +229,4 @@ def test_the_stamp_of_a_message_comes_with_its_values_and_zero_is_none() -> None
     message["header"]["stamp"] = {"sec": 3, "nanosec": 500_000_000}
 
     assert without == ([0.1], None)
-    assert Disassembler(own, TYPES).values(codec.encode(message)) == ([0.1], 3.5)
+    assert Disassembler(own, TYPES).values(codec.encode(message)) == ([0.1], 3_500_000_000)

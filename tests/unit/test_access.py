@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from fmu_mesh.dashboard.access import Access, Send, is_loopback
+from fmu_mesh.dashboard.access import Access, Send
+from fmu_mesh.web_server import is_loopback
 
 TOKEN = "0123"  # noqa: S105  a secret of this test
 COOKIE = f"fmu_mesh_dashboard_8000={TOKEN}"

@@ -1,4 +1,6 @@
-"""Reading a bag (MCAP or SQLite, by `ros2 bag` or by a mesh) with `rosbags`, and which of its topics are inputs.
+"""Reading a bag (MCAP or SQLite, by `ros2 bag` or by a mesh), which of its topics are inputs, and bags in scenarios.
+
+`rosbags` finds messages and definitions; our own `Disassembler` reads them, as it does in the gateway.
 
 Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a sample.
 """
@@ -6,34 +8,37 @@ Knows no communication points: `fmu_mesh.ros.bags.playing` finds the point of a 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
 from ... import files
+from ...config.findings import Findings
 from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
+from ...config.scenario_section import ScenarioSource, ScenarioValues
 from ...errors import ConfigurationError
 from ...installing import importing
 from ...system.recording import reading
+from ...system.scenario import BagValues, is_bag
 from ...text import listed, nearest, nearest_file
 from ...variables.model_description import ModelDescription, Value
-from ...variables.value_types import nested
-from ...wire.views import InstanceInfo
-from ..gateway.mapping import descriptions_of, message_types
-from ..gateway.resolver import Resolver
-from ..messages.definitions import MessageTypes, path_parts
+from ..gateway.mapping import Resolver, message_types
+from ..messages.assembling import Disassembler
+from ..messages.cdr import CdrError
+from ..messages.definitions import MessageTypes
 from ..messages.stamp import nanoseconds
-from ..messages.topics import Port, Topic
+from ..messages.topics import Topic
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces.typing import Typesdict
+    from rosbags.rosbag2 import Reader
 
-__all__ = ["Bag", "BagSample", "chosen_topics", "timed", "topics_for"]
+__all__ = ["Bag", "BagSample", "bag_values", "timed", "topics_for"]
 
 _CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
 
@@ -57,10 +62,7 @@ class BagSample(msgspec.Struct, frozen=True):
 
 
 class Bag:
-    """A bag that is open for reading; use it as a context manager.
-
-    Args:
-        path: an MCAP file, or the folder of a `ros2 bag`.
+    """A bag (an MCAP file, or the folder of a `ros2 bag`) that is open for reading; use it as a context manager.
 
     Raises:
         ConfigurationError: the file cannot be read, or `rosbags` is not installed.
@@ -68,7 +70,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         with importing("rosbags", "bags of ROS"):
-            from rosbags.highlevel import AnyReader  # noqa: PLC0415 an optional dependency
+            from rosbags.rosbag2 import Reader  # noqa: PLC0415 an optional dependency
         self.path = path
         if not files.exists(path):
             near = nearest_file(path)
@@ -83,8 +85,15 @@ class Bag:
         with reading(path, "bag"):
             if not files.is_folder(path):
                 files.opened(path).close()  # no pipe
-            self._reader: AnyReader = AnyReader([path])
+            self._reader = Reader(path)
             self._reader.open()
+            try:
+                self._definitions = _definitions(self._reader)
+            except BaseException:
+                self._reader.close()
+                raise
+        self._types = MessageTypes()
+        self._types.store.fielddefs.update(self._definitions)  # its own come first
 
     def __enter__(self) -> Self:
         return self
@@ -99,7 +108,7 @@ class Bag:
 
     def add_types(self, types: MessageTypes) -> None:
         """Add the message types of this bag to ``types``."""
-        for name, definition in self._reader.typestore.fielddefs.items():
+        for name, definition in self._definitions.items():
             types.store.fielddefs.setdefault(name, definition)
 
     def samples(self, topics: Sequence[Topic], stamps: StampSource) -> Iterator[BagSample]:
@@ -112,27 +121,49 @@ class Bag:
         Raises:
             ConfigurationError: a message has no such array element, or an array of another size.
         """
-        wanted: dict[str, list[tuple[list[str | int], Port]]] = {}
-        for topic in topics:  # several of one name give one message to several variables
-            wanted.setdefault(topic.name, []).extend((path_parts(port.path), port) for port in topic.ports)
-        connections = [connection for connection in self._reader.connections if connection.topic in wanted]
+        wanted: dict[str, list[Disassembler]] = {}
         with reading(self.path, "bag"):
+            for topic in topics:  # several of one name give one message to several variables
+                wanted.setdefault(topic.name, []).append(Disassembler(topic, self._types))
+            connections = [connection for connection in self._reader.connections if connection.topic in wanted]
             for connection, logged, data in self._reader.messages(connections) if connections else ():
-                message: Any = self._reader.deserialize(data, connection.msgtype)
-                stamp = _header_stamp(message) if stamps == "header" else None
-                for parts, port in wanted[connection.topic]:
-                    value = _value_at(message, parts, port, connection.topic)
-                    yield BagSample(logged if stamp is None else stamp, port.instance, port.variable.name, value)
+                for own in wanted[connection.topic]:
+                    try:
+                        values, stamp = own.values(data)
+                    except CdrError as error:
+                        raise ConfigurationError(f"a message of '{connection.topic}': {error}.") from error
+                    at = logged if stamp is None or stamps == "log" else stamp
+                    for port, value in zip(own.topic.ports, values, strict=True):
+                        yield BagSample(at, port.instance, port.variable.name, value)
 
 
-def chosen_topics(
-    loaded: LoadedConfig, infos: Mapping[str, InstanceInfo], bag: Bag, choices: Sequence[str] = ()
+def _definitions(reader: Reader) -> Typesdict:
+    """The message types that a bag defines. The reader for all kinds of bags would run code that it makes of them."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415 an optional dependency
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415 as above
+
+    found: Typesdict = {}
+    for connection in reader.connections:
+        text, kind = connection.msgdef.data, connection.msgdef.format
+        if kind == MessageDefinitionFormat.MSG:
+            found |= get_types_from_msg(text, connection.msgtype)
+        elif kind == MessageDefinitionFormat.IDL:
+            # Several files have lines of `=` between them, and each begins with its name.
+            for file in filter(None, text.split("=" * 80 + "\n")):
+                found |= get_types_from_idl(file.partition("\n")[2] if file.startswith("IDL: ") else file)
+    if reader.connections and not found:
+        raise ConfigurationError(f"the bag '{reader.path}' has no definitions of its messages.")
+    return found
+
+
+def topics_for(
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], bag: Bag, choices: Sequence[str] = ()
 ) -> list[Topic]:
     """The topics of a bag that are played into inputs of a mesh.
 
     Args:
         loaded: the configuration of the mesh.
-        infos: the information of every instance, by name.
+        descriptions: the model descriptions by instance name.
         bag: the bag.
         choices: each is `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE`. Without choices, the topics are
             those that the mesh subscribes to: by its `ros` section, or by the default names of its inputs.
@@ -140,24 +171,16 @@ def chosen_topics(
     Raises:
         ConfigurationError: a choice is wrong, or the mesh subscribes to no topic of the bag.
     """
-    return topics_for(loaded, descriptions_of(infos), bag, choices)
-
-
-def topics_for(
-    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], bag: Bag, choices: Sequence[str] = ()
-) -> list[Topic]:
-    """As `chosen_topics`, for model descriptions by instance name."""
     there = bag.topics
     section = loaded.config.ros or RosConfig()
-    config = replace(loaded.config, ros=section)
     findings = loaded.findings()
-    types = message_types(replace(loaded, config=config), findings)
+    types = message_types(loaded, section, findings)
     findings.raise_any()
     assert types is not None
     bag.add_types(types)
     # Each choice is a section of its own: a field may go to several variables.
     sections = [replace(section, topics=[_entry(choice, there)]) for choice in choices] or [section]
-    found = [one for own in sections for one in Resolver(config, own, descriptions, types, findings).topics()]
+    found = [one for own in sections for one in Resolver(loaded.config, own, descriptions, types, findings).topics()]
     if choices and len(findings):
         problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
         raise ConfigurationError(f"`topics=...`: {problems}.")
@@ -204,28 +227,65 @@ def _entry(choice: str, there: Mapping[str, str]) -> RosTopicConfig:
     return RosTopicConfig(topic=topic, type=there[topic], fields={found["field"] or "data": found["variable"]})
 
 
-def _header_stamp(message: Any) -> int | None:  # noqa: ANN401 a message of rosbags
-    """The stamp of the header in ns; None without a header, or if it is 0."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None or not (stamp.sec or stamp.nanosec):
-        return None
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+def bag_values(
+    source: ScenarioSource, loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Findings
+) -> dict[str, BagValues]:
+    """Read the bags of a scenario; the result has the values by `instance.variable`, in the order of their times.
+
+    What refers to no variable of ``descriptions`` is left out; what is wrong with a bag is added to ``findings``.
+    """
+    # One reading for all that name the same file, stamps, and time of the first message.
+    wanted: dict[tuple[str, str, float | None], dict[str, ScenarioValues]] = {}
+    for reference, values in source.config.values.items():
+        instance, _, name = reference.partition(".")
+        known = instance in descriptions and descriptions[instance].variable(name) is not None
+        if isinstance(values, ScenarioValues) and values.file and values.topic and is_bag(values) and known:
+            key = values.file, values.stamps or "header", values.start
+            wanted.setdefault(key, {})[reference] = values
+    found: dict[str, BagValues] = {}
+    for (file, stamps, start), entries in wanted.items():
+        places = {reference: f"{source.prefix}values.{reference}" for reference in entries}
+        try:
+            with Bag(source.resolve(file)) as bag:
+                topics = _topics(entries, bag, partial(topics_for, loaded, descriptions, bag), source.prefix, findings)
+                samples = timed(bag.samples(topics, "log" if stamps == "log" else "header"), start)
+        except ConfigurationError as error:
+            _add(f"{next(iter(places.values()))}.file", error, "a bag that can be read", findings)
+            continue
+        pairs: dict[str, list[tuple[float, Value]]] = {}
+        for time, sample in samples:
+            pairs.setdefault(f"{sample.instance}.{sample.variable}", []).append((time, sample.value))
+        for reference, place in places.items():
+            if own := pairs.get(reference):
+                times, values_ = zip(*own, strict=True)
+                found[reference] = BagValues(times, values_)
+            elif reference in {f"{port.instance}.{port.variable.name}" for topic in topics for port in topic.ports}:
+                findings.add(f"{place}.topic", f"'{entries[reference].topic}' without a message", "a topic with some")
+    return found
 
 
-def _value_at(message: Any, parts: Sequence[str | int], port: Port, topic: str) -> Value:  # noqa: ANN401 of rosbags
-    """A field as the value of a variable; an array gets the shape of the variable."""
-    value = message
-    try:
-        for part in parts:
-            value = value[part] if isinstance(part, int) else getattr(value, part)
-    except IndexError as error:
-        raise ConfigurationError(f"a message of '{topic}' has no '{port.path}'.") from error
-    plain: Value = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-    if not port.variable.shape:
-        return plain
-    if not isinstance(plain, list) or len(plain) != port.variable.size:
-        raise ConfigurationError(
-            f"a message of '{topic}' does not have the {port.variable.size} elements of "
-            f"'{port.instance}.{port.variable.name}'."
-        )
-    return nested(plain, port.variable.shape)
+def _add(place: str, error: ConfigurationError, expected: str, findings: Findings) -> None:
+    found = error.message.removeprefix("`topics=...`: ").rstrip(".")
+    findings.add(place, found, (error.hint or expected).rstrip("."))
+
+
+def _topics(
+    entries: Mapping[str, ScenarioValues],
+    bag: Bag,
+    find: Callable[[list[str]], list[Topic]],
+    prefix: str,
+    findings: Findings,
+) -> list[Topic]:
+    """The topics of all entries, each as for `fmu-mesh play --topic`, and a finding for each entry without one."""
+    topics: list[Topic] = []
+    for reference, values in entries.items():
+        topic, place = "/" + (values.topic or "").partition(":")[0].lstrip("/"), f"{prefix}values.{reference}.topic"
+        if topic not in bag.topics:
+            found, expected = f"the unknown topic '{topic}' of '{values.file}'", f"one of {listed(sorted(bag.topics))}"
+            findings.add(place, found, expected, nearest(topic, bag.topics))
+            continue
+        try:
+            topics += find([f"{values.topic}={reference}"])
+        except ConfigurationError as error:
+            _add(place, error, "another field", findings)
+    return topics

@@ -23,19 +23,17 @@ from ...files import Kept, open_alone
 from ...installing import importing
 from ...system.recording import Columns, Recording
 from ...variables.model_description import ModelDescription
-from ..gateway.mapping import message_types
-from ..gateway.resolver import Resolver
+from ..gateway.mapping import Resolver, message_types
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
-from ..messages.topics import RosPlan, Topic
+from ..messages.topics import CLOCK_TOPIC, RosPlan, Topic
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns, has_passed
 
 __all__ = ["McapFile"]
 
 _BUFFER_BYTES = 1 << 16
-_CLOCK_TOPIC = "/clock"
 _QOS = (
     "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -84,7 +82,7 @@ class McapFile:
         self._clock_points = plan.clock_points
         if self._clock_points is not None:
             self._clock = Codec(types, CLOCK)
-            self._clock_channel = self._channel(_CLOCK_TOPIC, CLOCK)
+            self._clock_channel = self._channel(CLOCK_TOPIC, CLOCK)
         self._about = {
             "metadata": msgspec.json.encode(recording.metadata).decode(),
             "recording": msgspec.json.encode(_recorded(recording, plan)).decode(),
@@ -229,7 +227,7 @@ def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:
         for topic in plan.topics
     ]
     if plan.clock_points is not None:
-        topics.append(TopicColumns(_CLOCK_TOPIC, (plan.clock_points,)))
+        topics.append(TopicColumns(CLOCK_TOPIC, (plan.clock_points,)))
     columns = []
     for (instance, name), (column, type_) in zip(recording.recorded, recording.columns, strict=True):
         variable = recording.descriptions[instance].variable_of(name)
@@ -253,28 +251,23 @@ def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
     A topic of the `ros` section is recorded as it is if all of its variables are recorded. Every other recorded
     variable has a topic of its own, with the name and the type that the section gives it by default.
 
-    Args:
-        recording: what is recorded.
-        findings: where findings go.
-
     Returns:
         None if a finding makes it impossible to go on.
     """
     loaded, descriptions = recording.loaded, recording.descriptions
     section = loaded.config.ros or RosConfig()
-    config = replace(loaded.config, ros=section)
-    types = message_types(replace(loaded, config=config), findings)
+    types = message_types(loaded, section, findings)
     if types is None:
         return None
     recorded = _whole(recording, findings)
     wanted = set(recorded)
     # The findings about the section itself are reported where the section is checked.
-    plan = Resolver(config, section, descriptions, types, Findings(str(loaded.file))).plan()
+    plan = Resolver(loaded.config, section, descriptions, types, Findings(str(loaded.file))).plan()
     configured = tuple(topic for topic in plan.topics if _variables(topic) <= wanted) if loaded.config.ros else ()
     covered = {variable for topic in configured for variable in _variables(topic)}
     rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
     own = Findings(str(loaded.file))
-    others = Resolver(config, rest, _published(descriptions, wanted), types, own).plan().topics
+    others = Resolver(loaded.config, rest, _published(descriptions, wanted), types, own).plan().topics
     section_file = loaded.config.records[recording.place].file
     for finding in own:
         findings.add(f"{recording.place}.file", f"in '{section_file}': {finding.found}", finding.expected)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel, McapRecord, Message, Schema
@@ -14,20 +14,12 @@ from ...files import opened
 from ...simtime import ENDLESS, TimeGrid
 from ...system.recording import Columns
 from ...variables.value_types import DTYPES, VariableType, is_text
-from ..messages.cdr import Codec
-from ..messages.definitions import Basic, MessageTypes, path_parts
+from ..messages.cdr import HEADER_SIZE, Codec
+from ..messages.definitions import NUMBERS, Basic, MessageTypes, path_parts
 from .mcap_layout import RecordedMcap, TopicColumns
 from .mcap_records import McapContent
 
 __all__ = ["read_mcap"]
-
-_CDR_HEADER: Final = 4
-_NUMBERS: Final = (
-    "bool",
-    "float32",
-    "float64",
-    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
-)
 
 
 def read_mcap(path: Path) -> Columns:
@@ -49,11 +41,7 @@ def read_mcap(path: Path) -> Columns:
 
 
 class _ColumnReader:
-    """Collects the values of the columns from the records of all chunks.
-
-    Args:
-        recording: which column is where.
-    """
+    """Collects the values of the columns from the records of all chunks."""
 
     def __init__(self, recording: RecordedMcap) -> None:
         self._recording = recording
@@ -149,8 +137,8 @@ def _value(message: Any, path: Sequence[str | int]) -> Any:  # noqa: ANN401  any
 def _plain_dtype(types: MessageTypes, message: str) -> np.dtype[Any] | None:
     """How numpy reads messages that have a single number, such as std_msgs/msg/Float64; None for others."""
     match types.fields(message):
-        case (("data", Basic(kind)),) if kind in _NUMBERS:
+        case (("data", Basic(kind)),) if kind in NUMBERS:
             number = np.dtype(kind)
-            size = _CDR_HEADER + number.itemsize
-            return np.dtype({"names": ["data"], "formats": [number], "offsets": [_CDR_HEADER], "itemsize": size})
+            size = HEADER_SIZE + number.itemsize
+            return np.dtype({"names": ["data"], "formats": [number], "offsets": [HEADER_SIZE], "itemsize": size})
     return None

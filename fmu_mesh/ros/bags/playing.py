@@ -23,7 +23,8 @@ from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Target
 from ...wire.client.waiting import go_on, paused_at, wait_until_at
 from ...wire.views import Command, MeshInfo
-from .bag import Bag, BagSample, chosen_topics, timed
+from ..gateway.mapping import descriptions_of
+from .bag import Bag, BagSample, timed, topics_for
 from .play_options import PlayOptions
 
 __all__ = ["Moment", "Played", "grid_of", "play", "play_bag", "running_configuration", "schedule"]
@@ -68,12 +69,17 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options:
     step_points = {name: round(info.step_size / mesh.step_size) for name, info in infos.items()}
     if loaded is None or options.config is not None:
         loaded = running_configuration(Path(options.config or mesh.config))
-    topics = chosen_topics(loaded, infos, bag, options.topics)
+    topics = topics_for(loaded, descriptions_of(infos), bag, options.topics)
     samples = bag.samples(topics, options.stamps)
     moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=options.start)
     names = [topic.name for topic in topics]
+    if not moments and beyond:
+        raise ConfigurationError(
+            f"all {beyond} values of {', '.join(names)} in '{bag.path}' are at or after the end of the simulation.",
+            hint="Say when the first one is, as with `start=0.0`.",
+        )
     if not moments:
-        raise _nothing(bag.path, ", ".join(names), beyond)
+        raise ConfigurationError(f"there is no message of {', '.join(names)} in '{bag.path}'.")
     count, first = play(client, moments, step_points, options.timeout)
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)
@@ -89,15 +95,6 @@ def running_configuration(path: Path) -> LoadedConfig:
     if any(finding.path.partition(".")[0] != "simulation" for finding in findings):
         findings.raise_any()
     return loaded
-
-
-def _nothing(file: Path, names: str, beyond: int) -> ConfigurationError:
-    if beyond:
-        return ConfigurationError(
-            f"all {beyond} values of {names} in '{file}' are at or after the end of the simulation.",
-            hint="Say when the first one is, as with `start=0.0`.",
-        )
-    return ConfigurationError(f"there is no message of {names} in '{file}'.")
 
 
 class Moment(msgspec.Struct, frozen=True):

@@ -1,9 +1,26 @@
 """The gateway: carries samples between a running mesh and ROS.
 
 It is a Zenoh client of the mesh like any other (docs/key-space.md). It has its own process and its own session towards
-ROS, so no node and no master ever waits for ROS. All work is done on the thread that calls `Gateway.run`; callbacks
-only put into a bounded queue. Samples that do not fit into the queue are left out, counted and reported.
+ROS, so no node and no master ever waits for ROS.
 """
+
+# Threads: Zenoh calls `arrived` and `take` on threads of its own, rclpy calls `take` on those of its executor. They
+# only put events into a queue. `Gateway.run` handles the events one by one on the thread of its caller, so nothing here
+# needs a lock. `Gateway.end` may be called from any thread, also while `open` waits for the master.
+#
+# What may go wrong:
+# * ROS is slower than the mesh. A callback must not wait, because the values of the mesh come on its thread. So the
+#   queue is bounded; what does not fit is left out, counted and reported. Only `run` waits for slow subscribers, on the
+#   second session, which the mesh does not know.
+# * The mesh ends while samples are on their way. The token of a follower makes the master stay until they are carried;
+#   the loss of the master's token can overtake samples (`latecomers`), so it is no reason to stop at once.
+# * The token of the mesh comes back. It belongs to another run, whose points begin again: this gateway ends.
+#
+# A variable of a slower instance holds its value between two of its points. So everything up to a point has been
+# published once every watched variable has a value that holds there, and `/clock` follows that point.
+#
+# Given up: a gateway in the process of the master, and one that the grant waits for; both let ROS slow the mesh
+# (ADR 0030).
 
 from __future__ import annotations
 
@@ -28,20 +45,21 @@ from ...wire.session import Question, ask, undeclare_all
 from ...wire.values import Stamp, encode_origin, encode_value, json_encoding
 from ...wire.views import MeshInfo
 from ..messages.assembling import Assembler, Disassembler
-from ..messages.cdr import CdrError
-from ..messages.topics import Port, RosPlan, Topic
-from .clock_progress import ClockPublisher, Progress, WarnOnce, WatchedVariable, clock_topic
-from .parameters import ParameterServices
-from .profile import Profile
-from .rmw_zenoh import RmwZenoh
-from .ros2dds import Ros2Dds
+from ..messages.cdr import CdrError, Codec
+from ..messages.definitions import CLOCK
+from ..messages.stamp import to_stamp
+from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
+from .profile import Profile, Put, Ros2Dds
+from .rmw_zenoh import ParameterServices, RmwZenoh
 
 __all__ = ["Gateway", "open_profiles"]
 
 log = logging.getLogger(__name__)
 
 _MAX_EVENTS = 1 << 16
+_MAX_WARNINGS = 10
 _REPEAT_S = 1.0
+"""How often `/clock` is repeated while it stands still, for new subscribers, and lost samples are reported."""
 
 Event = Callable[[], None]
 
@@ -50,18 +68,7 @@ Event = Callable[[], None]
 def open_profiles(
     section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys
 ) -> Iterator[dict[str, Profile]]:
-    """Open the profiles that a plan needs, and the parameter services of the node if it is one of rmw_zenoh.
-
-    Args:
-        section: the section `ros` of the configuration.
-        ros: the session towards ROS.
-        plan: the topics and the parameters.
-        mesh: a session that reaches the mesh.
-        keys: the keys of the mesh.
-
-    Yields:
-        The profiles by name, that of the section first.
-    """
+    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the parameter services."""
     profiles: dict[str, Profile] = {}
     with ExitStack() as stack:
         for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
@@ -78,14 +85,9 @@ def open_profiles(
 class Gateway:
     """Carries topics between one mesh and ROS.
 
-    Call `open`, then `run`, then `close`.
+    The caller closes the session and the profiles; the first of these has `/clock`.
 
-    Args:
-        plan: the topics.
-        mesh: a session that reaches the mesh; the caller closes it.
-        keys: the keys of the mesh.
-        grid: the communication points of the run.
-        profiles: the profiles of the topics by name, that of `/clock` first; the caller closes them.
+    Call `open`, then `run`, then `close`.
     """
 
     def __init__(
@@ -104,13 +106,11 @@ class Gateway:
         self._mesh_ended = False
         self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._progress = Progress()
+        self._progress = _Progress()
+        self._clock: _ClockPublisher | None = None
 
     def open(self, patience_s: float = 60.0) -> None:
         """Declare all topics; every later sample is carried.
-
-        Args:
-            patience_s: how long to wait for the master, in s.
 
         Raises:
             MeshLost: the master does not answer.
@@ -124,10 +124,11 @@ class Gateway:
         if not watched and self._plan.time_source is not None and self._plan.clock_points:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
-            put = next(iter(self._profiles.values())).publish(clock_topic(self._plan))
-            self._progress.start_clock(ClockPublisher(put, self._plan, self._grid))
+            first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
+            put = next(iter(self._profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
+            self._clock = _ClockPublisher(put, self._plan, self._grid)
         for key, variable in watched.items():
-            self._entities.append(self._mesh.declare_subscriber(key, partial(self._value_arrived, key, variable)))
+            self._take_values(key, variable)
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         )
@@ -141,7 +142,8 @@ class Gateway:
             if now >= due:
                 due = now + _REPEAT_S
                 self._report_left_out()
-                self._progress.repeat_clock()
+                if self._clock is not None:
+                    self._clock.repeat()
             try:
                 event = self._events.get(timeout=due - now if due > now else 0)
             except queue.Empty:
@@ -186,16 +188,20 @@ class Gateway:
         for index, port in enumerate(topic.ports):
             self._watch(port).outputs.append((assembler, index, put))
 
-    def _watch(self, port: Port) -> WatchedVariable:
+    def _watch(self, port: Port) -> _WatchedVariable:
         key = self._keys.variable(port.instance, port.kind, port.variable.name)
-        return self._progress.watch(key, f"{port.instance}.{port.variable.name}", port.step_points)
+        variable = _WatchedVariable(f"{port.instance}.{port.variable.name}", port.step_points)
+        return self._progress.watched.setdefault(key, variable)  # several topics share it
 
-    def _value_arrived(self, key: str, variable: WatchedVariable, sample: zenoh.Sample) -> None:
-        # A sample without an attachment is a value that somebody puts on the key of an input.
-        if sample.attachment is not None and str(sample.key_expr) == key:
-            self._post(partial(self._take_value, variable, sample.payload.to_bytes(), sample.attachment.to_bytes()))
+    def _take_values(self, key: str, variable: _WatchedVariable) -> None:
+        def arrived(sample: zenoh.Sample) -> None:
+            # A sample without an attachment is a value that somebody puts on the key of an input.
+            if sample.attachment is not None and str(sample.key_expr) == key:
+                self._post(partial(self._take_value, variable, sample.payload.to_bytes(), sample.attachment.to_bytes()))
 
-    def _take_value(self, variable: WatchedVariable, data: bytes, attachment: bytes) -> None:
+        self._entities.append(self._mesh.declare_subscriber(key, arrived))
+
+    def _take_value(self, variable: _WatchedVariable, data: bytes, attachment: bytes) -> None:
         try:
             stamp = decode_json(attachment, Stamp)
         except MessageRefused:  # somebody put it on the key of an input, with a time but without a point
@@ -211,7 +217,11 @@ class Gateway:
                     put(message, time_s)
             except CdrError as error:
                 variable.warn(f"{value!r} cannot be sent on '{assembler.topic.name}': {error}")
-        self._progress.published(variable, stamp.point)
+        if self._clock is not None and variable.holds_until < 0:
+            self._clock.begin(stamp.point)
+        now = self._progress.published(variable, stamp.point)
+        if self._clock is not None:
+            self._clock.advance(now)
 
     # --- from ROS to the mesh
 
@@ -236,7 +246,7 @@ class Gateway:
             message = subscribed.disassembler.topic.message
             subscribed.warn(f"a message of {len(data)} bytes is no '{message}' that can be used: {error}")
             return
-        attachment = subscribed.attachment(stamp)
+        attachment = subscribed.attachment(stamp / 1_000_000_000 if stamp is not None else None)
         for key, value in zip(subscribed.keys, values, strict=True):
             self._publishers[key].put(encode_value(value), attachment=attachment)
 
@@ -255,24 +265,36 @@ class Gateway:
             log.warning("%d samples were left out: the mesh is faster than ROS can receive", count)
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
-        self._events.put(self._end_mesh if sample.kind == zenoh.SampleKind.DELETE else self._meet_mesh)
+        def changed() -> None:
+            # A token after its end belongs to another run, or the connection was lost meanwhile: samples are missing.
+            self._ended = self._ended or (self._mesh_ended and not gone)
+            self._mesh_ended = self._mesh_ended or gone
+
+        gone = sample.kind == zenoh.SampleKind.DELETE
+        self._events.put(changed)
 
     def _is_over(self) -> bool:
         """Whether every sample has been carried."""
         return self._ended or not self._progress.watched or self._progress.complete >= self._grid.last_point
 
-    def _end_mesh(self) -> None:
-        self._mesh_ended = True
-
-    def _meet_mesh(self) -> None:
-        # A token after its end belongs to another run, or the connection was lost meanwhile: samples are missing.
-        self._ended = self._ended or self._mesh_ended
-
     def _end(self) -> None:
         self._ended = True
 
 
-class _SubscribedTopic(WarnOnce):
+class _WarnOnce:
+    """Logs each warning about one topic or variable once, and at most ten of them."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._logged: set[str] = set()
+
+    def warn(self, text: str) -> None:
+        if text not in self._logged and len(self._logged) < _MAX_WARNINGS:
+            self._logged.add(text)
+            log.warning("'%s': %s", self._name, text)
+
+
+class _SubscribedTopic(_WarnOnce):
     """A topic that the gateway subscribes to, and the keys of its variables."""
 
     def __init__(self, disassembler: Disassembler, keys: list[str], stop_time: float | None) -> None:
@@ -291,3 +313,85 @@ class _SubscribedTopic(WarnOnce):
             )
             stamp = None
         return encode_origin(stamp, self._who)
+
+
+class _WatchedVariable(_WarnOnce):
+    """A variable whose samples the gateway takes; it has one every ``step_points`` points.
+
+    Attributes:
+        outputs: (assembler of a topic, index of the variable's port there, publishes its messages).
+    """
+
+    def __init__(self, name: str, step_points: int) -> None:
+        super().__init__(name)
+        self.outputs: list[tuple[Assembler, int, Put]] = []
+        self._step_points = step_points
+        self._point = -1
+
+    @property
+    def holds_until(self) -> int:
+        """The last point at which the newest sample holds; -1 before the first sample."""
+        return self._point + self._step_points - 1 if self._point >= 0 else -1
+
+    def advance(self, point: int) -> None:
+        self._point = point
+
+
+class _ClockPublisher:
+    """`/clock`: the time of every n-th point, once everything up to that point has been published."""
+
+    def __init__(self, put: Put, plan: RosPlan, grid: TimeGrid) -> None:
+        self._put = put
+        self._codec = Codec(plan.types, CLOCK)
+        self._stride = plan.clock_points or 1
+        self._grid = grid
+        self._next: int | None = None
+        self._last: int | None = None
+        self._moved = False
+
+    def begin(self, point: int) -> None:
+        """Start at the first sample, which is of ``point``; earlier points were not published here."""
+        if self._last is None:
+            first = -(-point // self._stride) * self._stride
+            self._next = first if self._next is None else min(first, self._next)
+
+    def advance(self, point: int) -> None:
+        """Publish every n-th point up to ``point``, up to which everything else has been published."""
+        while self._next is not None and self._next <= point:
+            self._publish(self._next)
+            self._last = self._next
+            self._next += self._stride
+            self._moved = True
+
+    def repeat(self) -> None:
+        """Publish the last time again if it has not changed since the last call, for new subscribers."""
+        if self._last is not None and not self._moved:
+            self._publish(self._last)
+        self._moved = False
+
+    def _publish(self, point: int) -> None:
+        time_s = self._grid.time(point)
+        self._put(self._codec.encode({"clock": to_stamp(time_s)}), time_s)
+
+
+class _Progress:
+    """The watched variables of one gateway, and the point up to which all of their samples have been published.
+
+    Attributes:
+        watched: the variables by their keys.
+        complete: the last point at which the newest samples of all variables hold; -1 at first.
+    """
+
+    def __init__(self) -> None:
+        self.watched: dict[str, _WatchedVariable] = {}
+        self.complete = -1
+        self._newest = -1
+
+    def published(self, variable: _WatchedVariable, point: int) -> int:
+        """Note that the sample of ``variable`` at ``point`` has been published; returns how far everything has been."""
+        was_last = variable.holds_until <= self.complete
+        variable.advance(point)
+        self._newest = max(self._newest, point)
+        if was_last:
+            self.complete = min(other.holds_until for other in self.watched.values())
+        return min(self._newest, self.complete)

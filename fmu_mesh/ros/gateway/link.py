@@ -5,6 +5,10 @@ this thread. A router does not pass tokens on between peers, and the gateway is 
 is opened as soon as the router answers, to see the tokens of others.
 """
 
+# Threads: `ros-link` looks at the link four times a second and writes `_view`; Zenoh calls `_token_changed` and
+# `_answer` on threads of its own, which take the lock of the tokens or read `_view`. Nobody waits for `ros-link` but
+# `close`, at most 3 s: to open a session may take long where nobody answers (ADR 0030).
+
 from __future__ import annotations
 
 import logging
@@ -51,15 +55,7 @@ def two_clocks(other: str, setting: str) -> str:
 
 
 class RosLink:
-    """Watches the link of one gateway. Call `open` first and `close` last.
-
-    Args:
-        section: has the endpoints of the link.
-        ros: the session towards ROS; the caller closes it.
-        mesh: a session that reaches the mesh; the caller closes it.
-        keys: the keys of the mesh.
-        clock: whether this gateway publishes `/clock`.
-    """
+    """Watches the link of one gateway. Call `open` first and `close` last. The caller closes both sessions."""
 
     def __init__(self, section: RosConfig, ros: zenoh.Session, mesh: zenoh.Session, keys: Keys, *, clock: bool) -> None:
         self._section = section
@@ -120,7 +116,9 @@ class RosLink:
             clocks = self._other_clocks() if linked else ()
             self._view = self._seen(linked=linked, clocks=clocks)
             self._warn_of_link(linked=linked)
-            self._warn_of_clocks(clocks)
+            for other in sorted({*clocks} - self._warned_clocks):
+                self._warned_clocks.add(other)
+                self._warn(two_clocks(other, "`clock_rate: null` in the section `ros`"))
             self._was_linked = self._was_linked or linked
             if self._over.wait(_INTERVAL_S):
                 return
@@ -164,12 +162,6 @@ class RosLink:
             what = f"the link to {self._where} was lost" if self._was_linked else self._view.activity
             nothing = f"so ROS gets nothing of mesh '{name}', which runs on"
             self._warn(f"{what}, {nothing}. {self._hint} The gateway keeps trying.")
-
-    def _warn_of_clocks(self, clocks: tuple[str, ...]) -> None:
-        for other in clocks:
-            if other not in self._warned_clocks:
-                self._warned_clocks.add(other)
-                self._warn(two_clocks(other, "`clock_rate: null` in the section `ros`"))
 
     def _warn(self, text: str) -> None:
         self._warnings += 1

@@ -1,34 +1,41 @@
-"""From the `ros` section of a configuration to a plan: the section is checked and its topics are resolved."""
+"""From the `ros` section of a configuration to a plan: the section is checked and its topics are resolved.
+
+A topic that passes can be sent and received; every problem with a name is reported. Knows neither Zenoh nor FMPy.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import msgspec
+from msgspec.structs import replace
 
 from ...config.findings import Findings
 from ...config.loading import LoadedConfig
-from ...config.mesh import Config, RosConfig
+from ...config.mesh import Config, RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
 from ...files import opened
+from ...system.couplings import driven_inputs
 from ...system.start_values import sized
-from ...text import nearest_file
+from ...text import listed, nearest, nearest_file
 from ...variables.model_description import Causality, ModelDescription, Variability, Variable
 from ...variables.value_types import FMI2_TYPES, VariableType
 from ...wire.views import InstanceInfo, VariableView
 from ..messages.definitions import MessageTypes, is_message_name
-from ..messages.ros_names import topic_problem
-from ..messages.topics import Descriptions, RosPlan
-from .resolver import Resolver
+from ..messages.fitting import TopicEntry, check_topic, default_type
+from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
+from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
 
-__all__ = ["descriptions_of", "message_types", "resolve"]
+__all__ = ["Resolver", "descriptions_of", "message_types", "resolve"]
+
+_CHOOSE_NAME = "a name of your choice: {topic: /a_name, variable: %s}"
+_DATA = "data"
+_KINDS: Mapping[str, Kind] = {"output": "out", "local": "local", "input": "in"}
 
 
-def message_types(loaded: LoadedConfig, findings: Findings) -> MessageTypes | None:
-    """The message types of the `ros` section with its custom ones; None after a finding."""
-    section = loaded.config.ros
-    assert section is not None
+def message_types(loaded: LoadedConfig, section: RosConfig, findings: Findings) -> MessageTypes | None:
+    """The message types of a section `ros` with its custom ones; None after a finding."""
     custom = {}
     for name, file in section.messages.items():
         path = f"ros.messages.{name}"
@@ -53,10 +60,7 @@ def message_types(loaded: LoadedConfig, findings: Findings) -> MessageTypes | No
 def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings) -> RosPlan | None:
     """Make the plan of the `ros` section.
 
-    Args:
-        loaded: the configuration.
-        descriptions: the model descriptions by instance name; a topic whose description is missing is not checked.
-        findings: where the findings go.
+    A topic of an instance without a description is not checked.
 
     Returns:
         The plan; None without a section or without message types. After findings it is incomplete.
@@ -64,7 +68,7 @@ def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings
     section = loaded.config.ros
     if section is None:
         return None
-    types = message_types(loaded, findings)
+    types = message_types(loaded, section, findings)
     _check_section(loaded.config, section, findings)
     # Array sizes that are too large are reported with the start values that set them, so not here.
     instances, ignored = loaded.config.instances, loaded.findings()
@@ -124,3 +128,224 @@ def _check_section(config: Config, section: RosConfig, findings: Findings) -> No
     if config.simulation.start_time < 0:
         found = f"{config.simulation.start_time:g}, while `ros` is there"
         findings.add("simulation.start_time", found, "a time >= 0: a ROS clock has no negative times")
+
+
+class Resolver:
+    """Resolves the topics of a section `ros`, or of another one in its place; without types, only names are checked."""
+
+    def __init__(
+        self,
+        config: Config,
+        section: RosConfig,
+        descriptions: Descriptions,
+        types: MessageTypes | None,
+        findings: Findings,
+    ) -> None:
+        self._config = config
+        self._section = section
+        self._descriptions = descriptions
+        self._types = types
+        self._findings = findings
+        self._driven = driven_inputs(config, descriptions)
+        self._owners: dict[tuple[str, Direction], str] = {}
+        self._messages: dict[str, tuple[str, str]] = {}
+
+    def topics(self) -> list[Topic]:
+        """The topics without a finding."""
+        topics = []
+        for entry in self._entries():
+            for topic in self._topics(entry):
+                self._check_unique(topic, entry.path)
+                topics.append(topic)
+        return topics
+
+    def plan(self) -> RosPlan:
+        """The plan; after findings it is incomplete. It needs message types."""
+        assert self._types is not None
+        step_size, rate = self._config.simulation.step_size, self._section.clock_rate
+        return RosPlan(
+            types=self._types,
+            topics=tuple(self.topics()),
+            parameters=tuple(self._parameters()),
+            node=self._section.node or ros_name(self._config.mesh),
+            namespace=self._section.namespace,
+            clock_points=max(1, round(1 / (rate * step_size))) if rate and step_size > 0 else None,
+            time_source=next(
+                (
+                    self._as_port(instance, variable, "")
+                    for instance, description in self._descriptions.items()
+                    for variable in description.with_causality("output", "local", "input")
+                    if variable.type not in ("String", "Binary")
+                ),
+                None,
+            ),
+        )
+
+    def _entries(self) -> Iterator[TopicEntry]:
+        if self._section.topics is None:
+            for instance in self._config.instances:
+                yield TopicEntry(RosTopicConfig(variable=instance), "ros", "ros")
+            return
+        for index, entry in enumerate(self._section.topics):
+            path = f"ros.topics[{index}]"
+            if isinstance(entry, str):
+                yield TopicEntry(RosTopicConfig(variable=entry), path, path)
+            else:
+                yield TopicEntry(entry, path, f"{path}.variable")
+
+    # --- topics
+
+    def _topics(self, entry: TopicEntry) -> Iterator[Topic]:
+        item = entry.item
+        if (item.variable is None) == (not item.fields):
+            found = "neither `variable` nor `fields`" if item.variable is None else "both `variable` and `fields`"
+            self._findings.add(entry.path, found, "one of them")
+        elif item.variable is None:
+            yield from self._message_of_fields(entry)
+        elif item.variable in self._config.instances:
+            yield from self._all_of_instance(entry, item.variable)
+        else:
+            yield from self._single(entry, item.variable)
+
+    def _all_of_instance(self, entry: TopicEntry, instance: str) -> Iterator[Topic]:
+        item = entry.item
+        if item.type is not None:
+            found = f"one type for all topics of the instance '{instance}'"
+            self._findings.add(f"{entry.path}.type", found, "a topic per variable")
+            return
+        description = self._descriptions.get(instance)
+        wanted = [
+            variable
+            for variable in (description.variables if description is not None else ())
+            if variable.causality in ("output", "input") and f"{instance}.{variable.name}" not in self._driven
+            if default_type(variable.type, array=bool(variable.shape)) is not None
+        ]
+        problems = name_problems(variable.name for variable in wanted)
+        for problem in problems:
+            expected = _CHOOSE_NAME % f"'{instance}.{problem.variables[0]}'"
+            self._findings.add(entry.variable_path, f"in '{instance}' {problem}", expected)
+        unusable = {name for problem in problems for name in problem.variables}
+        for variable in wanted:
+            if variable.name not in unusable:
+                topic = f"{item.topic}/{ros_name(variable.name)}" if item.topic is not None else None
+                own = replace(item, topic=topic, variable=f"{instance}.{variable.name}")
+                yield from self._single(replace(entry, item=own), f"{instance}.{variable.name}")
+
+    def _single(self, entry: TopicEntry, reference: str) -> Iterator[Topic]:
+        port = self._port(reference, _DATA, entry.variable_path)
+        if port is None:
+            return
+        name = entry.item.topic
+        if name is None:
+            problems = name_problems([port.variable.name])
+            for problem in problems:
+                self._findings.add(entry.variable_path, str(problem), _CHOOSE_NAME % f"'{reference}'")
+            if problems:
+                return
+            name = f"{ros_name(port.instance)}/{ros_name(port.variable.name)}"
+        message = entry.item.type or default_type(port.variable.type, array=bool(port.variable.shape))
+        if message is None:
+            text = f"'{reference}' of the type {port.variable.type}, which no message of std_msgs carries"
+            self._findings.add(entry.variable_path, text, "a message in `type` and its field in `fields`")
+            return
+        yield from self._topic(entry, name, message, (port,))
+
+    def _message_of_fields(self, entry: TopicEntry) -> Iterator[Topic]:
+        item = entry.item
+        if item.topic is None or item.type is None:
+            key = "topic" if item.topic is None else "type"
+            self._findings.add(f"{entry.path}.{key}", f"no `{key}`", f"a {key}: several variables share this message")
+            return
+        found = [self._port(own, field, f"{entry.path}.fields.{field}") for field, own in item.fields.items()]
+        ports = [port for port in found if port is not None]
+        directions: dict[Direction, str] = {}
+        for port in ports:
+            directions.setdefault(port.direction, f"{port.instance}.{port.variable.name}")
+        if len(directions) > 1:
+            text = f"the output '{directions['out']}' and the input '{directions['in']}' in one message"
+            self._findings.add(f"{entry.path}.fields", text, "a topic for each direction")
+        elif len(ports) == len(item.fields):
+            yield from self._topic(entry, item.topic, item.type, tuple(ports))
+
+    def _topic(self, entry: TopicEntry, name: str, message: str, ports: tuple[Port, ...]) -> Iterator[Topic]:
+        full_name = absolute(name, self._section.namespace)
+        before = len(self._findings)
+        if (problem := topic_problem(full_name)) is not None:
+            expected = "letters, digits, underscores and slashes, no part that starts with a digit"
+            self._findings.add(f"{entry.path}.topic", f"'{name}': {problem}", expected)
+        topic = Topic(
+            name=full_name,
+            message=message,
+            direction=ports[0].direction,
+            ports=ports,
+            profile=entry.item.profile or self._section.profile,
+            frame_id=entry.item.frame_id,
+            reliability=entry.item.reliability,
+            constants=tuple(entry.item.constants.items()),
+        )
+        if self._types is not None:
+            check_topic(entry, topic, self._types, self._findings)
+        if len(self._findings) == before:
+            yield topic
+
+    # --- variables
+
+    def _port(self, reference: str, field: str, path: str) -> Port | None:
+        """The variable with the name ``reference`` in a field; None after a finding."""
+        variable = self._variable(reference, path)
+        if variable is None:
+            return None
+        if variable.causality == "input" and reference in self._driven:
+            self._findings.add(path, f"the connected input '{reference}'", self._driven[reference])
+            return None
+        if variable.causality not in _KINDS:
+            expected = "an output, a local variable or an input; parameters are parameters in ROS, too"
+            self._findings.add(path, f"'{reference}', a {variable.causality}", expected)
+            return None
+        return self._as_port(reference.partition(".")[0], variable, field)
+
+    def _variable(self, reference: str, path: str) -> Variable | None:
+        """The variable with the name `instance.variable`; None after a finding, or if the FMU could not be read."""
+        instance, dot, name = reference.partition(".")
+        names = list(self._config.instances)
+        if instance not in names:
+            expected = f"one of the instances {listed(names)}"
+            self._findings.add(path, f"the unknown instance '{instance}'", expected, nearest(instance, names))
+            return None
+        description = self._descriptions.get(instance)
+        variable = description.variable(name) if dot and description is not None else None
+        if variable is None and description is not None:
+            ends = description.with_causality("output", "input")
+            near = [own.name for own in ends if f"{instance}.{own.name}" not in self._driven]
+            found = f"the unknown variable '{name}' of instance '{instance}'"
+            if (clock := description.clock(name)) is not None:
+                self._findings.add(path, clock, "")
+            else:
+                self._findings.add(path, found, f"one of {listed(near)}", nearest(name, near))
+        return variable
+
+    def _as_port(self, instance: str, variable: Variable, field: str) -> Port:
+        step, base = self._config.instances[instance].step_size, self._config.simulation.step_size
+        points = max(1, round(step / base)) if step is not None and base > 0 else 1
+        return Port(field, instance, variable, _KINDS[variable.causality], points)
+
+    def _parameters(self) -> Iterator[NodeParameter]:
+        for instance, description in self._descriptions.items():
+            own = [variable for variable in description.with_causality("parameter") if not variable.shape]
+            unusable = {name for problem in name_problems(v.name for v in own) for name in problem.variables}
+            for variable in own:
+                if variable.name not in unusable:
+                    yield NodeParameter(f"{ros_name(instance)}.{ros_name(variable.name)}", instance, variable)
+
+    # --- the whole
+
+    def _check_unique(self, topic: Topic, path: str) -> None:
+        owners = ", ".join(f"'{port.instance}.{port.variable.name}'" for port in topic.ports)
+        first = self._owners.setdefault((topic.name, topic.direction), owners)
+        message, owner = self._messages.setdefault(topic.name, (topic.message, owners))
+        if first is not owners:
+            found = f"the topic '{topic.name}' for {owners} and for {first}"
+            self._findings.add(path, found, _CHOOSE_NAME % owners.partition(",")[0])
+        elif message != topic.message:
+            found = f"the topic '{topic.name}' with '{topic.message}' for {owners}, and with '{message}' for {owner}"
+            self._findings.add(path, found, "one message type for one topic")

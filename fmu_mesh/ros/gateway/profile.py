@@ -1,4 +1,10 @@
-"""The interface of a profile: how topics look to ROS, or to a bridge to ROS."""
+"""Profiles: how topics look to ROS, or to a bridge to ROS; what those on Zenoh have in common, and that of a bridge.
+
+Keys of zenoh-bridge-ros2dds are topic names, payloads are CDR, and tokens announce topics as a bridge does. A token is
+`@/<zid>/@ros2_lv/MP/<key>/<type>/<qos>` (MS for a subscriber), with `§` for every slash within a part. Its QoS is
+`<keyless>:<reliability>:<durability>:<history>,<depth>:<user data>` in the numbers of Cyclone DDS; the user data
+contain the type hash, as in ROS since Iron.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +13,11 @@ from typing import Protocol
 
 import zenoh
 
-from ..messages.topics import Topic
+from ...wire.session import undeclare_all
+from ..messages.definitions import MessageTypes
+from ..messages.topics import Reliability, Topic
 
-__all__ = ["DEPTH", "Profile", "Put", "Take", "congestion_control"]
+__all__ = ["DEPTH", "Profile", "Put", "Ros2Dds", "Take", "ZenohProfile"]
 
 Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
@@ -19,6 +27,8 @@ Take = Callable[[bytes], None]
 
 DEPTH = 1000
 """History depth: how many samples a DDS writer keeps at most for a reader that has not acknowledged them."""
+_RELIABLE, _BEST_EFFORT = 1, 0
+_VOLATILE, _KEEP_LAST = 0, 0
 
 
 class Profile(Protocol):
@@ -34,6 +44,67 @@ class Profile(Protocol):
         """Undeclare everything."""
 
 
-def congestion_control(topic: Topic) -> zenoh.CongestionControl:
-    """Wait for slow subscribers of a reliable topic; only the gateway waits, because its session is its own."""
-    return zenoh.CongestionControl.BLOCK if topic.reliability == "reliable" else zenoh.CongestionControl.DROP
+class ZenohProfile:
+    """Topics on Zenoh: a publisher or a subscriber, and a token that shows it to ROS. The caller closes the session."""
+
+    def __init__(self, session: zenoh.Session, types: MessageTypes) -> None:
+        self._session = session
+        self._types = types
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._publishers: list[zenoh.Publisher] = []
+        self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+
+    def publish(self, topic: Topic) -> Put:
+        """Declare a publisher of ``topic``."""
+        # Wait for slow subscribers of a reliable topic; only the gateway waits, because its session is its own.
+        control = zenoh.CongestionControl
+        publisher = self._session.declare_publisher(
+            self._key(topic.name, topic.message),
+            encoding=zenoh.Encoding.APPLICATION_CDR,
+            congestion_control=control.BLOCK if topic.reliability == "reliable" else control.DROP,
+        )
+        self._publishers.append(publisher)
+        attached = self._attached(self._announce("MP", topic.name, topic.message, topic.reliability))
+        return lambda data, time: publisher.put(data, attachment=attached(time))
+
+    def subscribe(self, topic: Topic, take: Take) -> None:
+        """Declare a subscriber of ``topic``."""
+        key = self._key(topic.name, topic.message)
+        self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
+        self._announce("MS", topic.name, topic.message, topic.reliability)
+
+    def close(self) -> None:
+        """Undeclare everything, tokens first."""
+        undeclare_all(self._tokens, self._publishers, self._others)
+
+    def _key(self, name: str, message: str) -> str:
+        """The key of a topic or a service."""
+        raise NotImplementedError
+
+    def _announce(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        """Declare the token of a publisher (MP), a subscriber (MS) or a server (SS), and return it."""
+        token = self._token(kind, name, message, reliability)
+        self._tokens.append(self._session.liveliness().declare_token(token))
+        return token
+
+    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        """The token of a topic or a service."""
+        raise NotImplementedError
+
+    def _attached(self, token: str) -> Callable[[float], bytes | None]:  # noqa: ARG002  another profile needs it
+        """What goes with a sample of a publisher with this token at a time in s."""
+        return lambda _time: None
+
+
+class Ros2Dds(ZenohProfile):
+    """Topics as a bridge between Zenoh and DDS expects them."""
+
+    def _key(self, name: str, message: str) -> str:  # noqa: ARG002  the name says all
+        return name.removeprefix("/")
+
+    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        qos = f":{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}"
+        if self._types.distribution != "humble":
+            qos += f":typehash={self._types.type_hash(message)};"
+        parts = (self._key(name, message).replace("/", "§"), message.replace("/", "§"), qos)
+        return f"@/{self._session.zid()}/@ros2_lv/{kind}/{'/'.join(parts)}"

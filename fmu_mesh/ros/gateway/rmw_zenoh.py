@@ -4,25 +4,43 @@ Keys are `<domain>/<name>/<type in DDS>/<hash>`. Tokens are
 `@ros2_lv/<domain>/<zid>/<node>/<entity>/<kind>/<enclave>/<namespace>/<node name>/<name>/<type>/<hash>/<qos>` with `%`
 for every slash within a part. Every sample, request and response has an attachment: sequence number, time in ns, and
 the 16 bytes that identify its sender (rmw_zenoh, docs/design.md).
+
+Services of this node are how ROS reads and sets the parameters of all instances.
 """
+
+# Threads: Zenoh calls `answer` on a thread of its own, which only puts a job into a queue, because the mesh may answer
+# slowly and the callbacks of other topics must not wait for it. `parameters` does the jobs one by one (ADR 0030).
 
 from __future__ import annotations
 
 import itertools
+import logging
+import queue
 import struct
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import zenoh
 
+from ...errors import FmuMeshError
 from ...installing import importing
-from ...wire.session import undeclare_all
+from ...system.settable import why_not_settable
+from ...variables.model_description import Value, Variable
+from ...wire.keys import Keys
+from ...wire.messages import decode_json
+from ...wire.session import Question, ask
+from ...wire.values import encode_origin, encode_value
 from ..messages.cdr import CdrError, Codec, Message
-from ..messages.ros_names import dds_type
+from ..messages.ros_names import absolute, dds_type
 from ..messages.stamp import nanoseconds
-from ..messages.topics import RosPlan, Topic
-from .profile import DEPTH, Put, Take, congestion_control
+from ..messages.topics import NodeParameter, Reliability, RosPlan
+from .profile import DEPTH, ZenohProfile
 
-__all__ = ["RmwZenoh", "Service", "decode_attachment"]
+__all__ = ["SERVICES", "ParameterServices", "RmwZenoh", "Service", "decode_attachment"]
+
+log = logging.getLogger(__name__)
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _SHORT_ATTACHMENT = struct.Struct("<qq16s")
@@ -33,48 +51,33 @@ _NO_HASH = "TypeHashNotSupported"
 Service = Callable[[Message, Callable[[Message], None]], None]
 """Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
 
+SERVICES = {
+    "GetParameters": ("string[] names\n", "rcl_interfaces/ParameterValue[] values\n"),
+    "GetParameterTypes": ("string[] names\n", "uint8[] types\n"),
+    "SetParameters": ("rcl_interfaces/Parameter[] parameters\n", "rcl_interfaces/SetParametersResult[] results\n"),
+    "ListParameters": ("string[] prefixes\nuint64 depth\n", "rcl_interfaces/ListParametersResult result\n"),
+    "DescribeParameters": ("string[] names\n", "rcl_interfaces/ParameterDescriptor[] descriptors\n"),
+}
+"""Request and response of each service (package rcl_interfaces)."""
 
-class RmwZenoh:
-    """One ROS node on Zenoh.
+_ANSWER_S = 2.0
+_WHO = "ros set_parameters"
+_ANSWERS_END_S = 2.0
+"""As long as the mesh may take for the answer that is under way, in s."""
+_NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING = range(5)
+_VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "double_value", _STRING: "string_value"}
 
-    Args:
-        session: towards ROS; the caller closes it.
-        plan: name and namespace of the node, and the message types.
-        domain: ROS_DOMAIN_ID.
-    """
+
+class RmwZenoh(ZenohProfile):
+    """One ROS node on Zenoh; the source time of a sample is its simulation time."""
 
     def __init__(self, session: zenoh.Session, plan: RosPlan, domain: int) -> None:
-        self._session = session
-        self._types = plan.types
-        self._plan = plan
+        super().__init__(session, plan.types)
         self._domain = domain
         self._entities = itertools.count(1)
-        self._publishers: list[zenoh.Publisher] = []
-        self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
-        node = f"@ros2_lv/{domain}/{session.zid()}/0/0/NN/{self._node()}"
-        self._tokens = [session.liveliness().declare_token(node)]
-
-    def publish(self, topic: Topic) -> Put:
-        """Declare a publisher of ``topic``; the source time of a sample is its simulation time."""
-        publisher = self._session.declare_publisher(
-            self._key(topic.name, topic.message),
-            encoding=zenoh.Encoding.APPLICATION_CDR,
-            congestion_control=congestion_control(topic),
-        )
-        self._publishers.append(publisher)
-        gid = self._announce("MP", topic.name, topic.message, reliable=topic.reliability == "reliable")
-        sequence = itertools.count(1)
-
-        def put(data: bytes, time: float) -> None:
-            publisher.put(data, attachment=_ATTACHMENT.pack(next(sequence), nanoseconds(time), _GID_SIZE, gid))
-
-        return put
-
-    def subscribe(self, topic: Topic, take: Take) -> None:
-        """Declare a subscriber of ``topic``."""
-        key = self._key(topic.name, topic.message)
-        self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
-        self._announce("MS", topic.name, topic.message, reliable=topic.reliability == "reliable")
+        self._node = f"%/{_mangled(plan.namespace)}/{plan.node}"
+        node = f"@ros2_lv/{domain}/{session.zid()}/0/0/NN/{self._node}"
+        self._tokens.append(session.liveliness().declare_token(node))
 
     def serve(self, name: str, kind: str, service: Service) -> None:
         """Declare the server of the service ``name``; its type ``kind`` has to be defined in the message types."""
@@ -99,30 +102,24 @@ class RmwZenoh:
             service(request, reply)
 
         self._others.append(self._session.declare_queryable(key, answer, complete=True))
-        self._announce("SS", name, kind, reliable=True)
-
-    def close(self) -> None:
-        """Undeclare everything, tokens first."""
-        undeclare_all(self._tokens, self._publishers, self._others)
-
-    def _announce(self, kind: str, name: str, message: str, *, reliable: bool) -> bytes:
-        """Declare the token of an entity, and return the 16 bytes that identify the entity."""
-        with importing("xxhash", "topics of rmw_zenoh"):
-            import xxhash  # noqa: PLC0415  an optional dependency
-
-        qos = f"{_RELIABLE if reliable else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
-        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
-        token = f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node()}/{own}"
-        self._tokens.append(self._session.liveliness().declare_token(token))
-        number = xxhash.xxh3_128_intdigest(token.encode())
-        low, high = number & (1 << 64) - 1, number >> 64
-        return struct.pack("<QQ", low, high)
-
-    def _node(self) -> str:
-        return f"%/{_mangled(self._plan.namespace)}/{self._plan.node}"
+        self._announce("SS", name, kind, "reliable")
 
     def _key(self, name: str, message: str) -> str:
         return f"{self._domain}/{name.strip('/')}/{dds_type(message)}/{self._hash(message)}"
+
+    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+        qos = f"{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
+        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
+        return f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node}/{own}"
+
+    def _attached(self, token: str) -> Callable[[float], bytes | None]:
+        with importing("xxhash", "topics of rmw_zenoh"):
+            import xxhash  # noqa: PLC0415  an optional dependency
+
+        number = xxhash.xxh3_128_intdigest(token.encode())
+        gid = struct.pack("<QQ", number & (1 << 64) - 1, number >> 64)
+        sequence = itertools.count(1)
+        return lambda time: _ATTACHMENT.pack(next(sequence), nanoseconds(time), _GID_SIZE, gid)
 
     def _hash(self, message: str) -> str:
         return _NO_HASH if self._types.distribution == "humble" else self._types.type_hash(message)
@@ -146,3 +143,144 @@ def decode_attachment(attachment: zenoh.ZBytes | None) -> tuple[int, int, bytes]
 
 def _mangled(name: str) -> str:
     return name.replace("/", "%")
+
+
+class ParameterServices:
+    """Answers for the parameters of one mesh, on its own thread, because the mesh may answer slowly.
+
+    A parameter is named `<instance>.<variable>`. If the mesh refuses a value (a fixed parameter, a value out of range),
+    the service answers with the same reason.
+
+    The messages of the services are added to the types of the plan. The caller closes the session.
+    """
+
+    def __init__(self, plan: RosPlan, mesh: zenoh.Session, keys: Keys) -> None:
+        self._plan = plan
+        self._mesh = mesh
+        self._keys = keys
+        self._parameters = {parameter.name: parameter for parameter in plan.parameters}
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        for name, (request, response) in SERVICES.items():
+            plan.types.define_service(f"rcl_interfaces/srv/{name}", request, response)
+        self._no_value = Codec(plan.types, "rcl_interfaces/msg/ParameterValue").empty()
+        self._no_descriptor = Codec(plan.types, "rcl_interfaces/msg/ParameterDescriptor").empty()
+
+    @contextmanager
+    def served_by(self, node: RmwZenoh) -> Iterator[None]:
+        """Offer the services of ``node`` within the context."""
+        thread = threading.Thread(target=self._run, name="parameters", daemon=True)
+        thread.start()
+        for name, kind, answer in (
+            ("get_parameters", "GetParameters", self._get),
+            ("get_parameter_types", "GetParameterTypes", self._get_types),
+            ("set_parameters", "SetParameters", self._set),
+            ("list_parameters", "ListParameters", self._list),
+            ("describe_parameters", "DescribeParameters", self._describe),
+        ):
+            full_name = absolute(f"{self._plan.node}/{name}", self._plan.namespace)
+            node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._queued(answer))
+        try:
+            yield
+        finally:
+            self._jobs.put(None)
+            thread.join(_ANSWERS_END_S)
+
+    def _queued(self, answer: Callable[[Message], Message]) -> Service:
+        def service(request: Message, reply: Callable[[Message], None]) -> None:
+            self._jobs.put(lambda: reply(answer(request)))
+
+        return service
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except zenoh.ZError as error:  # the client is gone
+                log.info("answer_not_sent", extra={"error": str(error)})
+
+    # --- the services
+
+    def _get(self, request: Message) -> Message:
+        return {"values": [self._value(name) for name in request["names"]]}
+
+    def _get_types(self, request: Message) -> Message:
+        kinds = [self._parameters.get(name) for name in request["names"]]
+        return {"types": [_kind(own.variable) if own is not None else _NOT_SET for own in kinds]}
+
+    def _set(self, request: Message) -> Message:
+        results = [self._set_one(own["name"], own["value"]) for own in request["parameters"]]
+        return {"results": [{"successful": not reason, "reason": reason} for reason in results]}
+
+    def _list(self, request: Message) -> Message:
+        wanted = [
+            name
+            for name in self._parameters
+            if not request["prefixes"] or any(name == p or name.startswith(f"{p}.") for p in request["prefixes"])
+        ]
+        return {"result": {"names": wanted, "prefixes": sorted({name.partition(".")[0] for name in wanted})}}
+
+    def _describe(self, request: Message) -> Message:
+        return {"descriptors": [self._descriptor(name) for name in request["names"]]}
+
+    def _descriptor(self, name: str) -> Message:
+        parameter = self._parameters.get(name)
+        if parameter is None:
+            return {**self._no_descriptor, "name": name, "read_only": True}
+        variable = parameter.variable
+        ranges: list[Message] = []
+        if variable.minimum is not None and variable.maximum is not None:
+            ranges = [{"from_value": variable.minimum, "to_value": variable.maximum, "step": 0.0}]
+        double = _kind(variable) == _DOUBLE
+        return {
+            "name": name,
+            "type": _kind(variable),
+            "description": variable.description or "",
+            "additional_constraints": f"unit: {variable.unit}" if variable.unit else "",
+            "read_only": why_not_settable(variable, None) is not None,
+            "dynamic_typing": False,
+            "floating_point_range": ranges if double else [],
+            "integer_range": [] if double else [{name: int(limit) for name, limit in own.items()} for own in ranges],
+        }
+
+    # --- the mesh
+
+    def _value(self, name: str) -> Message:
+        parameter = self._parameters.get(name)
+        value = self._ask(parameter)[0] if parameter is not None else None
+        if parameter is None or value is None:
+            return self._no_value
+        kind = _kind(parameter.variable)
+        return {**self._no_value, "type": kind, _VALUE_FIELDS[kind]: float(value) if kind == _DOUBLE else value}
+
+    def _set_one(self, name: str, value: Message) -> str:
+        """Set one parameter; returns why it was refused, or an empty text."""
+        parameter = self._parameters.get(name)
+        if parameter is None:
+            return f"there is no parameter '{name}'"
+        field = _VALUE_FIELDS.get(value["type"])
+        if field is None:
+            return f"'{name}' takes one value, a {parameter.variable.type}"
+        return self._ask(parameter, value[field])[1]
+
+    def _ask(self, parameter: NodeParameter, value: Value | None = None) -> tuple[Any, str]:
+        """Get the value, or set a new one; returns the answer of the mesh, and why it refused or an empty text."""
+        key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
+        payload = encode_value(value) if value is not None else None
+        question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload, encode_origin(None, _WHO))
+        try:
+            return decode_json(ask(self._mesh, question), object), ""
+        except FmuMeshError as error:
+            return None, error.message
+
+
+def _kind(variable: Variable) -> int:
+    """The number of the parameter type in ROS (`rcl_interfaces/msg/ParameterType`)."""
+    match variable.type:
+        case "Boolean":
+            return _BOOL
+        case "String":
+            return _STRING
+        case "Float64" | "Float32":
+            return _DOUBLE
+        case _:
+            return _INTEGER

@@ -16,14 +16,13 @@ import numpy as np
 from ...variables.model_description import Value
 from ...variables.value_types import DTYPES, flattened, nested
 from .cdr import CdrError, Codec, Message
-from .definitions import HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
-from .stamp import from_stamp, to_stamp
+from .definitions import FLOATS, HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
+from .stamp import in_nanoseconds, to_stamp
 from .topics import Port, Topic
 
 __all__ = ["Assembler", "Disassembler"]
 
 _MAX_WAITING = 1 << 14
-_FLOATS = {"NaN": float("nan"), "INF": float("inf"), "-INF": float("-inf")}
 
 
 class Assembler:
@@ -31,10 +30,6 @@ class Assembler:
 
     A message belongs to one point. If the variables have different step sizes, every point of one of them has a
     message, with the values that hold at that point.
-
-    Args:
-        topic: the topic.
-        types: the message types.
 
     Raises:
         CdrError: messages of this type cannot be encoded.
@@ -58,16 +53,7 @@ class Assembler:
                 header["frame_id"] = topic.frame_id
 
     def add(self, port: int, point: int, time: float, value: Value) -> Iterator[tuple[bytes, float]]:
-        """Take the value of a port at a point, and yield every message that is complete now.
-
-        Args:
-            port: index of the port.
-            point: of the value.
-            time: of the point, in s.
-            value: of the variable.
-
-        Yields:
-            Each message in CDR, and its time in s.
+        """Take the value of a port at a point, and yield every message that is complete now, in CDR, and its time in s.
 
         Raises:
             CdrError: a value does not fit into its field.
@@ -105,7 +91,7 @@ class Assembler:
         container, last = self._place(port.path, types)
         kind = types.field(self.topic.message, port.path)
         element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
-        floats = isinstance(element, Basic) and element.kind in ("float64", "float32")
+        floats = isinstance(element, Basic) and element.kind in FLOATS
         dtype = np.float64 if floats else DTYPES[port.variable.type]
         shape = port.variable.shape
         if shape and "layout" in self._message:
@@ -119,7 +105,7 @@ class Assembler:
                 elements = value if isinstance(value, np.ndarray) else flattened(value, len(shape))
                 container[last] = np.asarray(elements, dtype)  # "-INF" becomes a float, too
             else:
-                container[last] = _FLOATS[value] if floats and isinstance(value, str) else value
+                container[last] = float(value) if floats and isinstance(value, str) else value
 
         return put
 
@@ -149,12 +135,7 @@ class Assembler:
 
 
 class Disassembler:
-    """Reads the values of the variables from the messages of one subscribed topic.
-
-    Args:
-        topic: the topic.
-        types: the message types.
-    """
+    """Reads the values of the variables from the messages of one subscribed topic."""
 
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
         self.topic = topic
@@ -162,8 +143,8 @@ class Disassembler:
         self._stamped = types.has_header(topic.message)
         self._paths = [path_parts(port.path) for port in topic.ports]
 
-    def values(self, data: bytes) -> tuple[list[Value], float | None]:
-        """The values of the ports, and the stamp in s; the stamp is None if it is 0 or if there is no header.
+    def values(self, data: bytes) -> tuple[list[Value], int | None]:
+        """The values of the ports, and the stamp in ns; the stamp is None if it is 0 or if there is no header.
 
         Raises:
             CdrError: the bytes are not such a message, or an element of a port is not in it.
@@ -181,8 +162,7 @@ class Disassembler:
         if not self._stamped:
             return values, None
         stamp = message["header"]["stamp"]
-        time = from_stamp(stamp["sec"], stamp["nanosec"])
-        return values, time or None
+        return values, in_nanoseconds(stamp["sec"], stamp["nanosec"]) or None
 
 
 def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -> Iterator[tuple[str, Message]]:  # noqa: ANN401 any field

@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CLOCK",
+    "FLOATS",
     "HEADER",
     "MAX_ELEMENTS",
+    "NUMBERS",
     "TIME",
     "Array",
     "Basic",
@@ -42,6 +44,10 @@ HEADER = "std_msgs/msg/Header"
 
 MAX_ELEMENTS: Final = 1 << 16
 """Largest number of strings and nested messages in all arrays of one message; every index is below it."""
+
+FLOATS: Final = frozenset({"float32", "float64"})
+NUMBERS: Final = FLOATS | {"bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+"""Kinds of fields that numpy has by the same names; `byte` and `char` are other names of `uint8`."""
 
 Distribution = Literal["humble", "jazzy", "kilted", "lyrical"]
 
@@ -122,7 +128,10 @@ class MessageTypes:
         for name, text in (custom or {}).items():
             self.define(name, text)
         for name in custom or {}:
-            self._check_references(name)
+            try:
+                list(self.paths(name))
+            except UnknownType as error:
+                raise ConfigurationError(f"the definition of '{name}': {error}") from error
 
     def define(self, name: str, text: str) -> None:
         """Add a definition in the syntax of a `.msg` file.
@@ -225,13 +234,6 @@ class MessageTypes:
         self.fields(message)
         text, _md5 = self.store.generate_msgdef(message, ros_version=2)
         return text
-
-    def _check_references(self, message: str) -> None:
-        try:
-            for _ in self.paths(message):
-                pass
-        except UnknownType as error:
-            raise ConfigurationError(f"the definition of '{message}': {error}") from error
 
 
 def path_parts(path: str) -> list[str | int]:

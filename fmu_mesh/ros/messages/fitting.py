@@ -19,7 +19,9 @@ from ...variables.value_types import VariableType, nested
 from .assembling import Assembler, Disassembler
 from .cdr import MAX_MESSAGE_SIZE, CdrError
 from .definitions import (
+    FLOATS,
     HEADER,
+    NUMBERS,
     Array,
     Basic,
     FieldType,
@@ -34,8 +36,6 @@ from .topics import Direction, Port, Topic
 
 __all__ = ["TopicEntry", "carries", "check_topic", "default_type"]
 
-_FLOATS = ("float32", "float64")
-_NUMBERS = frozenset({"bool", *_FLOATS, *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))})
 _OTHER_NAMES: Mapping[str, str] = {"byte": "uint8", "char": "uint8", "Boolean": "bool", "Enumeration": "int64"}
 
 _PLAIN: Mapping[str, type | tuple[type, ...]] = {
@@ -78,23 +78,16 @@ def carries(target: str, source: str) -> bool:
     to, of = (_OTHER_NAMES.get(name, name.lower()) for name in (target, source))
     if to == of:
         return True
-    if not {to, of} <= _NUMBERS:
+    if not {to, of} <= NUMBERS:
         return False
-    if to in _FLOATS and of in _FLOATS:
+    if to in FLOATS and of in FLOATS:
         return True
     # numpy counts 64-bit integers into float64 as safe, although they may be rounded.
-    return np.can_cast(of, to) and not (to in _FLOATS and of in ("int64", "uint64"))
+    return np.can_cast(of, to) and not (to in FLOATS and of in ("int64", "uint64"))
 
 
 def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> None:
-    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants.
-
-    Args:
-        entry: where the topic stands in the configuration.
-        topic: the topic, whose message type may be unknown.
-        types: the message types.
-        findings: where the findings go.
-    """
+    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants."""
     before = len(findings)
     for port in topic.ports:
         _check_port(entry, topic, port, types, findings)

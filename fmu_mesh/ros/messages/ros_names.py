@@ -8,38 +8,30 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Literal
 
 import msgspec
 
-__all__ = ["NameProblem", "absolute", "dds_type", "name_problems", "ros_name", "topic_problem"]
+__all__ = ["NameProblem", "absolute", "collision", "dds_type", "name_problems", "ros_name", "topic_problem"]
 
 _NO_NAME_CHARACTER = re.compile(r"[^A-Za-z0-9_]")
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class NameProblem(msgspec.Struct, frozen=True):
-    """Variables that the rule gives no usable name.
+    """Variables that the rule gives no usable name, in the order of the model description; `str` says why."""
 
-    Attributes:
-        name: the name that the rule gives them.
-        variables: the variables with this name, in the order of the model description.
-        kind: several variables have the same name, the name starts with a digit, or the name is empty.
-    """
-
-    name: str
     variables: tuple[str, ...]
-    kind: Literal["collision", "digit", "empty"]
+    text: str
 
     def __str__(self) -> str:
-        quoted = ", ".join(f"'{variable}'" for variable in self.variables)
-        match self.kind:
-            case "collision":
-                return f"the variables {quoted} all become '{self.name}'"
-            case "digit":
-                return f"the variable {quoted} becomes '{self.name}', which starts with a digit"
-            case "empty":
-                return f"nothing is left of the name of the variable {quoted}"
+        return self.text
+
+
+def collision(name: str, variables: Iterable[str]) -> NameProblem:
+    """Several variables have this name."""
+    several = tuple(variables)
+    quoted = ", ".join(f"'{variable}'" for variable in several)
+    return NameProblem(several, f"the variables {quoted} all become '{name}'")
 
 
 def ros_name(variable: str) -> str:
@@ -59,13 +51,13 @@ def name_problems(variables: Iterable[str]) -> list[NameProblem]:
         by_name.setdefault(ros_name(variable), []).append(variable)
     problems = []
     for name, owners in by_name.items():
-        if not name:
-            problems += [NameProblem(name, (owner,), "empty") for owner in owners]
-            continue
-        if name[0].isdigit():
-            problems += [NameProblem(name, (owner,), "digit") for owner in owners]
-        if len(owners) > 1:
-            problems.append(NameProblem(name, tuple(owners), "collision"))
+        if not name or name[0].isdigit():
+            for owner in owners:
+                text = f"the variable '{owner}' becomes '{name}', which starts with a digit"
+                nothing = f"nothing is left of the name of the variable '{owner}'"
+                problems.append(NameProblem((owner,), text if name else nothing))
+        if name and len(owners) > 1:
+            problems.append(collision(name, owners))
     return problems
 
 

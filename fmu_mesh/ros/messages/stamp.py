@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["from_stamp", "in_nanoseconds", "nanoseconds", "to_stamp"]
+__all__ = ["in_nanoseconds", "nanoseconds", "to_stamp"]
 
 _PER_SECOND = 1_000_000_000
 
@@ -19,11 +19,6 @@ def to_stamp(time: float) -> dict[str, int]:
     """``time`` s as a `builtin_interfaces/msg/Time`."""
     sec, nanosec = divmod(nanoseconds(time), _PER_SECOND)
     return {"sec": sec, "nanosec": nanosec}
-
-
-def from_stamp(sec: int, nanosec: int) -> float:
-    """The time in s of a `builtin_interfaces/msg/Time`: the nearest float."""
-    return in_nanoseconds(sec, nanosec) / _PER_SECOND
 
 
 def in_nanoseconds(sec: int, nanosec: int) -> int:

@@ -1,6 +1,6 @@
 """The topics of a mesh or of a node: plain values.
 
-`fmu_mesh.ros.gateway.resolver` makes them from a configuration, `fmu_mesh.ros.node.node_topics` from the parameters of
+`fmu_mesh.ros.gateway.mapping` makes them from a configuration, `fmu_mesh.ros.node.node_topics` from the parameters of
 a ROS node.
 """
 
@@ -15,11 +15,24 @@ from ...config.mesh import RosProfile
 from ...variables.model_description import ModelDescription, Variable
 from .definitions import MessageTypes
 
-__all__ = ["Descriptions", "Direction", "Kind", "NodeParameter", "Port", "RosPlan", "Topic"]
+__all__ = [
+    "CLOCK_TOPIC",
+    "Descriptions",
+    "Direction",
+    "Kind",
+    "NodeParameter",
+    "Port",
+    "Reliability",
+    "RosPlan",
+    "Topic",
+]
+
+CLOCK_TOPIC = "/clock"
 
 Descriptions = Mapping[str, ModelDescription]
 Direction = Literal["out", "in"]
 Kind = Literal["out", "in", "local"]
+Reliability = Literal["reliable", "best_effort"]
 
 
 class Port(msgspec.Struct, frozen=True):
@@ -62,7 +75,7 @@ class Topic(msgspec.Struct, frozen=True):
     ports: tuple[Port, ...]
     profile: RosProfile = "ros2dds"
     frame_id: str = ""
-    reliability: Literal["reliable", "best_effort"] = "reliable"
+    reliability: Reliability = "reliable"
     constants: tuple[tuple[str, str | float | bool], ...] = ()
 
 

@@ -8,23 +8,17 @@ from __future__ import annotations
 from collections import Counter
 
 from ..gateway.link import two_clocks
+from ..messages.topics import CLOCK_TOPIC
 from .rclpy_modules import RosNode, steady_timer
 
-__all__ = ["CLOCK_TOPIC", "ClockWatch"]
-
-CLOCK_TOPIC = "/clock"
+__all__ = ["ClockWatch"]
 
 _INTERVAL_S = 1.0
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 
 class ClockWatch:
-    """Warns once of every other node that publishes `/clock`.
-
-    Args:
-        node: a node that publishes `/clock` itself; the caller destroys it.
-        setting: the setting that stops this node from publishing it.
-    """
+    """Warns once of every other node that publishes `/clock`, and says which setting stops this node from it."""
 
     def __init__(self, node: RosNode, setting: str) -> None:
         self._node = node

@@ -4,6 +4,11 @@ Owns the `FMIAdapter`, the limit on catching up, pauses, the stop time and jumps
 ROS parameters and rclpy. All times are in ns of the clock of the node.
 """
 
+# Threads: an FMU is only called by the thread of its `FmuThread`. The executor of rclpy, with any number of threads,
+# submits calls: from its timer, its subscriptions and its services, which answer while the FMU computes. An FMU that
+# does not return cannot be stopped: `close` gives it 5 s, then its files are removed, and the process ends without it
+# (ADR 0031).
+
 from __future__ import annotations
 
 import math
@@ -76,9 +81,6 @@ class FmuDriver:
 
     The time of the FMU is 0.0 at the first update, and stands still between the last update before a pause and
     `resume`.
-
-    Args:
-        settings: how the FMU is driven.
 
     Raises:
         CallRefused: a setting is out of range.
@@ -173,7 +175,10 @@ class FmuDriver:
             elif jumped_back:
                 self._shift = time - self._adapter.simulation_time_ns
         if not self._started:
-            self._begin(time)
+            self._start = time
+            self._steps = 0
+            self._adapter.exit_initialization_mode(Nanoseconds(time))
+            self._started = True
         steps, behind = self._advance(time - self._shift)
         return Update(
             time=self._adapter.simulation_time_ns + self._shift,
@@ -205,12 +210,6 @@ class FmuDriver:
             self._last_step = math.floor(stop_time / adapter.step_size) if exact is None else exact
         return adapter
 
-    def _begin(self, time: int) -> None:
-        self._start = time
-        self._steps = 0
-        self._adapter.exit_initialization_mode(Nanoseconds(time))
-        self._started = True
-
     def _restart(self) -> None:
         """Replace the FMU by a new instance, and set again every variable that was set."""
         self._adapter.close()
@@ -233,7 +232,7 @@ class FmuDriver:
         return self._steps - before, behind
 
 
-class FmuThread:
+class FmuThread(ThreadPoolExecutor):
     """The only thread that calls one FMU, whatever executor the node is in (FMI does not require thread safety).
 
     The services of the node answer while the FMU computes. Call `close` last.
@@ -241,13 +240,11 @@ class FmuThread:
 
     def __init__(self) -> None:
         self._thread: threading.Thread | None = None
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="fmu", initializer=self._keep_thread)
 
-    def submit(
-        self, function: Callable[Parameters, Result], *args: Parameters.args, **kwargs: Parameters.kwargs
-    ) -> Future[Result]:
-        """Call a function on the thread later, after all earlier calls."""
-        return self._pool.submit(function, *args, **kwargs)
+        def keep() -> None:
+            self._thread = threading.current_thread()
+
+        super().__init__(1, thread_name_prefix="fmu", initializer=keep)
 
     def call(
         self, function: Callable[Parameters, Result], *args: Parameters.args, **kwargs: Parameters.kwargs
@@ -274,11 +271,8 @@ class FmuThread:
 
     def close(self) -> bool:
         """Cancel the calls that have not started, and wait up to 5 s; returns whether the thread has ended."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self.shutdown(wait=False, cancel_futures=True)
         if self._thread is None:
             return True
         self._thread.join(_THREAD_END_S)
         return not self._thread.is_alive()
-
-    def _keep_thread(self) -> None:
-        self._thread = threading.current_thread()

@@ -3,6 +3,11 @@
 With the parameter `fmu_path` the node runs an FMU; with `config` it is the gateway of the mesh in that file.
 """
 
+# Threads: the main thread spins the executor and makes the transitions. `autostart` waits for a mesh, so that services
+# answer and Ctrl-C works meanwhile; it only creates a task for the executor. A timer ends the process if an FMU or the
+# middleware does not return at the end. rclpy has a thread for SIGINT, which shuts ROS down while callbacks still use
+# it; from the end on, SIGINT is ours and ends the process at once (ADR 0031).
+
 from __future__ import annotations
 
 import faulthandler
@@ -10,11 +15,14 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 from ...errors import ConfigurationError, FmuError, FmuMeshError, Interrupted
-from .autostart import Autostart
+from ...wire.client.reaching import Meshes
+from ..bags.playing import running_configuration
 from .fmu_node import FmuNode
 from .gateway_node import GatewayNode
 from .node_settings import PARAMETERS
@@ -22,36 +30,23 @@ from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["create_node", "main"]
 
-_END_S = 20.0
-
 NODE_NAME = "fmi_adapter_node"
 
-
-class Managed(Protocol):
-    """The behaviour of a lifecycle node; the methods are its transitions, and raise `FmuMeshError`.
-
-    Attributes:
-        failure: the error with which it failed while it was active, until it is configured again.
-    """
-
-    failure: FmuMeshError | None
-
-    def configure(self) -> None: ...
-
-    def activate(self) -> None: ...
-
-    def deactivate(self) -> None: ...
-
-    def cleanup(self) -> None: ...
-
-    def close(self) -> bool: ...
+_END_S = 20.0
+"""How long the end of the node, and that of ROS, may take."""
+_ATTEMPT_S = 2.0
+"""Deadline of one question to the mesh that autostart waits for."""
+_INTERVAL_S = 0.25
+"""Time between two such questions."""
+_ATTEMPT_END_S = 5.0
+"""How long the end of the process waits for a question on its way."""
 
 
 def create_node(name: str = NODE_NAME, **options: Any) -> RosNode:  # noqa: ANN401 those of rclpy
     """Create a lifecycle node that runs an FMU or is the gateway of a mesh.
 
-    Call `rclpy.init` before it. The attribute `managed` of the node is its `Managed`; call `managed.close()` before
-    `destroy_node()`.
+    Call `rclpy.init` before it. The attribute `managed` of the node does what its transitions ask for; call
+    `managed.close()` before `destroy_node()`.
 
     Args:
         name: of the node.
@@ -80,7 +75,7 @@ def _node_class() -> Any:  # noqa: ANN401, C901 a type of rclpy; a class, not on
             descriptor = ros_module("rcl_interfaces.msg").ParameterDescriptor
             for parameter, (default, description) in PARAMETERS.items():
                 self.declare_parameter(parameter, default, descriptor(description=description))
-            self.managed: Managed = FmuNode(self)
+            self.managed: FmuNode | GatewayNode = FmuNode(self)
 
         def on_configure(self, _state: object) -> object:
             return self._answer(self._configure)
@@ -163,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ConfigurationError.exit_code
     try:
         executor = executors.SingleThreadedExecutor()
-        with Autostart(node, executor):
+        with _Autostart(node, executor):
             rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
@@ -174,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         # A second Ctrl-C ends the process at once, without a traceback.
         signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
-        managed: Managed = node.managed
+        managed: FmuNode | GatewayNode = node.managed
         with _Deadline(f"the node was not closed within {_END_S:g} s", FmuError.exit_code):
             returned = managed.close()
         exit_code = managed.failure.exit_code if managed.failure is not None else 0 if returned else FmuError.exit_code
@@ -189,12 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Deadline:
-    """Ends the process if what is inside takes longer than `_END_S`; says so, and what every thread does.
-
-    Args:
-        what: has not happened then.
-        exit_code: of the process then.
-    """
+    """Ends the process if what is inside takes longer than `_END_S`; says so, and what every thread does."""
 
     def __init__(self, what: str, exit_code: int) -> None:
         self._what = what
@@ -212,3 +202,80 @@ class _Deadline:
         print(f"fmu_mesh.ros.node: {self._what}; the process ends without it", file=sys.stderr)  # noqa: T201 as above
         faulthandler.dump_traceback()
         os._exit(self._exit_code)
+
+
+class _Autostart:
+    """Configures and activates a node if its parameter `autostart` is true.
+
+    The gateway of a mesh waits for the mesh on another thread, so services answer meanwhile and Ctrl-C ends the wait.
+    Use it as a context manager around the spinning of the node.
+    """
+
+    def __init__(self, node: RosNode, executor: Any) -> None:  # noqa: ANN401 a class of rclpy
+        self._node = node
+        self._executor = executor
+        self._log = node.get_logger()
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> None:
+        """Start the node, or begin to wait for the mesh."""
+        if not self._node.get_parameter("autostart").value:
+            return
+        if self._node.get_parameter("config").value and not self._node.get_parameter("fmu_path").value:
+            self._thread = threading.Thread(target=self._wait_and_start, name="autostart", daemon=True)
+            self._thread.start()
+        else:
+            self._start()
+
+    def __exit__(self, *_: object) -> None:
+        """Stop waiting."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join(_ATTEMPT_END_S)
+
+    def _start(self) -> None:
+        done = ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS
+        if self._node.trigger_configure() == done:
+            self._node.trigger_activate()
+
+    def _wait_and_start(self) -> None:
+        """Start the node when all instances of the mesh answer; after the timeout only say so."""
+        config = self._node.get_parameter("config").value
+        timeout_s = self._node.get_parameter("autostart_timeout").value
+        try:
+            mesh = running_configuration(Path(config)).config.mesh
+        except FmuMeshError:
+            self._executor.create_task(self._start)  # `configure` reports what is wrong with the file
+            return
+        deadline = time.monotonic() + timeout_s
+        reported = False
+        while not self._over.is_set():
+            reason = self._absence(mesh)
+            if reason is None:
+                self._executor.create_task(self._start)
+                return
+            if time.monotonic() >= deadline:
+                name = self._node.get_fully_qualified_name()
+                self._log.error(
+                    f"mesh '{mesh}' did not come within {timeout_s:g} s (autostart_timeout): {reason} "
+                    "Once it runs, configure and activate this node: "
+                    f"`ros2 lifecycle set {name} configure`, then `ros2 lifecycle set {name} activate`."
+                )
+                return
+            if not reported:
+                reported = True
+                self._log.info(f"waiting up to {timeout_s:g} s (autostart_timeout) for mesh '{mesh}': {reason}")
+            self._over.wait(_INTERVAL_S)
+
+    def _absence(self, mesh: str) -> str | None:
+        """Why the gateway cannot start yet; None if it can."""
+        endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
+        try:
+            with Meshes(endpoints, _ATTEMPT_S) as meshes:
+                client = meshes.named(mesh)
+                for name in client.info().instances:
+                    client.instance_info(name)
+        except FmuMeshError as error:
+            return str(error)
+        return None

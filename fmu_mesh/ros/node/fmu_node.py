@@ -8,23 +8,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
+from contextlib import ExitStack
 from typing import Any
 
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
 from ...variables.model_description import Value, Variable
 from ..messages.definitions import CLOCK
-from ..messages.topics import Topic
-from .clock_watch import CLOCK_TOPIC, ClockWatch
+from ..messages.topics import CLOCK_TOPIC, Topic
+from .clock_watch import ClockWatch
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
-from .fmu_topics import LOG_INTERVAL_S, FmuTopics
 from .node_settings import RESERVED, PacedTime, read_settings
-from .node_topics import topics_of
+from .node_topics import LOG_INTERVAL_S, FmuTopics, topics_of
 from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, time_message
 from .variable_parameters import (
     declare_parameters,
     names_of,
     parameter_values,
-    undeclare_parameters,
     undeclared,
     value_of,
 )
@@ -40,9 +39,6 @@ class FmuNode:
 
     The methods are the transitions of the node; one thread at a time calls them.
 
-    Args:
-        node: the lifecycle node, with `PARAMETERS` declared.
-
     Attributes:
         failure: the error with which the FMU failed; None again after `configure`.
     """
@@ -54,10 +50,8 @@ class FmuNode:
         self._driver: FmuDriver | None = None
         self._topics: FmuTopics | None = None
         self._variables: dict[str, Variable] = {}
-        self._declared: list[str] = []
         self._clock_publisher: Any = None
-        self._clock_watch: ClockWatch | None = None
-        self._checking: Any = None
+        self._configured = ExitStack()
         self._timer: Any = None
         self._update: Future[Update] | None = None
         self._paced = PacedTime(1.0)
@@ -105,9 +99,6 @@ class FmuNode:
     def cleanup(self) -> None:
         """Close the FMU and its topics, and undeclare its parameters. Never raises."""
         self._stop_timer()
-        if self._checking is not None:
-            self._node.remove_on_set_parameters_callback(self._checking)
-            self._checking = None
         driver, self._driver = self._driver, None
         topics, self._topics = self._topics, None
         if topics is not None:
@@ -120,15 +111,8 @@ class FmuNode:
                 driver.remove_files()
         if topics is not None:
             topics.close_outputs()
-        if self._clock_watch is not None:
-            self._clock_watch.close()
-            self._clock_watch = None
-        if self._clock_publisher is not None:
-            self._node.destroy_publisher(self._clock_publisher)
-            self._clock_publisher = None
-        undeclare_parameters(self._node, self._declared)
-        self._declared = []
-        self._update = None
+        self._configured.close()
+        self._clock_publisher = self._update = None
 
     def close(self) -> bool:
         """Clean up and end the thread of the FMU; returns whether the last call of the FMU has returned."""
@@ -140,7 +124,7 @@ class FmuNode:
     def _configure(self) -> None:
         settings = read_settings(self._node)
         self._paced = PacedTime(settings.real_time_factor)
-        driver = self._driver = self._thread.call(FmuDriver, settings.drive)
+        driver = self._driver = self._thread.call(FmuDriver, settings)
         description = driver.description
         names = names_of(description.variables, settings.names)
         taken = sorted(RESERVED.intersection(names.values()))
@@ -152,17 +136,20 @@ class FmuNode:
         topics = topics_of(description, settings.names, settings.messages, stamped=settings.stamped)
         before = [name for name in names.values() if self._node.has_parameter(name)]
         self._variables = declare_parameters(self._node, description, settings.names)
-        self._declared = [name for name in self._variables if name not in before]
+        for name in self._variables:
+            if name not in before:  # another FMU can declare its own
+                self._configured.callback(self._node.undeclare_parameter, name)
         self._set_values(driver, parameter_values(self._node, self._variables))
         opened = self._topics = FmuTopics(self._node, driver, self._thread, self._now)
         for topic in topics:
             opened.open(topic)
         if settings.publish_clock:
-            self._clock_publisher = self._node.create_publisher(message_class(CLOCK), CLOCK_TOPIC, 10)
-            self._clock_watch = ClockWatch(self._node, "publish_clock: false")
-        self._checking = self._check_parameters
-        self._node.add_on_set_parameters_callback(self._checking)
-        self._report(driver, settings.drive, topics)
+            publisher = self._clock_publisher = self._node.create_publisher(message_class(CLOCK), CLOCK_TOPIC, 10)
+            self._configured.callback(self._node.destroy_publisher, publisher)
+            self._configured.callback(ClockWatch(self._node, "publish_clock: false").close)
+        self._node.add_on_set_parameters_callback(self._check_parameters)
+        self._configured.callback(self._node.remove_on_set_parameters_callback, self._check_parameters)
+        self._report(driver, settings, topics)
 
     def _report(self, driver: FmuDriver, settings: DriveSettings, topics: Sequence[Topic]) -> None:
         """Log what a user may want to know of this FMU."""
@@ -241,7 +228,9 @@ class FmuNode:
     def _check_parameters(self, parameters: Sequence[Any]) -> Any:  # noqa: ANN401 types of rclpy
         """Refuse values that cannot be set now, with the reason; the FMU gets the others before its next step."""
         result = ros_module("rcl_interfaces.msg").SetParametersResult
-        driver, _ = self._live()
+        driver = self._driver
+        if driver is None:  # it is being closed
+            return result(successful=False, reason="the node has no FMU")
         accepted = []
         for parameter in parameters:
             variable = self._variables.get(parameter.name)

@@ -4,6 +4,11 @@
 parameters of the node.
 """
 
+# Threads: `gateway` runs the gateway and publishes; Zenoh calls its callbacks. The executor of rclpy makes the
+# transitions, looks four times a second whether the gateway has ended, takes messages, and sets parameters, for which
+# it waits for the mesh. The exit stacks undo what a transition did in the order in which the threads need it: first no
+# more looks, then the end of the thread, then the subscribers and the publishers that it used (ADR 0030, 0031).
+
 from __future__ import annotations
 
 import threading
@@ -34,21 +39,16 @@ _INTERVAL_S = 0.25
 
 
 class RclpyProfile:
-    """A profile whose topics are those of a node of rclpy, which takes and returns messages as CDR bytes.
-
-    Args:
-        node: the node; the caller destroys it.
-    """
+    """A profile whose topics are those of a node of rclpy, which takes and returns messages as CDR bytes."""
 
     def __init__(self, node: RosNode) -> None:
         self._node = node
-        self._publishers: list[Any] = []
-        self._subscriptions: list[Any] = []
+        self._entities = ExitStack()
 
     def publish(self, topic: Topic) -> Put:
         """Create a publisher of ``topic``."""
         publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
-        self._publishers.append(publisher)
+        self._entities.callback(self._node.destroy_publisher, publisher)
 
         def put(data: bytes, _time: float) -> None:
             try:
@@ -63,22 +63,16 @@ class RclpyProfile:
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Create a subscription of ``topic``."""
         kind = message_class(topic.message)
-        self._subscriptions.append(self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True))
+        subscription = self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True)
+        self._entities.callback(self._node.destroy_subscription, subscription)
 
     def close(self) -> None:
         """Destroy everything."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        for publisher in self._publishers:
-            self._node.destroy_publisher(publisher)
-        self._subscriptions, self._publishers = [], []
+        self._entities.close()
 
 
 class GatewayNode:
     """The behaviour of a lifecycle node that is the gateway of a running mesh.
-
-    Args:
-        node: the lifecycle node, with the parameters `config` and `connect` declared.
 
     Attributes:
         failure: always None; the end of a mesh is not a failure of its gateway.
@@ -89,7 +83,7 @@ class GatewayNode:
     def __init__(self, node: RosNode) -> None:
         self._node = node
         self._log = node.get_logger()
-        self._stack = ExitStack()
+        self._configured = ExitStack()
         self._client: MeshClient | None = None
         self._plan: RosPlan | None = None
         self._targets: dict[str, Target] = {}
@@ -102,11 +96,22 @@ class GatewayNode:
         Raises:
             FmuMeshError: something is wrong; everything that was done is undone.
         """
-        try:
-            self._configure()
-        except BaseException:
-            self.cleanup()
-            raise
+        loaded = running_configuration(Path(self._node.get_parameter("config").value))
+        if loaded.config.ros is None:
+            loaded = replace(loaded, config=replace(loaded.config, ros=RosConfig()))
+        endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
+        with ExitStack() as stack:
+            client = stack.enter_context(Meshes(endpoints, _TIMEOUT_S)).named(loaded.config.mesh)
+            info = client.info()
+            infos = {name: client.instance_info(name) for name in info.instances}
+            findings = loaded.findings()
+            plan = resolve(loaded, descriptions_of(infos), findings)
+            findings.raise_any()
+            assert plan is not None  # there is a section, or a finding
+            self._declare_parameters(client, plan, stack)
+            self._client, self._plan, self._run = client, plan, info.run
+            self._configured = stack.pop_all()
+        self._log.info(f"gateway of mesh '{loaded.config.mesh}' with {len(plan.topics)} topics")
 
     def activate(self) -> None:
         """Open the topics and carry their samples.
@@ -114,45 +119,6 @@ class GatewayNode:
         Raises:
             FmuMeshError: a topic cannot be opened, or the mesh has ended; everything that was done is undone.
         """
-        try:
-            self._activate()
-        except BaseException:
-            self.deactivate()
-            raise
-
-    def deactivate(self) -> None:
-        """Close the topics; samples that have arrived from the mesh are published before."""
-        self._active.close()
-
-    def cleanup(self) -> None:
-        """Disconnect from the mesh and undeclare its parameters. Never raises."""
-        self.deactivate()
-        self._stack.close()
-        self._client, self._plan, self._targets = None, None, {}
-
-    def close(self) -> bool:
-        """Clean up; returns True, because nothing is left running."""
-        self.cleanup()
-        return True
-
-    def _configure(self) -> None:
-        loaded = running_configuration(Path(self._node.get_parameter("config").value))
-        if loaded.config.ros is None:
-            loaded = replace(loaded, config=replace(loaded.config, ros=RosConfig()))
-        endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
-        meshes = self._stack.enter_context(Meshes(endpoints, _TIMEOUT_S))
-        client = self._client = meshes.named(loaded.config.mesh)
-        info = client.info()
-        self._run = info.run
-        infos = {name: client.instance_info(name) for name in info.instances}
-        findings = loaded.findings()
-        plan = self._plan = resolve(loaded, descriptions_of(infos), findings)
-        findings.raise_any()
-        if plan is not None:
-            self._declare_parameters(client, plan)
-        self._log.info(f"gateway of mesh '{loaded.config.mesh}' with {len(plan.topics) if plan else 0} topics")
-
-    def _activate(self) -> None:
         client, plan = self._client, self._plan
         if client is None or plan is None:
             raise ConfigurationError("the gateway has no mesh yet.", hint="Configure it first.")
@@ -162,23 +128,40 @@ class GatewayNode:
                 f"the run of mesh '{client.keys.mesh}' for which this node was configured has ended",
                 hint="Clean the node up, and configure it again when the mesh runs.",
             )
-        profile = RclpyProfile(self._node)
-        self._active.callback(profile.close)
-        names = {topic.profile for topic in plan.topics} or {"ros2dds"}
-        profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
-        gateway = Gateway(plan, client.session, client.keys, grid_of(info), profiles)
-        self._active.callback(gateway.close)
-        gateway.open(_TIMEOUT_S)
-        thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
-        thread.start()
-        self._active.callback(thread.join, _TIMEOUT_S)
-        self._active.callback(gateway.end)
-        timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread))
-        self._active.callback(self._node.destroy_timer, timer)
-        if plan.clock_points is not None:
-            self._active.callback(ClockWatch(self._node, "`clock_rate: null` in the section `ros`").close)
+        with ExitStack() as stack:
+            profile = RclpyProfile(self._node)
+            stack.callback(profile.close)
+            names = {topic.profile for topic in plan.topics} or {"ros2dds"}
+            profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
+            gateway = Gateway(plan, client.session, client.keys, grid_of(info), profiles)
+            stack.callback(gateway.close)
+            gateway.open(_TIMEOUT_S)
+            thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
+            thread.start()
+            stack.callback(thread.join, _TIMEOUT_S)
+            stack.callback(gateway.end)
+            timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread))
+            stack.callback(self._node.destroy_timer, timer)
+            if plan.clock_points is not None:
+                stack.callback(ClockWatch(self._node, "`clock_rate: null` in the section `ros`").close)
+            self._active = stack.pop_all()
 
-    def _declare_parameters(self, client: MeshClient, plan: RosPlan) -> None:
+    def deactivate(self) -> None:
+        """Close the topics; samples that have arrived from the mesh are published before."""
+        self._active.close()
+
+    def cleanup(self) -> None:
+        """Disconnect from the mesh and undeclare its parameters. Never raises."""
+        self.deactivate()
+        self._configured.close()
+        self._client, self._plan, self._targets = None, None, {}
+
+    def close(self) -> bool:
+        """Clean up; returns True, because nothing is left running."""
+        self.cleanup()
+        return True
+
+    def _declare_parameters(self, client: MeshClient, plan: RosPlan, stack: ExitStack) -> None:
         """Declare the parameters of the mesh as parameters of the node, with their current values."""
         references = {
             parameter.name: f"{parameter.instance}.{parameter.variable.name}" for parameter in plan.parameters
@@ -194,9 +177,9 @@ class GatewayNode:
             self._node.declare_parameter(
                 name, values.get(target.key), descriptor(description=about, dynamic_typing=True)
             )
-            self._stack.callback(self._node.undeclare_parameter, name)
+            stack.callback(self._node.undeclare_parameter, name)
         self._node.add_on_set_parameters_callback(self._set_parameters)
-        self._stack.callback(self._node.remove_on_set_parameters_callback, self._set_parameters)
+        stack.callback(self._node.remove_on_set_parameters_callback, self._set_parameters)
 
     def _set_parameters(self, parameters: Sequence[Any]) -> Any:  # noqa: ANN401 types of rclpy
         """Set tunable parameters of the mesh; if the mesh refuses a value, answer with its reason."""

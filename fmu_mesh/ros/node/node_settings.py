@@ -7,8 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from ...errors import ConfigurationError
 from .driving import DriveSettings
 from .node_topics import own_names
@@ -38,11 +36,10 @@ RESERVED = frozenset({*PARAMETERS, "use_sim_time", "start_type_description_servi
 """Names of the parameters that every node has, which a variable of an FMU cannot have."""
 
 
-class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
+class NodeSettings(DriveSettings, frozen=True, kw_only=True):
     """The checked parameters of a node that runs an FMU.
 
     Attributes:
-        drive: how the FMU is driven.
         update_period: period of the timer in s.
         stamped: whether numeric variables have a second topic with a header.
         names: ROS names by variable, for variables whose usual name cannot be used.
@@ -51,7 +48,6 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
         real_time_factor: simulated over wall-clock time.
     """
 
-    drive: DriveSettings
     update_period: float
     stamped: bool
     names: dict[str, str]
@@ -80,12 +76,10 @@ def read_settings(node: RosNode) -> NodeSettings:
             "this node cannot publish /clock and run by it.", hint="Set either publish_clock or use_sim_time."
         )
     return NodeSettings(
-        drive=DriveSettings(
-            fmu_path=Path(value["fmu_path"]),
-            step_size=value["step_size"] or None,
-            stop_time=value["stop_time"] or None,
-            max_steps=value["max_steps"],
-        ),
+        fmu_path=Path(value["fmu_path"]),
+        step_size=value["step_size"] or None,
+        stop_time=value["stop_time"] or None,
+        max_steps=value["max_steps"],
         update_period=value["update_period"],
         stamped=value["stamped"],
         names=own_names(filter(None, value["names"])),
@@ -96,11 +90,7 @@ def read_settings(node: RosNode) -> NodeSettings:
 
 
 class PacedTime:
-    """Simulated time that starts at 0 and runs at a multiple of wall-clock time; it starts paused.
-
-    Args:
-        factor: simulated over wall-clock time.
-    """
+    """Simulated time that starts at 0 and runs at a multiple of wall-clock time; it starts paused."""
 
     def __init__(self, factor: float) -> None:
         self._factor = factor

@@ -4,9 +4,14 @@ Owns the parameters `names`, `messages` and `stamped` of the node. Knows nothing
 messages are objects of the user's own ROS, with the default values that ROS gives their fields.
 """
 
+# Threads: rclpy calls `arrived` on threads of its executor. Messages go through the queue of the `FmuThread`, which
+# takes inputs and publishes outputs; `_count` is the lock for the number of those that wait, because a queue without
+# a limit would take all memory while an FMU hangs (ADR 0031).
+
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -16,7 +21,7 @@ import numpy as np
 
 from ...config.findings import Findings
 from ...config.yaml_text import Plain, read
-from ...errors import ConfigurationError
+from ...errors import CallRefused, ConfigurationError
 from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import flattened, nested
@@ -25,10 +30,11 @@ from ..messages.fitting import default_type
 from ..messages.ros_names import topic_problem
 from ..messages.stamp import in_nanoseconds
 from ..messages.topics import Port, Topic
-from .rclpy_modules import message_class, time_message
+from .driving import FmuDriver, FmuThread, Update
+from .rclpy_modules import RosNode, message_class, ros_module, time_message
 from .variable_parameters import names_of
 
-__all__ = ["fill", "message_time", "own_names", "topics_of", "values_in"]
+__all__ = ["LOG_INTERVAL_S", "FmuTopics", "fill", "message_time", "own_names", "topics_of", "values_in"]
 
 STAMPED = "geometry_msgs/msg/PointStamped"
 """The smallest message type in every ROS that has a header and a float64."""
@@ -39,6 +45,11 @@ _SEQUENCE = re.compile(r"sequence<(?P<element>.*?)(, (?P<bound>\d+))?>")
 
 _EMPTY: Mapping[str, str | bytes | bool] = {"string": "", "wstring": "", "boolean": False, "octet": b"\0"}
 """The value of a new element of a sequence, by type; a number is 0."""
+LOG_INTERVAL_S = 10.0
+"""Time in s between two equal messages in the log."""
+
+_DEPTH = 1000
+_MAX_WAITING = 10_000
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -99,15 +110,9 @@ def topics_of(
 
 
 def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> None:  # noqa: ANN401 a ROS message
-    """Set the fields of a message to the values of their variables, and the stamp of its headers.
+    """Set the fields of a message to the values of their variables, and the stamp of its headers to ``time`` in ns.
 
     Sequences are made as long as the paths need them.
-
-    Args:
-        topic: the topic.
-        message: a new message of the type of the topic.
-        values: by variable.
-        time: the stamp, in ns.
     """
     _set_stamp(message, time)
     for port in topic.ports:
@@ -227,11 +232,6 @@ def _place(message: Any, path: str, passed: Callable[[Any], None] = lambda _owne
 
     Sequences on the way are made as long as the path needs them.
 
-    Args:
-        message: a ROS message.
-        path: such as `poses[0].position.x`.
-        passed: called with every message on the way that is an element of an array.
-
     Raises:
         AttributeError: there is no such field.
         IndexError: an array cannot have so many elements; its text is the largest number of elements.
@@ -269,3 +269,107 @@ def _lengthen(owner: Any, name: str, length: int) -> None:  # noqa: ANN401 a ROS
 def _set_stamp(message: Any, time: int) -> None:  # noqa: ANN401 a ROS message
     if hasattr(message, "header"):
         message.header.stamp = time_message(time)
+
+
+class FmuTopics:
+    """Publishes the outputs of an FMU, and takes its inputs.
+
+    While the node is inactive, only the last message of each topic is kept, for `start`.
+    """
+
+    def __init__(self, node: RosNode, driver: FmuDriver, thread: FmuThread, now: Callable[[], int]) -> None:
+        self._node = node
+        self._log = node.get_logger()
+        self._driver = driver
+        self._thread = thread
+        self._now = now
+        self._publishers: list[tuple[Topic, Any, Any]] = []
+        self._subscriptions: list[Any] = []
+        self._held: dict[str, tuple[Topic, Any, int]] = {}
+        self._started = False
+        self._closed = False
+        self._waiting = 0
+        self._count = threading.Lock()
+
+    @property
+    def outputs(self) -> Sequence[str]:
+        """The variables that are published."""
+        return [port.variable.name for topic, _, _ in self._publishers for port in topic.ports]
+
+    def open(self, topic: Topic) -> None:
+        """Create the publisher or the subscription of a topic.
+
+        Raises:
+            ConfigurationError: ROS has no such message type.
+        """
+        kind = message_class(topic.message)
+        overrides = ros_module("rclpy.qos_overriding_options").QoSOverridingOptions.with_default_policies()
+        if topic.direction == "out":
+            publisher = self._node.create_publisher(kind, topic.name, _DEPTH, qos_overriding_options=overrides)
+            self._publishers.append((topic, publisher, kind))
+            return
+
+        def arrived(message: Any) -> None:  # noqa: ANN401 a ROS message
+            self._arrived(topic, message)
+
+        self._subscriptions.append(
+            self._node.create_subscription(kind, topic.name, arrived, _DEPTH, qos_overriding_options=overrides)
+        )
+
+    def start(self) -> None:
+        """Give the FMU the messages that were kept, and from now on every message."""
+        for topic, message, arrived in self._held.values():
+            self._thread.call(self._take, topic, message, arrived)
+        self._held.clear()
+        self._started = True
+
+    def stop(self) -> None:
+        """From now on only keep the last message of each topic."""
+        self._started = False
+
+    def publish(self, update: Update) -> None:
+        """Publish the outputs of an update; called on the thread of the FMU."""
+        for topic, publisher, kind in self._publishers:
+            message = kind()
+            fill(topic, message, update.values, update.time)
+            publisher.publish(message)
+
+    def close_inputs(self) -> None:
+        """Destroy the subscriptions and drop the messages that wait; before the FMU is closed."""
+        self._closed = True
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+
+    def close_outputs(self) -> None:
+        """Destroy the publishers; after the FMU is closed, because its thread publishes."""
+        for _, publisher, _ in self._publishers:
+            self._node.destroy_publisher(publisher)
+
+    def _arrived(self, topic: Topic, message: Any) -> None:  # noqa: ANN401 a ROS message
+        arrived = self._now()
+        if not self._started:
+            self._held[topic.name] = (topic, message, arrived)
+            return
+        with self._count:
+            full = self._waiting >= _MAX_WAITING
+            self._waiting += not full
+        if full:
+            self._log.error(
+                f"{_MAX_WAITING} messages wait for the FMU; one on '{topic.name}' is lost",
+                throttle_duration_sec=LOG_INTERVAL_S,
+            )
+            return
+        self._thread.submit(self._take, topic, message, arrived, waited=1)
+
+    # --- on the thread of the FMU
+
+    def _take(self, topic: Topic, message: Any, arrived: int, waited: int = 0) -> None:  # noqa: ANN401 a ROS message
+        with self._count:
+            self._waiting -= waited
+        if self._closed:
+            return
+        try:
+            for variable, value in values_in(topic, message).items():
+                self._driver.set_input(variable, message_time(message, arrived), value)
+        except (CallRefused, IndexError) as error:
+            self._log.error(f"a message on '{topic.name}' was left out: {error}", throttle_duration_sec=LOG_INTERVAL_S)

@@ -14,7 +14,7 @@ from ...errors import CallRefused, ConfigurationError
 from ...text import nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import nested
-from ..messages.ros_names import NameProblem, name_problems, ros_name
+from ..messages.ros_names import collision, name_problems, ros_name
 from .rclpy_modules import RosNode, ros_module
 
 __all__ = [
@@ -22,7 +22,6 @@ __all__ = [
     "initialize_from_parameters",
     "names_of",
     "parameter_values",
-    "undeclare_parameters",
     "undeclared",
     "value_of",
 ]
@@ -44,7 +43,7 @@ def names_of(variables: Sequence[Variable], names: Mapping[str, str] | None = No
             problems.append(f"'{chosen}', the name given to '{name}', is no ROS name")
         sharing = [other for other, taken in result.items() if taken == chosen]
         if len(sharing) > 1 and sharing[0] == name:
-            problems.append(str(NameProblem(chosen, tuple(sharing), "collision")))
+            problems.append(str(collision(chosen, sharing)))
     if problems:
         raise ConfigurationError(
             f"the FMU's variables cannot be named in ROS: {'; '.join(problems)}.",
@@ -99,12 +98,6 @@ def undeclared(node: RosNode) -> dict[str, str | None]:
     overrides = node._parameter_overrides  # noqa: SLF001 rclpy has no public way to read them
     names = [name for name in overrides if not node.has_parameter(name)]
     return {name: nearest(name, there) for name in names if not name.startswith("qos_overrides.")}
-
-
-def undeclare_parameters(node: RosNode, names: Sequence[str]) -> None:
-    """Undeclare parameters, so that another FMU can declare its own."""
-    for name in names:
-        node.undeclare_parameter(name)
 
 
 def parameter_values(node: RosNode, variables: Mapping[str, Variable]) -> dict[str, Value]:
