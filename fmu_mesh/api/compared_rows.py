@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.recording import Columns
+from ..results.recording import Columns
 from ..variables.units import BaseUnit, Linear, conversion
 from .comparison import Comparison, FirstDifference, Rows, VariableDifference
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config.plain_values import plain
-from ..recorder.arrays_file import ENDING
+from ..results.arrays_file import ENDING
 from ..run.run_plan import RunPlan
 from ..wire.runtime import run_name, runtime_folder
 

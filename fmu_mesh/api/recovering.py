@@ -7,7 +7,7 @@ from pathlib import Path
 from ..config.call_options import checked
 from ..errors import ConfigurationError
 from ..files import Kept, is_file, open_alone
-from ..system.recording import reading, result_format
+from ..results.recording import reading, result_format
 from ..text import nearest_file
 
 __all__ = ["recover"]

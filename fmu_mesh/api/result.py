@@ -20,11 +20,12 @@ from ..instances.python.unit_names import base_unit_of
 from ..pictures.drawing import thinned
 from ..pictures.result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
 from ..pictures.tables import html_table
-from ..recorder.csv_file import CsvFile
-from ..recorder.parquet_file import ParquetFile
+from ..results.csv_file import CsvFile
+from ..results.parquet_file import ParquetFile
+from ..results.recording import ResultFile, joined
+from ..results.result_reading import Columns, chosen_names, of_one_instance, read_result, result_pieces
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
-from ..system.recording import ResultFile, joined
 from ..system.run_metadata import machine_difference
 from ..system.system import ResolvedSystem
 from ..text import listed, short_path
@@ -33,7 +34,6 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import DTYPES, VariableType, is_float
 from .compared_rows import Side, compared, differences_of, values_in_unit_of
 from .comparison import Comparison
-from .result_reading import Columns, chosen_names, of_one_instance, read_result, result_pieces
 
 if TYPE_CHECKING:
     import pandas as pd

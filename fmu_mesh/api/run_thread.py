@@ -18,7 +18,8 @@ from msgspec.structs import replace
 
 from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
 from ..printing import paragraph
-from ..recorder.arrays_file import bytes_of_a_row, read_arrays
+from ..results.arrays_file import bytes_of_a_row, read_arrays
+from ..results.result_reading import Columns
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.launcher import Launcher
 from ..run.options import StartOptions
@@ -28,7 +29,6 @@ from ..simtime import ENDLESS
 from ..wire.views import MeshStatus
 from .plan_options import memory_of
 from .result import Result, result_of, types_of
-from .result_reading import Columns
 
 if TYPE_CHECKING:
     from ..run.in_process import InProcessRun

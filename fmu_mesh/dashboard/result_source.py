@@ -12,8 +12,8 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.recording import result_format
-from .csv_tail import CsvTail
+from ..results.csv_tail import CsvTail
+from ..results.recording import result_format
 from .curve import BoundedCurve
 
 __all__ = ["ResultSource"]
@@ -68,7 +68,7 @@ def open_tail(path: Path) -> Tail | None:
     if path.suffix == ".csv":
         return CsvTail.open(path)
     try:
-        from .parquet_tail import ParquetTail  # noqa: PLC0415  pyarrow is optional
+        from ..results.parquet_tail import ParquetTail  # noqa: PLC0415  pyarrow is optional
     except ImportError:
         return None
     found = result_format(path) if path.suffix == ".parquet" else None

@@ -19,9 +19,11 @@ import zenoh
 from msgspec import to_builtins
 
 from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
+from ..results.growth import GrowthWatch, ReadColumn
+from ..results.record_files import RecordFiles
+from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Link, NodePlan
-from ..system.recording import ResultFile
 from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
@@ -40,8 +42,6 @@ from ..wire.messages import (
     SetValue,
     decode_json,
 )
-from .growth import GrowthWatch, ReadColumn
-from .record_files import RecordFiles
 
 __all__ = ["RecordedSource", "Recorder"]
 

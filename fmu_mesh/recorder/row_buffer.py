@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..results.growth import GrowthWatch, ReadColumn
+from ..results.record_files import RecordFiles
+from ..results.recording import ResultFile
 from ..simtime import TimeGrid
-from ..system.recording import ResultFile
 from ..system.records import RecordPlan, union_of
 from ..variables.value_types import DTYPES, Value, VariableType
-from .growth import GrowthWatch, ReadColumn
-from .record_files import RecordFiles
 
 __all__ = ["RowBuffer"]
 

@@ -13,7 +13,7 @@ from ..config.call_options import option_fields
 from ..config.findings import Findings
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
-from ..recorder.arrays_file import ENDING
+from ..results.arrays_file import ENDING
 from ..text import listed, nearest, option_text
 from .options import PlanOptions
 

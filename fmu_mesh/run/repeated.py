@@ -32,11 +32,11 @@ from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
 from ..node.stepping import Position, Runner
-from ..recorder.growth import GrowthWatch
+from ..results.growth import GrowthWatch
+from ..results.recording import ResultFile
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..system.plan import Plan, make_plan
-from ..system.recording import ResultFile
 from .local_system import opening_of
 from .one_process import OneProcess
 from .outcome import Outcome

@@ -21,8 +21,9 @@ from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
 from ..master.master import Master, MasterSettings
 from ..node.node import Node
-from ..recorder.growth import GrowthWatch
 from ..recorder.recorder import Recorder
+from ..results.growth import GrowthWatch
+from ..results.result_files import open_results
 from ..system.plan import MASTER, RECORDER
 from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
@@ -32,7 +33,6 @@ from .child import is_other_python
 from .events import Event, Log, Reachable, Status
 from .outcome import Outcome
 from .process import RunProcess
-from .results import open_results
 from .run_plan import MANUAL, NodeRun, RunPlan
 from .wiring import patient, wiring
 

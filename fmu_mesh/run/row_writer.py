@@ -10,13 +10,13 @@ import time
 from collections.abc import Mapping
 
 from ..node.stepping import Runner
-from ..recorder.growth import GrowthWatch
-from ..recorder.record_files import RecordFiles
 from ..recorder.recorder import RecordedSource
+from ..results.growth import GrowthWatch
+from ..results.record_files import RecordFiles
+from ..results.recording import ResultFile
+from ..results.result_files import what_is_kept
 from ..system.plan import RECORDER, Plan
-from ..system.recording import ResultFile
 from ..wire.frames import SourceRows
-from .results import what_is_kept
 
 __all__ = ["RowWriter"]
 

@@ -1,6 +1,6 @@
 """Which variables each result file has, and at which points: names and patterns of the section `record`.
 
-Owns `RecordPlan` and the meaning of patterns. Formats are `fmu_mesh.system.recording`.
+Owns `RecordPlan` and the meaning of patterns. Formats are `fmu_mesh.results.recording`.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
 from ..errors import ConfigurationError
 from ..files import archive_on_the_way
+from ..results.recording import Recording, has_unknown_ending, is_in_memory, result_endings, result_format
 from ..simtime import TimeGrid, steps_between
 from ..text import EXPRESSION, is_pattern, listed, matched, nearest, short_number, shown
 from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
-from .recording import Recording, has_unknown_ending, is_in_memory, result_endings, result_format
 
 __all__ = ["RecordPlan", "record_paths", "record_warnings", "resolve_records", "union_of"]
 

@@ -15,8 +15,8 @@ import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.dashboard.result_source import open_tail
 from fmu_mesh.errors import ConfigurationError, Finding, FmuMeshError
-from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.ros.bags.bag import Bag
 from fmu_mesh.ros.bags.mcap_file import McapFile
 from fmu_mesh.sweeps.sweep_folder import SweepFolder

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.arrays_file import ArraysFile, read_arrays
+from fmu_mesh.results.arrays_file import ArraysFile, read_arrays
 from fmu_mesh.variables.value_types import VariableType
 
 TYPES: list[VariableType] = ["Float64", "Boolean", "String"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmu_mesh.dashboard.csv_tail import CsvTail
+from fmu_mesh.results.csv_tail import CsvTail
 
 HEADING = b'time,a.x,"a.der(x,2)",a.flag\n'
 

@@ -14,11 +14,11 @@ from fmu_mesh import plugins
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.parquet_file import ParquetFile
+from fmu_mesh.results.recording import ResultFile, ResultFormat, result_endings, result_format
+from fmu_mesh.results.result_files import rows_left
 from fmu_mesh.ros.bags.mcap_file import McapFile
-from fmu_mesh.run.results import rows_left
-from fmu_mesh.system.recording import ResultFile, ResultFormat, result_endings, result_format
 from tests.helpers import write_config
 
 Offer = Callable[..., None]
@@ -60,7 +60,7 @@ def test_the_ending_of_its_name_chooses_the_format_of_a_result_file(name: str, e
 
 
 def test_a_format_of_another_package_is_found_by_its_ending(offer: Offer) -> None:
-    offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
+    offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
 
     assert result_format("a.table") is CsvFile
     assert result_endings() == [".csv", ".mcap", ".parquet", ".table"]
@@ -80,7 +80,7 @@ def test_only_our_own_entry_points_are_read_for_a_format_of_ours(monkeypatch: py
 def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], offer: Offer
 ) -> None:
-    offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
+    offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
     config = write_config(tmp_path, record={"file": "pair.feather"})
 
     codes = main(["check", str(config)]), main(["launch", str(config), "--output", "pair.json"])
@@ -93,8 +93,8 @@ def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
 
 
 def test_two_packages_with_one_ending_are_both_named(offer: Offer) -> None:
-    offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
-    offer("more-tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
+    offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
+    offer("more-tables", "table", "fmu_mesh.results.csv_file:CsvFile")
 
     with pytest.raises(ConfigurationError, match=r"the packages 'more-tables', 'tables' both offer 'table'"):
         result_format("a.table")

@@ -13,9 +13,9 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig, read_text
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data, parse
+from fmu_mesh.results.recording import result_endings
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.overriding import with_options
-from fmu_mesh.system.recording import result_endings
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription, Variable

@@ -24,15 +24,15 @@ from pyarrow import parquet
 import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.dashboard.parquet_tail import ParquetTail
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.instances.configuration import parse
-from fmu_mesh.recorder import parquet_file, parquet_groups
-from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results import parquet_file, parquet_groups
+from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.parquet_file import ParquetFile
+from fmu_mesh.results.parquet_tail import ParquetTail
+from fmu_mesh.results.recording import Recording, ResultFile, ResultFormat, with_notes
 from fmu_mesh.ros.bags.mcap_file import McapFile
-from fmu_mesh.system.recording import Recording, ResultFile, ResultFormat, with_notes
 from fmu_mesh.system.schedule import SeriesFile
 from fmu_mesh.system.series_files import columns_of, content_of, read_series
 from fmu_mesh.variables.model_description import ModelDescription, Variable
@@ -494,8 +494,8 @@ import os, sys
 from pathlib import Path
 import pyarrow.parquet
 from fmu_mesh import Result
-from fmu_mesh.dashboard.parquet_tail import ParquetTail
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results.parquet_tail import ParquetTail
+from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.system.series_files import SeriesFile, content_of, read_series
 from fmu_mesh.variables.model_description import Variable
 

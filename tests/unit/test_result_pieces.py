@@ -15,11 +15,11 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 import fmu_mesh
-from fmu_mesh.api import result_reading
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.pictures import drawing
-from fmu_mesh.recorder.csv_file import NativeLines, python_lines
+from fmu_mesh.results import result_reading
+from fmu_mesh.results.csv_file import NativeLines, python_lines
+from fmu_mesh.results.result_reading import Columns
 
 TEXTS = ["one, two", 'a "b"', "line\nbreak", "", "plain", "é"]
 NUMBERS = [0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1.7976931348623157e308, 1 / 3, 0.1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.files import Kept, open_alone
-from fmu_mesh.system.recording import Recording
+from fmu_mesh.results.recording import Recording
 
 _BUFFER_BYTES = 1 << 16
 

@@ -19,7 +19,7 @@ from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
 from ...installing import importing
-from ...system.recording import reading
+from ...results.recording import reading
 from ...text import listed, nearest, nearest_file
 from ...variables.model_description import ModelDescription, Value
 from ...variables.value_types import nested

@@ -21,7 +21,7 @@ from ...config.findings import Findings
 from ...config.mesh import RosConfig
 from ...files import Kept, open_alone
 from ...installing import importing
-from ...system.recording import Columns, Recording
+from ...results.recording import Columns, Recording
 from ...variables.model_description import ModelDescription
 from ..gateway.mapping import message_types
 from ..gateway.resolver import Resolver

@@ -11,8 +11,8 @@ from mcap.records import Channel, McapRecord, Message, Schema
 from numpy.typing import NDArray
 
 from ...files import opened
+from ...results.recording import Columns
 from ...simtime import ENDLESS, TimeGrid
-from ...system.recording import Columns
 from ...variables.value_types import DTYPES, VariableType, is_text
 from ..messages.cdr import Codec
 from ..messages.definitions import Basic, MessageTypes, path_parts

@@ -39,7 +39,7 @@ from mcap.stream_reader import breakup_chunk
 
 from ...errors import ConfigurationError
 from ...files import Kept, decoded_json
-from ...system.recording import metadata_in, with_notes
+from ...results.recording import metadata_in, with_notes
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap
 
 __all__ = ["McapContent", "finish_mcap"]

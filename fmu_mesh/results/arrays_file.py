@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files import Kept
-from ..system.recording import Recording
+from .recording import Recording
 from ..variables.value_types import DTYPES, VariableType, is_text
 from .block_file import BlockFile
 

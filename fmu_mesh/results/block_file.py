@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..files import Kept, open_alone
-from ..system.recording import Recording
+from .recording import Recording
 
 __all__ = ["BlockFile"]
 

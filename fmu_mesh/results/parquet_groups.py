@@ -13,7 +13,7 @@ import msgspec
 
 from ..files import replaced
 from ..system.arrow import parquet_module, pyarrow_module
-from ..system.recording import metadata_in, with_notes
+from .recording import metadata_in, with_notes
 
 __all__ = ["KEY", "GroupWriter", "decoded"]
 

@@ -30,7 +30,7 @@ from ..config.findings import Findings
 from ..errors import ConfigurationError
 from ..files import Kept, decoded_json, exists, is_file, open_alone, opened
 from ..system.arrow import DIMENSIONS, elements_of, open_parquet, parquet_batches, parquet_module, pyarrow_module
-from ..system.recording import Columns, Recording, joined, with_notes
+from .recording import Columns, Recording, joined, with_notes
 from ..variables.model_description import Variable
 from ..variables.value_types import DTYPES, VariableType, element_name
 from .parquet_groups import KEY, GroupWriter, decoded

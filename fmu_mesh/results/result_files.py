@@ -1,6 +1,6 @@
 """The result files of a run: opened in their formats, counted after their writer was killed.
 
-Knows no format: `fmu_mesh.system.recording` finds the format by the name of the file.
+Knows no format: `fmu_mesh.results.recording` finds the format by the name of the file.
 
 A run in processes keeps a note for each file in its folder: how many rows the operating system has. The note is written
 before the first row. So while it is empty, the result file is not that of this run.
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, open_alone
-from ..recorder.arrays_file import ENDING
-from ..system.recording import Recording, ResultFile, ResultFormat, reading, result_format
+from .arrays_file import ENDING
+from .recording import Recording, ResultFile, ResultFormat, reading, result_format
 from ..system.records import record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem

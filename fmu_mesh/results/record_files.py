@@ -10,7 +10,7 @@ from typing import Any
 
 from ..files import unwritable
 from ..simtime import TimeGrid
-from ..system.recording import ResultFile
+from .recording import ResultFile
 from ..system.records import RecordPlan
 from .growth import GrowthWatch, ReadColumn
 

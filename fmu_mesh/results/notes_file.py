@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from ..files import opened, replaced
-from ..system.recording import metadata_in
+from .recording import metadata_in
 
 __all__ = ["NotesFile", "read_notes"]
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigurationError
 from ..files import opened
-from ..recorder.csv_file import CsvFile
-from ..recorder.notes_file import read_notes
-from ..system.recording import Columns, PiecewiseFormat, ReadableFormat, joined, reading, result_format
+from .csv_file import CsvFile
+from .notes_file import read_notes
+from .recording import Columns, PiecewiseFormat, ReadableFormat, joined, reading, result_format
 from ..text import listed, matching, nearest
 from ..variables.value_types import DTYPES, VariableType, is_float
 

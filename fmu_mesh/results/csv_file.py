@@ -26,7 +26,7 @@ from ..config.findings import Findings
 from ..errors import ConfigurationError
 from ..files import Kept, exists, is_file
 from ..rings.library import load_library
-from ..system.recording import Recording
+from .recording import Recording
 from ..variables.value_types import VariableType, is_text
 from .block_file import BlockFile
 from .notes_file import NotesFile
