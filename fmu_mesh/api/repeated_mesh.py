@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from ..config.call_options import takes
 from ..errors import CallRefused, FmuError, FmuMeshError
 from ..files import Kept, remove_tree
-from ..results.result_files import open_result
-from ..results.result_reading import Columns
+from ..results.record_files import open_result
+from ..results.recording import Columns
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.repeated import RepeatedRuns

@@ -20,10 +20,11 @@ from ..instances.python.unit_names import base_unit_of
 from ..pictures.drawing import thinned
 from ..pictures.result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
 from ..pictures.tables import html_table
+from ..results.column_names import chosen_names, of_one_instance
 from ..results.csv_file import CsvFile
+from ..results.formats import read_result, result_pieces
 from ..results.parquet_file import ParquetFile
-from ..results.recording import ResultFile, joined
-from ..results.result_reading import Columns, chosen_names, of_one_instance, read_result, result_pieces
+from ..results.recording import Columns, ResultFile, joined
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..system.run_metadata import machine_difference

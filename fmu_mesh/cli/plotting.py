@@ -13,7 +13,7 @@ from ..api.result import Result
 from ..errors import ConfigurationError, FmuMeshError
 from ..installing import require
 from ..pictures.drawing import draw
-from ..results.result_reading import require_readable
+from ..results.formats import require_readable
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..text import listed

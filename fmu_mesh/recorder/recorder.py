@@ -11,6 +11,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -69,6 +70,7 @@ class Recorder:
         files: the result files, in the order of the plan; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
         growth: looks at all rows.
+        notes: the folder of the run, if somebody counts the rows when this process was killed (`rows_left`).
         launch: the launcher that started this process; None if it was started manually.
         memory: the shared memory of this host; None if nothing is shared.
 
@@ -83,6 +85,7 @@ class Recorder:
         has_begun: Callable[[], bool] = lambda: True,
         *,
         growth: GrowthWatch | None = None,
+        notes: Path | None = None,
         launch: str | None = None,
         memory: HostMemory | None = None,
     ) -> None:
@@ -93,7 +96,7 @@ class Recorder:
         self._rows = min(place.rows for place in plan.rings)
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
-        self._files = RecordFiles(files, growth)
+        self._files = RecordFiles(files, growth, notes)
         self._has_begun = has_begun
         self._written = 0
         self._told = 0

@@ -3,6 +3,8 @@
 A float has the smallest number of digits that gives the same bits when it is read; a Boolean is `true` or `false`, a
 String is quoted text, a Binary is base64. `csv_rows.c` writes numbers; Python writes the same characters where there is
 text, or no library.
+
+The last row may be cut off where a run was killed, or goes on.
 """
 
 from __future__ import annotations
@@ -12,11 +14,15 @@ import csv
 import ctypes
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from codecs import BOM_UTF8
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from ctypes import c_int64, c_void_p
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, BinaryIO, Final, Self
 
 import numpy as np
 import orjson
@@ -24,18 +30,23 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..errors import ConfigurationError
-from ..files import Kept, exists, is_file
+from ..files import Kept, exists, is_file, opened
 from ..rings.library import load_library
-from .recording import Recording
-from ..variables.value_types import VariableType, is_text
+from ..variables.value_types import DTYPES, VariableType, is_float, is_text
 from .block_file import BlockFile
-from .notes_file import NotesFile
+from .notes_file import NotesFile, read_notes
+from .recording import Columns, Recording
+from .tails import LineTail
 
 __all__ = ["CsvFile", "NativeLines", "python_lines"]
 
 _DEVICES: Final = ("/dev", "/dev/fd", "/proc/self/fd")
-_READ_BYTES = 1 << 20
-_TIME: Final = b"time"
+_READ_BYTES: Final = 1 << 20
+_PIECE_BYTES: Final = 1 << 22
+_TIME: Final = "time"
+
+_MOST_ELEMENTS: Final = 10_000
+"""How many elements of an array may be columns: a file with more takes seconds per row, and few programs open it."""
 
 _COLUMN_FIELDS: Final = 6
 _CELLS: Final = 512
@@ -46,6 +57,14 @@ _END_BYTES: Final = 40
 
 _WIDE: Final = {"f": np.float64, "i": np.int64, "u": np.uint64, "b": np.int64}
 """The 64 bits of a number for `csv_rows.c`, by its kind in NumPy."""
+
+_FIELD = re.compile(rb'(?:(?<=,)|(?<!.))("[^"]*(?:""[^"]*)*"|[^,"]*)(?=,|\Z)', re.DOTALL)
+_BEGUN = re.compile(rb'(?:(?:"[^"]*(?:""[^"]*)*"|[^,"]*),)*(?:"[^"]*(?:""[^"]*)*"?|[^,"]*)')
+_READERS: Final[dict[VariableType, Callable[[bytes], object]]] = {
+    "Boolean": {b"true": True, b"false": False}.__getitem__,
+    "String": lambda field: field[1:-1].decode().replace('""', '"'),
+    "Binary": base64.b64decode,
+}
 
 
 class CsvFile(BlockFile):
@@ -67,7 +86,7 @@ class CsvFile(BlockFile):
         is_device = str(path.parent) in _DEVICES or (exists(path) and not is_file(path))
         self._notes = NotesFile(path, metadata) if metadata and not is_device else None
         header = io.StringIO()
-        csv.writer(header, lineterminator="\n").writerow(["time", *(name for name, _ in columns)])
+        csv.writer(header, lineterminator="\n").writerow([_TIME, *(name for name, _ in columns)])
         self._header = header.getvalue().encode()  # it is written with the first rows
         has_text = any(is_text(type_) for _, type_ in columns)
         self._lines: Callable[[Sequence[NDArray[Any]]], bytes | memoryview] = (
@@ -76,8 +95,15 @@ class CsvFile(BlockFile):
 
     @classmethod
     def check(cls, recording: Recording, findings: Findings) -> None:
-        """Check that no array is too large."""
-        recording.check_arrays(findings)
+        """Add a finding for each array that is too large for a file with a column for each element."""
+        known = [(own, recording.variable(own, name)) for own, name in recording.recorded]
+        arrays = Counter(f"{own}.{variable.name}" for own, variable in known if variable.shape)
+        for array, count in arrays.items():
+            if count > _MOST_ELEMENTS:
+                found = f"{count:,} elements of '{array}', for which this format has a column each"
+                ways = f"a file ending in .parquet or .mcap, or variables without '{array}'"
+                expected = f"at most {_MOST_ELEMENTS:,} elements, {ways}"
+                findings.add(f"{recording.place}.variables", found, expected)
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
@@ -97,9 +123,9 @@ class CsvFile(BlockFile):
         """
         lines, end, quoted = 0, kept.size, False
         with path.open("r+b") as file:
-            start = file.read(1 + len(_TIME)).lstrip(b'"')
+            start = file.read(1 + len(_TIME)).decode(errors="replace").lstrip('"')
             if not kept.size and not (start.startswith(_TIME) or _TIME.startswith(start)):
-                raise ConfigurationError(f"'{path}' is no result file: its first column is not '{_TIME.decode()}'.")
+                raise ConfigurationError(f"'{path}' is no result file: its first column is not '{_TIME}'.")
             offset = file.seek(kept.size)
             while piece := file.read(_READ_BYTES):
                 for number, part in enumerate(piece.split(b'"')):  # a String may contain line ends
@@ -113,6 +139,43 @@ class CsvFile(BlockFile):
             rows = kept.rows + lines - (0 if kept.size else 1)  # the first line is the heading
             file.truncate(end if rows > 0 else 0)
         return max(rows, 0)
+
+    @staticmethod
+    def pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:
+        """The rows of a file, piece by piece.
+
+        Args:
+            path: the file.
+            types: the types of the columns, by name. Without them, the first row tells truth values, whole numbers,
+                floats and texts apart; a column with a number that is not whole is one of floats from there on.
+
+        Raises:
+            ConfigurationError: it is no result file; with the line.
+        """
+        with opened(path) as file:
+            table = _Table(path, file, types)
+            data, body = file.read(_PIECE_BYTES), b""
+            while True:
+                body += data
+                end = _end_of_rows(body)
+                if end or not data:
+                    yield table.columns(body[:end])
+                    body = body[end:]
+                if not data:
+                    table.check_end(body)
+                    return
+                data = file.read(_PIECE_BYTES)
+
+    @staticmethod
+    def follow(path: Path) -> LineTail | None:
+        """Open a file that may still grow; None if its heading is not complete."""
+        with ExitStack() as stack:
+            file = stack.enter_context(opened(path))
+            table = _Table(path, file, {})
+            if not table.is_begun:
+                return None
+            stack.pop_all()
+        return LineTail(path, file, table.names, table.columns, _end_of_rows)
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
@@ -195,7 +258,11 @@ def _native() -> tuple[Callable[..., int], NDArray[np.uint64]] | None:
     path = load_library()
     if path is None:
         return None
-    powers = {n: _power(n) for n in range(-293, 326)}
+    powers = {}
+    for n in range(-293, 326):  # the first 128 bits of each power of ten, rounded down
+        bits = 127 - math.floor(n * math.log2(10))
+        numerator, denominator = (10**n, 1) if n >= 0 else (1, 10**-n)
+        powers[n] = (numerator << bits) // denominator if bits >= 0 else numerator >> -bits
     scales = []
     for q in range(-1075, 972):
         n = -1 - math.floor(q * math.log10(2))
@@ -205,8 +272,130 @@ def _native() -> tuple[Callable[..., int], NDArray[np.uint64]] | None:
     return ctypes.CFUNCTYPE(c_int64, *types)(("csv_rows", ctypes.CDLL(path))), np.frombuffer(tables, np.uint64)
 
 
-def _power(exponent: int) -> int:
-    """The first 128 bits of a power of ten, rounded down."""
-    bits = 127 - math.floor(exponent * math.log2(10))
-    numerator, denominator = (10**exponent, 1) if exponent >= 0 else (1, 10**-exponent)
-    return (numerator << bits) // denominator if bits >= 0 else numerator >> -bits
+class _Table:
+    """Turns the rows of a file into columns, piece by piece.
+
+    Args:
+        path: the file.
+        file: it, open at its beginning; afterwards at its first row.
+        types: the types of the columns by name, as far as they are known.
+
+    Attributes:
+        names: the columns without `time`.
+        is_begun: whether the heading is complete.
+
+    Raises:
+        ConfigurationError: the first column is not `time`.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO, types: Mapping[str, VariableType]) -> None:
+        heading = file.readline().removeprefix(BOM_UTF8)  # Excel writes one
+        while heading.count(b'"') % 2 and len(heading) < _PIECE_BYTES and (more := file.readline(_PIECE_BYTES)):
+            heading += more  # a name may contain line ends
+        first, *self.names = next(csv.reader([heading.decode()], strict=True), []) or [None]
+        if first != _TIME:
+            found = f"its first column is '{first[:40]}'" if first is not None else "it is empty"
+            raise ConfigurationError(f"'{path}' is no result file: {found}, not '{_TIME}'.")
+        self.is_begun = heading.endswith(b"\n")
+        self._path = path
+        self._line = 1 + heading.count(b"\n")
+        self._metadata = read_notes(path)
+        about = {name: own for name, own in self._metadata.get("variables", {}).items() if name in self.names}
+        self._units = {name: own["unit"] for name, own in about.items() if own.get("unit") is not None}
+        self._known = {name: own["type"] for name, own in about.items()} | dict(types)
+        self._types: list[VariableType] = []
+
+    def columns(self, body: bytes, wanted: Sequence[str] | None = None) -> Columns:
+        """Some or all columns of whole rows, which follow those of the last call."""
+        body.decode()  # not every number would tell a byte that is no text
+        if not self._types:
+            first = next(self._rows(body), [b"0.0"] * (1 + len(self.names)))
+            of_columns = zip(self.names, first[1:], strict=True)
+            self._types = ["Float64", *(self._known.get(name, _type_of(text)) for name, text in of_columns)]
+        names = self.names if wanted is None else wanted
+        places = range(1 + len(names)) if wanted is None else [0, *(1 + self.names.index(name) for name in wanted)]
+        if all(is_float(self._types[place]) for place in places) and (table := self._floats(body, places)) is not None:
+            arrays: list[NDArray[Any]] = [*table.T]
+        elif texts := [*zip(*self._rows(body), strict=True)]:
+            arrays = [self._array(place, texts[place]) for place in places]
+        else:
+            arrays = [np.zeros(0, DTYPES[self._types[place]]) for place in places]
+        self._line += body.count(b"\n")
+        return Columns(arrays[0], dict(zip(names, arrays[1:], strict=True)), self._units, self._metadata)
+
+    def check_end(self, rest: bytes) -> None:
+        """Check that what follows the last whole row is the beginning of a row; its writer was killed there."""
+        if not _BEGUN.fullmatch(rest):
+            raise self._refused(self._line, "a quotation mark in the wrong place")
+
+    def _floats(self, body: bytes, places: Sequence[int]) -> NDArray[np.float64] | None:
+        """All rows of columns with nothing but floats, fast; None where they have something else, or no rows."""
+        if not body.strip():
+            return None
+        some = None if isinstance(places, range) else places
+        try:
+            table: NDArray[np.float64] = np.loadtxt(io.BytesIO(body), delimiter=",", comments=None, ndmin=2, usecols=some)
+        except ValueError:
+            return None
+        # `loadtxt` passes over empty lines.
+        return table if table.shape == (body.count(b"\n"), len(places)) else None
+
+    def _rows(self, body: bytes) -> Iterator[list[bytes]]:
+        """The fields of every row; a text keeps its quotation marks."""
+        waiting, first = b"", self._line
+        for number, line in enumerate(body.split(b"\n")[:-1], self._line):
+            waiting = waiting + b"\n" + line if waiting else line
+            if waiting.count(b'"') % 2:  # a text with line ends in it
+                continue
+            row = waiting.removesuffix(b"\r")
+            fields = row.split(b",") if b'"' not in row else _FIELD.findall(row)
+            if b",".join(fields) != row:
+                raise self._refused(first, "a quotation mark in the wrong place")
+            if len(fields) != 1 + len(self.names):
+                raise self._refused(first, f"{len(fields)} values where the heading has {1 + len(self.names)}")
+            yield fields
+            waiting, first = b"", number + 1
+
+    def _array(self, place: int, texts: Sequence[bytes]) -> NDArray[Any]:
+        """The values of a column; the first one is `time`."""
+        type_ = self._types[place]
+        if type_ == "Int64" and self.names[place - 1] not in self._known and not all(map(_is_whole, texts)):
+            type_ = self._types[place] = "Float64"  # another program may write 0 for 0.0
+        read = _READERS.get(type_, float if is_float(type_) else int)
+        values: list[Any] = []
+        text = b""
+        try:
+            for text in texts:
+                values.append(read(text))
+            return np.array(values, dtype=DTYPES[type_])
+        except (ValueError, KeyError, OverflowError) as error:
+            what = f"{text.decode(errors='replace')!r} is no value of type {type_}"
+            raise self._refused(self._line + len(values), what) from error
+
+    def _refused(self, line: int, what: str) -> ConfigurationError:
+        return ConfigurationError(f"'{self._path}' is no result file: line {line}: {what}.")
+
+
+def _end_of_rows(body: bytes) -> int:
+    """The end of the last whole row; a text may contain line ends."""
+    end = body.rfind(b"\n") + 1
+    quotes = body.count(b'"', 0, end)
+    while quotes % 2:
+        start = body.rfind(b"\n", 0, end - 1) + 1
+        quotes -= body.count(b'"', start, end)
+        end = start
+    return end
+
+
+def _type_of(text: bytes) -> VariableType:
+    """The type of a column whose first value is ``text``: a float always has a point, an exponent or letters."""
+    if text in (b"true", b"false"):
+        return "Boolean"
+    if text.startswith(b'"'):
+        return "String"
+    return "Int64" if _is_whole(text) else "Float64"
+
+
+def _is_whole(text: bytes) -> bool:
+    """Whether a text is a whole number; with a sign, 0 is a float."""
+    return text.removeprefix(b"-").isdigit() and text != b"-0" and -(1 << 63) <= int(text) < 1 << 63

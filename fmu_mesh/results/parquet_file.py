@@ -1,7 +1,5 @@
 """Results as Parquet: one column for the time, and one for each variable, with its own type and its unit.
 
-The rows of an array are lists of one size, unless only some of its elements are recorded: these have a column each.
-
 A Parquet file cannot be read without its end. While a run goes on, its rows are in an Arrow IPC stream beside it,
 `<file>.arrows`, in batches that the operating system has after every `flush`. The same rows are compressed into a draft
 of the Parquet file, group by group; `close` writes its end, renames it and removes the stream. After the writer was
@@ -17,7 +15,8 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Self
@@ -28,40 +27,25 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..errors import ConfigurationError
-from ..files import Kept, decoded_json, exists, is_file, open_alone, opened
-from ..system.arrow import DIMENSIONS, elements_of, open_parquet, parquet_batches, parquet_module, pyarrow_module
-from .recording import Columns, Recording, joined, with_notes
-from ..variables.model_description import Variable
-from ..variables.value_types import DTYPES, VariableType, element_name
-from .parquet_groups import KEY, GroupWriter, decoded
+from ..files import Kept, decoded_json, exists, is_file, open_alone, opened, replaced
+from ..system.arrow import DIMENSIONS, open_parquet, parquet_batches, parquet_module, pyarrow_module
+from ..variables.value_types import DTYPES, VariableType
+from .parquet_arrays import KEY, arrays_of, arrow_array, columns_of, decoded, no_result, plain_schema, schema_of
+from .recording import Columns, Recording, Tail, with_notes
 
 __all__ = ["ParquetFile"]
 
 _STREAM: Final = ".arrows"
-_TIME: Final = "time"
-_UNIT: Final = b"unit"
-_ABOUT_TIME: Final = {"type": "Float64", "unit": "s"}
 
 _BLOCK_ROWS: Final = 16384
 _BLOCK_BYTES: Final = 1 << 22
 """A batch has at most so many rows, and numbers of so many bytes; likewise texts, but at least one row."""
 
-_ARROW_TYPES: Final[dict[VariableType, str]] = {
-    "Float64": "float64",
-    "Int64": "int64",
-    "UInt64": "uint64",
-    "Enumeration": "int64",
-    "Float32": "float32",
-    "Int32": "int32",
-    "UInt32": "uint32",
-    "Int16": "int16",
-    "UInt16": "uint16",
-    "Int8": "int8",
-    "UInt8": "uint8",
-    "Boolean": "bool_",
-    "String": "string",
-    "Binary": "binary",
-}
+_GROUP_ROWS: Final = 131072
+_GROUP_BYTES: Final = 1 << 26
+"""A row group of the Parquet file has at most so many rows, and about so many bytes before they are compressed."""
+
+_MERGED: Final = 32
 
 
 class ParquetFile:
@@ -96,9 +80,9 @@ class ParquetFile:
         self._noted: list[Mapping[str, Any]] = []
         self._schema = schema
         self._file = open_alone(self.growing_file(path), path)
-        self._sink = _Sink()
+        self._sink = io.BytesIO()  # of the pieces that pyarrow writes
         self._stream: Any = None
-        self._groups: GroupWriter | None = None
+        self._groups: _GroupWriter | None = None
         self._stream_only = False  # the draft could not be written
 
     @classmethod
@@ -112,17 +96,12 @@ class ParquetFile:
         if exists(path) and not is_file(path):
             hint = "Record into a .csv file."
             raise ConfigurationError(f"'{path}' is not a file, and a Parquet file cannot replace it.", hint=hint)
-        return cls(path, _schema_of(recording))
+        return cls(path, schema_of(recording))
 
     @classmethod
     def of_columns(cls, path: Path, types: Mapping[str, VariableType], columns: Columns) -> Self:
         """Open a file for columns of which only the types, units and metadata are known."""
-        pa = pyarrow_module()
-        fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata=_ABOUT_TIME)]
-        for name, type_ in types.items():
-            about = {"type": type_} | ({"unit": columns.units[name]} if name in columns.units else {})
-            fields.append(pa.field(name, getattr(pa, _ARROW_TYPES[type_])(), nullable=False, metadata=about))
-        return cls(path, pa.schema(fields, {KEY: msgspec.json.encode(columns.metadata)}))
+        return cls(path, plain_schema(types, columns))
 
     @staticmethod
     def growing_file(path: Path) -> Path:
@@ -140,7 +119,7 @@ class ParquetFile:
                 return int(open_parquet(file).metadata.num_rows)
         rows = 0
         if stream.stat().st_size:
-            with _Stream(stream) as batches, GroupWriter(path, batches.schema) as groups:
+            with _Stream(stream) as batches, _GroupWriter(path, batches.schema) as groups:
                 for batch in batches:
                     groups.add(batch)
                 rows = groups.finish(batches.notes)
@@ -148,30 +127,33 @@ class ParquetFile:
         return rows
 
     @staticmethod
-    def read(path: Path) -> Columns:
-        """Read a result file; while its run goes on, or after it was killed, the complete batches of its stream."""
-        return joined(ParquetFile.pieces(path))
-
-    @staticmethod
-    def pieces(path: Path) -> Iterator[Columns]:
-        """The same, piece by piece."""
+    def pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:  # noqa: ARG004  the file has them
+        """The rows of a file; while its run goes on, or after it was killed, the complete batches of its stream."""
         pyarrow_module()
         stream = ParquetFile.growing_file(path)
         if stream.is_file() and not path.exists():
             with _Stream(stream) as batches:
-                none, names = _columns_of(path, batches.schema)
+                none, names = columns_of(path, batches.schema)
                 for batch in batches:
-                    yield none._replace(**_arrays_of(batch, names))
+                    yield none._replace(**arrays_of(batch, names))
                 yield none._replace(metadata=with_notes(none.metadata, batches.notes))
             return
         with opened(path) as file:
             content = open_parquet(file)
-            none, names = _columns_of(path, content.schema_arrow)
+            none, names = columns_of(path, content.schema_arrow)
             none = none._replace(metadata=decoded(content.metadata))
             if not content.metadata.num_rows:
                 yield none
             for batch in parquet_batches(content):
-                yield none._replace(**_arrays_of(batch, names))
+                yield none._replace(**arrays_of(batch, names))
+
+    @staticmethod
+    def follow(path: Path) -> Tail | None:
+        """Open a file, or the stream that becomes it; None if neither is complete enough."""
+        pyarrow_module()
+        from .parquet_tail import ParquetTail  # noqa: PLC0415  it imports pyarrow, which is optional
+
+        return ParquetTail.open(path, ParquetFile.growing_file(path))
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
@@ -234,7 +216,7 @@ class ParquetFile:
         """Write the rows that are waiting as one batch."""
         pa = pyarrow_module()
         fields = zip(self._block, self._schema, strict=True)
-        arrays = [_arrow_array(array[: self._waiting], field.type) for array, field in fields]
+        arrays = [arrow_array(array[: self._waiting], field.type) for array, field in fields]
         self._waiting = 0
         batch = pa.RecordBatch.from_arrays(arrays, schema=self._schema)
         notes, self._notes = self._notes, []
@@ -242,7 +224,9 @@ class ParquetFile:
         if self._stream is None:
             self._stream = pa.ipc.new_stream(self._sink, self._schema)
         self._stream.write_batch(batch, {KEY: msgspec.json.encode(notes)} if notes else None)
-        left = memoryview(self._sink.taken())
+        left = memoryview(self._sink.getvalue())
+        self._sink.seek(0)
+        self._sink.truncate()
         try:
             while left:
                 left = left[self._file.write(left) :]
@@ -256,7 +240,7 @@ class ParquetFile:
             return
         try:
             if self._groups is None:
-                self._groups = GroupWriter(self.path, self._schema)
+                self._groups = _GroupWriter(self.path, self._schema)
             self._groups.add(batch)
         except OSError:
             groups, self._groups, self._stream_only = self._groups, None, True
@@ -290,7 +274,7 @@ class _Stream:
             self._reader = self._pa.ipc.open_stream(self._file)
         except (self._pa.ArrowException, OSError) as error:
             self._file.close()
-            raise _no_result(path, f"its heading is not complete ({error})") from error
+            raise no_result(path, f"its heading is not complete ({error})") from error
         self.schema = self._reader.schema
 
     def __enter__(self) -> Self:
@@ -312,109 +296,120 @@ class _Stream:
             yield batch
 
 
-class _Sink(io.RawIOBase):
-    """Collects what pyarrow writes in many small pieces."""
+class _GroupWriter:
+    """Writes a draft of the Parquet file, which gets its name at the end; a context manager, which removes the draft.
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._parts: list[bytes] = []
+    A batch is kept until its row group is complete. So it must own its memory. A row group is compressed on a thread of
+    its own, because that takes tens of milliseconds, in which nodes would have to wait for the recorder. If two groups
+    are waiting, `add` waits too.
 
-    def writable(self) -> bool:
-        return True
+    Args:
+        path: the file.
+        schema: its columns and metadata.
+    """
 
-    def write(self, data: Any, /) -> int:  # noqa: ANN401  any buffer
-        self._parts.append(bytes(data))
-        return len(self._parts[-1])
+    def __init__(self, path: Path, schema: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        self._schema = schema
+        self._levels: list[list[Any]] = [[]]
+        self._rows = self._size = self._written = 0
+        floats: list[str] = []
+        others: list[str] = []
+        for field in schema:
+            element = getattr(field.type, "value_type", None)  # of lists
+            column = field.name if element is None else f"{field.name}.list.element"
+            (floats if str(element or field.type) in ("double", "float") else others).append(column)
+        ways = {
+            "compression": "zstd",
+            "compression_level": 1,
+            "use_dictionary": others,
+            "use_byte_stream_split": floats,
+        }
+        with ExitStack() as draft:
+            file = draft.enter_context(draft.enter_context(replaced(path)).open("wb"))
+            self._writer = parquet_module().ParquetWriter(file, schema, **ways)
+            self._draft = draft.pop_all()
+        self._compressing = ThreadPoolExecutor(1, "parquet")
+        self._begun: Future[None] | None = None
 
-    def taken(self) -> bytes:
-        """All that was written since the last call."""
-        taken = b"".join(self._parts)
-        self._parts.clear()
-        return taken
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.abandon()
+
+    def add(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        """Add the rows of a batch.
+
+        Raises:
+            OSError: the draft cannot be written; it is removed.
+        """
+        while batch.num_rows:
+            part = batch.slice(0, _GROUP_ROWS - self._rows)
+            batch = batch.slice(part.num_rows)
+            self._keep(part)
+            self._rows, self._size = self._rows + part.num_rows, self._size + part.nbytes
+            if self._rows == _GROUP_ROWS or self._size >= _GROUP_BYTES:
+                self._write()
+
+    def finish(self, notes: Sequence[Mapping[str, Any]]) -> int:
+        """Write the end, and give the file its name; return the number of its rows. Without a row, there is no file.
+
+        Raises:
+            OSError: the draft cannot be written; it is removed.
+        """
+        if self._rows:
+            self._write()
+        self._wait()
+        self._compressing.shutdown()
+        if self._written:
+            metadata = with_notes(decoded(self._schema), notes)
+            self._writer.add_key_value_metadata({KEY: msgspec.json.encode(metadata)})
+            self._writer.close()
+            self._writer = None
+            self._draft.close()
+        return self._written
+
+    def abandon(self) -> None:
+        """Remove the draft, unless it has become the file."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        self._compressing.shutdown(cancel_futures=True)
+        with suppress(OSError):
+            writer.close()
+        with suppress(_Abandoned, OSError), self._draft:
+            raise _Abandoned
+
+    def _keep(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
+        """Keep a batch for the row group; many small ones become a large one, which takes less memory."""
+        for level in self._levels:
+            level.append(batch)
+            if len(level) < _MERGED:
+                return
+            [batch] = pyarrow_module().Table.from_batches(level).combine_chunks().to_batches()
+            level.clear()
+        self._levels.append([batch])
+
+    def _write(self) -> None:
+        """Begin to write what is waiting as one row group, as soon as the one before it is written."""
+        table = pyarrow_module().Table.from_batches([batch for level in reversed(self._levels) for batch in level])
+        self._written += self._rows
+        self._levels, self._rows, self._size = [[]], 0, 0
+        self._wait()
+        self._begun = self._compressing.submit(self._writer.write_table, table, row_group_size=_GROUP_ROWS)
+
+    def _wait(self) -> None:
+        """Wait until the row group that was begun is written.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            begun.result()
 
 
-def _schema_of(recording: Recording) -> Any:  # noqa: ANN401  pyarrow has no types
-    """The columns of a recording as pyarrow has them, with what is known of each variable."""
-    pa = pyarrow_module()
-    fields = [pa.field(_TIME, pa.float64(), nullable=False, metadata=_ABOUT_TIME)]
-    recorded, place = recording.recorded, 0
-    while place < len(recorded):
-        instance, name = recorded[place]
-        variable = recording.descriptions[instance].variable_of(name)
-        assert variable is not None  # the system is valid
-        arrow_type, about, end = getattr(pa, _ARROW_TYPES[variable.type])(), _about(variable), place + variable.size
-        is_first = bool(variable.shape) and name == element_name(variable.name, (0,) * len(variable.shape))
-        if is_first and recorded[place:end] == tuple((instance, element) for element in variable.elements):
-            arrow_type = pa.list_(pa.field("element", arrow_type, nullable=False), variable.size)
-            about[DIMENSIONS.decode()] = msgspec.json.encode(variable.shape).decode()
-            name, place = variable.name, end - 1
-        fields.append(pa.field(f"{instance}.{name}", arrow_type, nullable=False, metadata=about))
-        place += 1
-    return pa.schema(fields, {KEY: msgspec.json.encode(recording.metadata)})
-
-
-def _about(variable: Variable) -> dict[str, str]:
-    """What the field of a variable says about it."""
-    about: dict[str, str] = {"type": variable.type}
-    about |= {"causality": variable.causality, "variability": variable.variability}
-    known = {"unit": variable.unit, "description": variable.description}
-    about |= {key: text for key, text in known.items() if text is not None}
-    if variable.items:
-        about["items"] = msgspec.json.encode(dict(variable.items)).decode()
-    return about
-
-
-def _arrow_array(values: NDArray[Any], type_: Any) -> Any:  # noqa: ANN401  pyarrow has no types
-    """A copy of the values as pyarrow has it. `pyarrow.array` would import pandas, which takes half a second."""
-    pa = pyarrow_module()
-    if values.ndim > 1:
-        elements = _arrow_array(values.reshape(-1), type_.value_type)
-        return pa.Array.from_buffers(type_, len(values), [None], null_count=0, children=[elements])
-    if values.dtype == object:
-        texts = [value.encode() if isinstance(value, str) else value for value in values.tolist()]
-        ends = np.zeros(1 + len(texts), np.int32)
-        np.cumsum([len(text) for text in texts], out=ends[1:])
-        buffers = [ends, b"".join(texts)]
-    elif values.dtype == np.bool_:
-        buffers = [np.packbits(values, bitorder="little")]
-    else:
-        buffers = [values.copy()]
-    return pa.Array.from_buffers(type_, len(values), [None, *map(pa.py_buffer, buffers)], null_count=0)
-
-
-def _columns_of(path: Path, schema: Any) -> tuple[Columns, list[tuple[str, ...]]]:  # noqa: ANN401  pyarrow has no types
-    """The columns without rows, and the names of those of each field."""
-    pa = pyarrow_module()
-    if not schema.names or schema.names[0] != _TIME or not pa.types.is_float64(schema[0].type):
-        raise _no_result(path, f"its first column is not '{_TIME}' in float64")
-    names = [elements_of(field) for field in schema]
-    known = [(field.metadata or {}).get(_UNIT) for field in schema]
-    units = {name: unit.decode() for unit, own in zip(known, names, strict=True) if unit is not None for name in own}
-    return Columns(**_arrays_of(schema.empty_table(), names), units=units, metadata=decoded(schema)), names
-
-
-def _arrays_of(batch: Any, names: Sequence[tuple[str, ...]]) -> dict[str, Any]:  # noqa: ANN401  pyarrow has no types
-    """The times and values of a batch, as numpy has them; ``names`` are those of the columns of each field."""
-    arrays: dict[str, NDArray[Any]] = {}
-    for name, own, column in zip(batch.schema.names, names, batch.columns, strict=True):
-        if own == (name,):
-            arrays[name] = _array(column)
-        else:
-            from pyarrow.compute import list_flatten  # noqa: PLC0415  an optional dependency, slow to import
-
-            table = _array(list_flatten(column)).reshape(len(column), len(own))
-            arrays |= zip(own, np.ascontiguousarray(table.T), strict=True)
-    return {"times": arrays.pop(_TIME), "values": arrays}
-
-
-def _array(column: Any) -> NDArray[Any]:  # noqa: ANN401  pyarrow has no types
-    """A column as numpy has it; `object` for texts and bytes."""
-    pa = pyarrow_module()
-    if pa.types.is_string(column.type) or pa.types.is_binary(column.type):
-        return np.array([*column.to_pylist(), None], object)[:-1]  # never an array of more dimensions
-    array: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    return array
-
-
-def _no_result(path: Path, why: str) -> ConfigurationError:
-    return ConfigurationError(f"'{path}' is no result file: {why}.".replace("..", "."))
+class _Abandoned(Exception):
+    """A draft is of no use."""

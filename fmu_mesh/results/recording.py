@@ -1,62 +1,27 @@
-"""What a run records, the contract of what writes it into a file, and how that is found.
+"""What a run records, and the contract of a result format: how its files are written, read, followed and recovered.
 
-A package offers a result format through the entry points `fmu_mesh.recorders`, under the ending of its files without
-the dot. CSV, Parquet and MCAP are found in the same way. `docs/extending.md` shows how to write one.
+A package offers a format through the entry points `fmu_mesh.recorders`, under the ending of its files without the dot.
+CSV, Parquet and MCAP are found in the same way (`fmu_mesh.results.formats`). `docs/extending.md` shows how to write
+one.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fmu_mesh.config.findings import Findings
-from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.errors import ConfigurationError, FmuMeshError
-from fmu_mesh.files import Kept, decoded_json
-from fmu_mesh.plugins import plugin, plugin_names
-from fmu_mesh.text import nearest_file, printable
-from fmu_mesh.variables.model_description import ModelDescription
-from fmu_mesh.variables.value_types import VariableType
+from ..config.findings import Findings
+from ..config.loading import LoadedConfig
+from ..files import Kept, decoded_json
+from ..variables.model_description import ModelDescription, Variable
+from ..variables.value_types import VariableType
 
-__all__ = [
-    "Columns",
-    "PiecewiseFormat",
-    "ReadableFormat",
-    "Recording",
-    "ResultFile",
-    "ResultFormat",
-    "has_unknown_ending",
-    "is_in_memory",
-    "joined",
-    "metadata_in",
-    "reading",
-    "result_endings",
-    "result_format",
-    "with_notes",
-]
-
-_GROUP = "fmu_mesh.recorders"
-_DEFAULT = "csv"
-_IN_MEMORY = "arrays"
-"""What the library keeps in memory; no file that anybody names."""
-
-_PLAIN = ("", "txt")
-"""Endings that ask for no format in particular; a number, as in `result.2`, does not either."""
-
-_OTHER_FORMATS = frozenset(
-    ("arrow", "bag", "db3", "feather", "h5", "hdf5", "json", "mat", "npz", "ods", "parquet", "xls", "xlsx")
-)
-"""Endings of known formats that nobody may have installed. The programs for them could not open a CSV."""
-
-_MOST_ELEMENTS = 10_000
-"""How many elements of an array may be columns: a file with more takes seconds per row, and few programs open it."""
+__all__ = ["Columns", "Recording", "ResultFile", "ResultFormat", "Tail", "joined", "metadata_in", "with_notes"]
 
 
 class Recording(msgspec.Struct, frozen=True):
@@ -84,23 +49,13 @@ class Recording(msgspec.Struct, frozen=True):
     @property
     def columns(self) -> list[tuple[str, VariableType]]:
         """(`instance.variable`, type) of every column, in order; the time is not among them."""
-        columns: list[tuple[str, VariableType]] = []
-        for instance, name in self.recorded:
-            variable = self.descriptions[instance].variable_of(name)
-            assert variable is not None  # the system is valid
-            columns.append((f"{instance}.{name}", variable.type))
-        return columns
+        return [(f"{instance}.{name}", self.variable(instance, name).type) for instance, name in self.recorded]
 
-    def check_arrays(self, findings: Findings) -> None:
-        """Add a finding for each array that is too large for a file with a column for each element."""
-        known = ((own, name, self.descriptions[own].variable_of(name)) for own, name in self.recorded)
-        arrays = Counter(f"{own}.{variable.name}" for own, _, variable in known if variable and variable.shape)
-        for array, count in arrays.items():
-            if count > _MOST_ELEMENTS:
-                found = f"{count:,} elements of '{array}', for which this format has a column each"
-                ways = f"a file ending in .parquet or .mcap, or variables without '{array}'"
-                expected = f"at most {_MOST_ELEMENTS:,} elements, {ways}"
-                findings.add(f"{self.place}.variables", found, expected)
+    def variable(self, instance: str, name: str) -> Variable:
+        """The variable of a column: of an element of an array, the array."""
+        variable = self.descriptions[instance].variable_of(name)
+        assert variable is not None  # the system is valid
+        return variable
 
 
 class Columns(NamedTuple):
@@ -120,27 +75,10 @@ class Columns(NamedTuple):
     metadata: Mapping[str, Any] = {}
 
 
-class _Metadata(msgspec.Struct):
-    """The metadata that are used when a file is read, with their types."""
-
-    mesh: str = ""
-    first: int = 0
-    every: int = 1
-    versions: dict[str, str] = {}
-    variables: dict[str, _Described] = {}
-    set: list[dict[str, Any]] = []
-
-
-class _Described(msgspec.Struct):
-    type: VariableType
-    unit: str | None = None
-    variability: str = ""
-
-
 class ResultFormat(Protocol):
-    """What an entry point names: a class with these four methods, whose instances are `ResultFile`s.
+    """What an entry point names: a class with these six methods, whose instances are `ResultFile`s.
 
-    The call sequence of both is:
+    The call sequence of both, where a run writes a file:
 
     1. `check`, before anything is started, in another process than the rest.
     2. `open`, when the run starts. Another run must not be able to open the same file, and what is at ``path`` must
@@ -150,6 +88,9 @@ class ResultFormat(Protocol):
        from one thread at a time.
     4. `close`, once, also after an error. It may be called from another thread than `write`.
     5. `keep_whole_rows`, only if the process was killed before `close`, in another process.
+
+    `pieces` and `follow` read a file at any time, in any process, also while a run writes it. They may be missing:
+    results of a format without `pieces` can only be written, and no page shows those of one without `follow`.
 
     A format whose files cannot be read without their end writes into a file of another name, its `growing_file`, from
     which `close` or `keep_whole_rows` makes the file at ``path``.
@@ -201,12 +142,15 @@ class ResultFormat(Protocol):
         """
         ...
 
+    def pieces(self, path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:
+        """The rows of a result file, piece by piece, so that a file may be larger than the memory.
 
-class ReadableFormat(Protocol):
-    """What a `ResultFormat` also has if `Result.read` can read its files."""
+        Args:
+            path: the file.
+            types: the types of the columns by name, where the caller knows them and the file may not say them.
 
-    def read(self, path: Path) -> Columns:
-        """Read a result file.
+        Returns:
+            At least one piece; all have the same columns.
 
         Raises:
             ConfigurationError: it is not a result file of this format.
@@ -214,13 +158,11 @@ class ReadableFormat(Protocol):
         """
         ...
 
+    def follow(self, path: Path) -> Tail | None:
+        """Open a result file that may still grow; None if it has no heading yet, or cannot be followed.
 
-@runtime_checkable
-class PiecewiseFormat(Protocol):
-    """What a `ReadableFormat` also has whose files may be larger than the memory."""
-
-    def pieces(self, path: Path) -> Iterator[Columns]:
-        """The rows of a result file, piece by piece; there is at least one piece. The errors are those of `read`."""
+        The errors are those of `pieces`.
+        """
         ...
 
 
@@ -275,34 +217,55 @@ class ResultFile(Protocol):
         ...
 
 
-def result_format(path: str | Path) -> ResultFormat | None:
-    """The format of a result file of this name, or None if its ending is that of a format that no package writes.
+class Tail(Protocol):
+    """The rows of a result file in pieces, while it grows and afterwards; only reads, and the run never waits for it.
 
-    A name without an ending is that of a CSV, and so is one with any other ending (see `has_unknown_ending`).
-
-    Raises:
-        ConfigurationError: two packages write this format, or the package cannot be imported.
+    Attributes:
+        path: the result file.
+        names: the columns without `time`.
+        replaced: whether the file is gone, or that of another run.
+        behind: bytes of the file that were not read yet.
     """
-    ending = _ending(path)
-    found = plugin(_GROUP, ending)
-    if found is None and ending not in _OTHER_FORMATS:
-        found = plugin(_GROUP, _DEFAULT)
-    return cast("ResultFormat | None", found)
+
+    path: Path
+    names: Sequence[str]
+
+    @property
+    def replaced(self) -> bool: ...  # noqa: D102 see above
+
+    @property
+    def behind(self) -> int: ...  # noqa: D102 see above
+
+    def skip(self) -> None:
+        """Go on with the rows that are written from now on."""
+        ...
+
+    def read(self, names: Sequence[str]) -> Columns | None:
+        """These columns of the next rows, a few megabytes of the file at most; None if there is no new row."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
 
 
-def has_unknown_ending(path: str | Path) -> bool:
-    """Whether no installed package writes files with this ending."""
-    return plugin(_GROUP, _ending(path)) is None
-
-
-def is_in_memory(path: str | Path) -> bool:
-    """Whether a result of this name is kept in memory and is no file."""
-    return _ending(path) == _IN_MEMORY
-
-
-def result_endings() -> list[str]:
-    """The endings that result files can have, such as `.csv`, ours first."""
-    return [f".{name}" for name in plugin_names(_GROUP) if name != _IN_MEMORY]
+def joined(pieces: Iterable[Columns]) -> Columns:
+    """All rows of a result. Besides its columns, only one piece is in memory at a time."""
+    columns: dict[str, NDArray[Any]] = {}
+    rows = 0
+    for piece in pieces:
+        end = rows + len(piece.times)
+        for name, part in (("", piece.times), *piece.values.items()):
+            own = columns.setdefault(name, np.empty(0, part.dtype))
+            if own.dtype != part.dtype:  # it has nulls, as the files of other programs may, or is no whole number
+                own = columns[name] = own.astype(np.result_type(own, part))
+            if len(own) < end:
+                own.resize(max(end, rows + rows // 4), refcheck=False)  # large memory grows where it is
+            own[rows:end] = part
+        rows = end
+    for own in columns.values():
+        own.resize(rows, refcheck=False)
+    return piece._replace(times=columns.pop(""), values=columns)
 
 
 def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
@@ -325,23 +288,21 @@ def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
     return {**noted, "set": values} if values else noted
 
 
-def joined(pieces: Iterable[Columns]) -> Columns:
-    """All rows of a result. Besides its columns, only one piece is in memory at a time."""
-    columns: dict[str, NDArray[Any]] = {}
-    rows = 0
-    for piece in pieces:
-        end = rows + len(piece.times)
-        for name, part in (("", piece.times), *piece.values.items()):
-            own = columns.setdefault(name, np.empty(0, part.dtype))
-            if own.dtype != part.dtype:  # it has nulls, as the files of other programs may, or is no whole number
-                own = columns[name] = own.astype(np.result_type(own, part))
-            if len(own) < end:
-                own.resize(max(end, rows + rows // 4), refcheck=False)  # large memory grows where it is
-            own[rows:end] = part
-        rows = end
-    for own in columns.values():
-        own.resize(rows, refcheck=False)
-    return piece._replace(times=columns.pop(""), values=columns)
+class _Metadata(msgspec.Struct):
+    """The metadata that are used when a file is read, with their types."""
+
+    mesh: str = ""
+    first: int = 0
+    every: int = 1
+    versions: dict[str, str] = {}
+    variables: dict[str, _Described] = {}
+    set: list[dict[str, Any]] = []
+
+
+class _Described(msgspec.Struct):
+    type: VariableType
+    unit: str | None = None
+    variability: str = ""
 
 
 def metadata_in(data: bytes | str) -> dict[str, Any]:
@@ -352,29 +313,3 @@ def metadata_in(data: bytes | str) -> dict[str, Any]:
     """
     decoded_json(data, _Metadata)
     return decoded_json(data, dict[str, Any])
-
-
-@contextmanager
-def reading(path: Path, what: str = "result file") -> Iterator[None]:
-    """In the block a result file, or another kind of file, is read. Whatever is wrong with it is one error.
-
-    Raises:
-        ConfigurationError: it cannot be read, or it is none.
-    """
-    try:
-        yield
-    except FmuMeshError:
-        raise
-    except OSError as error:
-        near = nearest_file(path) if isinstance(error, FileNotFoundError) else None
-        hint = f"Did you mean '{near}'?" if near is not None else None
-        text = f"the {what} '{path}' cannot be read: {error.strerror or error}.".replace("..", ".")
-        raise ConfigurationError(text, hint=hint) from error
-    except Exception as error:  # each library of a format has errors of its own for damaged bytes
-        text = f"'{path}' is no {what}: {printable(str(error)) or type(error).__name__}."
-        raise ConfigurationError(text.replace("..", ".")) from error
-
-
-def _ending(path: str | Path) -> str:
-    ending = Path(path).suffix.removeprefix(".").lower()
-    return _DEFAULT if ending in _PLAIN or ending.isdecimal() else ending

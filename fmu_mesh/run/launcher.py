@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..files import remove_tree
-from ..results.result_files import rows_left, what_is_kept
+from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import (
     STOPPED,

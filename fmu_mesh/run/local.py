@@ -26,7 +26,7 @@ from ..instances.registry import open_instance
 from ..master.pacing import Pacer
 from ..recorder.row_buffer import RowBuffer
 from ..results.growth import GrowthWatch
-from ..results.result_files import open_results, what_is_kept
+from ..results.record_files import open_results, what_is_kept
 from ..system.layout import Layout
 from ..system.plan import Plan
 from .local_system import LocalSystem, opening_of

@@ -23,7 +23,7 @@ from ..master.master import Master, MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..results.growth import GrowthWatch
-from ..results.result_files import open_results
+from ..results.record_files import open_results
 from ..system.plan import MASTER, RECORDER
 from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
@@ -185,19 +185,14 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         recorder = failure = None
         try:
             if RECORDER in plan.nodes:
-                results = open_results(
-                    run.loaded,
-                    plan.system,
-                    process.folder if process.is_child else None,
-                    digest=plan.digest,
-                    contents=run.contents,
-                )
+                results = open_results(run.loaded, plan.system, digest=plan.digest, contents=run.contents)
                 with Recorder(
                     plan.nodes[RECORDER],
                     session,
                     results,
                     lambda: master.has_begun,
                     growth=GrowthWatch(plan),
+                    notes=process.folder if process.is_child else None,
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
                 ) as recorder:

@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from ..node.stepping import Runner
 from ..recorder.recorder import RecordedSource
 from ..results.growth import GrowthWatch
-from ..results.record_files import RecordFiles
+from ..results.record_files import RecordFiles, what_is_kept
 from ..results.recording import ResultFile
-from ..results.result_files import what_is_kept
 from ..system.plan import RECORDER, Plan
 from ..wire.frames import SourceRows
 

@@ -1,13 +1,14 @@
 """Which variables each result file has, and at which points: names and patterns of the section `record`.
 
-Owns `RecordPlan` and the meaning of patterns. Formats are `fmu_mesh.results.recording`.
+Owns `RecordPlan` and the meaning of patterns. Knows no format: what a file can hold is checked by a function that the
+caller gives (`fmu_mesh.results.formats.check_record`).
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,16 +17,25 @@ import msgspec
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
-from ..errors import ConfigurationError
 from ..files import archive_on_the_way
-from ..results.recording import Recording, has_unknown_ending, is_in_memory, result_endings, result_format
 from ..simtime import TimeGrid, steps_between
 from ..text import EXPRESSION, is_pattern, listed, matched, nearest, short_number, shown
 from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
 
-__all__ = ["RecordPlan", "record_paths", "record_warnings", "resolve_records", "union_of"]
+__all__ = [
+    "IN_MEMORY",
+    "CheckRecord",
+    "RecordPlan",
+    "record_paths",
+    "record_warnings",
+    "resolve_records",
+    "union_of",
+]
+
+IN_MEMORY = ".arrays"
+"""The ending of what the library keeps in memory; no file that anybody names."""
 
 _PREFIXES: dict[str, tuple[Causality, ...]] = {
     "out": ("output",),
@@ -87,8 +97,17 @@ def union_of(records: Sequence[RecordPlan]) -> tuple[tuple[str, str], ...]:
     return tuple(dict.fromkeys(column for record in records for column in record.variables))
 
 
-def resolve_records(
-    loaded: LoadedConfig, variables: Variables, grid: TimeGrid | None, findings: Findings, obstacles: Findings
+CheckRecord = Callable[[RecordPlan, str, Mapping[str, ModelDescription], Findings], None]
+"""Adds a finding for everything that the format of a file cannot hold, given the place of its section."""
+
+
+def resolve_records(  # noqa: PLR0913, PLR0917  a section, what it may refer to, and where findings go
+    loaded: LoadedConfig,
+    variables: Variables,
+    grid: TimeGrid | None,
+    findings: Findings,
+    obstacles: Findings,
+    check: CheckRecord,
 ) -> tuple[RecordPlan, ...]:
     """The result files of a configuration; one without a path or without columns is left out.
 
@@ -98,6 +117,7 @@ def resolve_records(
         grid: the communication points; None after a finding about them.
         findings: where findings go.
         obstacles: where findings go about the files themselves, such as a folder of that name, or a missing package.
+        check: what the formats say about their files.
     """
     records: list[RecordPlan] = []
     first_of: dict[str, str] = {}
@@ -108,7 +128,7 @@ def resolve_records(
         if file is None:
             continue
         known = tuple((i, v) for i, v in chosen if (own := variables.descriptions.get(i)) and own.variable_of(v))
-        _check_format(file, Recording(loaded, variables.descriptions, known, place, first, section.every), obstacles)
+        check(RecordPlan(file, known, first, section.every), place, variables.descriptions, obstacles)
         other = first_of.setdefault(file, place)
         if other != place:
             findings.add(f"{place}.file", f"'{section.file}', which is also the file of {other}", "a file of its own")
@@ -123,7 +143,7 @@ def resolve_records(
 def record_warnings(
     loaded: LoadedConfig, variables: Variables, records: Sequence[RecordPlan], warnings: Findings
 ) -> None:
-    """Warn of files without the outputs of an instance, and of endings that nobody offers: they still give a CSV."""
+    """Warn of files without the outputs of an instance."""
     files = {record.file for record in records}
     for place, section in loaded.config.records.items():
         file = _path(loaded, section)
@@ -137,10 +157,6 @@ def record_warnings(
                 warnings.add(f"{place}.variables", found, f"`{every}` in this list for all locals")
             elif str(file) not in files:
                 warnings.add(place, "nothing is recorded: there are no outputs, states or locals with numbers", "")
-        if file is not None and str(file) in files and has_unknown_ending(file):
-            found = f"'{section.file}', an ending of no installed format, so the file becomes a CSV"
-            endings = " or ".join(result_endings())
-            warnings.add(f"{place}.file", found, f"a name ending in {endings}; from version 0.3 on this is an error")
 
 
 def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
@@ -151,7 +167,7 @@ def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
 
 def _is_named(loaded: LoadedConfig, place: str, section: RecordConfig) -> bool:
     """Whether somebody named the file and expects results in it: with `variables: []`, only an option names it."""
-    if section.file is None or is_in_memory(section.file):
+    if section.file is None or Path(section.file).suffix.lower() == IN_MEMORY:
         return False
     in_file = f"{place}.file" in loaded.lines or not section.file.endswith(_DEFAULT_FILE)
     return f"{place}.file" in loaded.overrides or (in_file and section.variables is None)
@@ -175,19 +191,6 @@ def _file(loaded: LoadedConfig, place: str, section: RecordConfig, findings: Fin
     elif (file := archive_on_the_way(path)) is not None:
         findings.add(place, f"'{text}' in the file '{file}'", "a file in a folder; choose one with `output=...`")
     return str(path)
-
-
-def _check_format(file: str, recording: Recording, findings: Findings) -> None:
-    """Check that a file of this name can be written, and can hold what is recorded."""
-    place, text = f"{recording.place}.file", recording.loaded.config.records[recording.place].file
-    try:
-        if (format_ := result_format(file)) is None:
-            endings = " or ".join(result_endings())
-            findings.add(place, f"'{text}', a format that is not written", f"a name ending in {endings}")
-        else:
-            format_.check(recording, findings)
-    except ConfigurationError as error:  # a package is missing
-        findings.add(place, str(error), "")
 
 
 def _first_point(section: RecordConfig, place: str, grid: TimeGrid | None, findings: Findings) -> int:

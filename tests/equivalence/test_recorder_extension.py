@@ -78,7 +78,7 @@ def test_what_is_cut_off_within_a_row_is_not_counted(extended: Place) -> None:
     program = (
         "from pathlib import Path\n"
         "from fmu_mesh.files import Kept\n"
-        "from fmu_mesh.results.recording import result_format\n"
+        "from fmu_mesh.results.formats import result_format\n"
         "print(result_format('pair.jsonl').keep_whole_rows(Path('pair.jsonl'), Kept(1, 14)))"
     )
 

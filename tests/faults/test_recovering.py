@@ -14,7 +14,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.results.recording import result_format
+from fmu_mesh.results.formats import result_format
 from tests.helpers import Place, wait_until, write_config
 
 KILLS = int(os.environ.get("FMU_MESH_KILLS", "3"))

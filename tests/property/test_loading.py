@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.instances.configuration import installed_config, parse
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.instances.registry import KINDS
+from fmu_mesh.results.formats import check_record
 from fmu_mesh.system.system import build
 from fmu_mesh.text import nearest, option_text
 from fmu_mesh.variables.model_description import ModelDescription, Variable
@@ -193,7 +195,7 @@ def test_a_valid_configuration_survives_the_way_through_a_file(config: Config) -
 def test_any_valid_structure_builds_or_is_a_configuration_error(config: Config) -> None:
     loaded = LoadedConfig(config, FILE)
     with contextlib.suppress(ConfigurationError):
-        build(loaded, dict.fromkeys(config.instances, GAIN))
+        build(loaded, dict.fromkeys(config.instances, GAIN), check_record=partial(check_record, loaded))
 
 
 @relaxed

@@ -26,7 +26,7 @@ from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import LoopNotConverged, StepFailed, TerminationRequested
 from fmu_mesh.instances.registry import decode_section
-from fmu_mesh.results.result_files import open_result
+from fmu_mesh.results.record_files import open_result
 from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh

@@ -19,7 +19,7 @@ from fmu_mesh.api.result import Result
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, ConfigurationError
 from fmu_mesh.instances.python.unit_names import base_unit_of
-from fmu_mesh.results.result_reading import Columns
+from fmu_mesh.results.recording import Columns
 
 ROOT = Path(__file__).parents[2]
 NAN, INF = math.nan, math.inf

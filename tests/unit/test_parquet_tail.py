@@ -50,8 +50,11 @@ def _opened(path: Path) -> ParquetTail:
 def _numbers(tail: ParquetTail) -> list[float]:
     """The values of `a.x` that are new, halved."""
     rows = tail.read(["a.x"])
-    assert rows is None or rows[0].tolist() == (rows[1][0] / 2 * 0.1).tolist()
-    return [] if rows is None else (rows[1][0] / 2).tolist()
+    if rows is None:
+        return []
+    numbers: list[float] = (rows.values["a.x"] / 2).tolist()
+    assert rows.times.tolist() == [number * 0.1 for number in numbers]
+    return numbers
 
 
 def test_rows_come_once_while_the_file_grows_and_none_is_missing_at_its_end(path: Path) -> None:
@@ -95,7 +98,8 @@ def test_a_complete_file_is_read_from_its_first_row_on(path: Path) -> None:
     rows = tail.read(["a.flag", "a.x"])
 
     assert rows is not None
-    assert rows[1].tolist() == [[1, 0, 1, 0, 1], [0, 2, 4, 6, 8]]
+    assert rows.values["a.flag"].tolist() == [True, False, True, False, True]
+    assert rows.values["a.x"].tolist() == [0, 2, 4, 6, 8]
     assert (_numbers(tail), tail.replaced) == ([], False)
     tail.close()
 

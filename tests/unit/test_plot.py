@@ -25,7 +25,8 @@ from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
 from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.pictures.drawing import reduced
 from fmu_mesh.pictures.result_drawing import Curves, PictureOptions, figure_of
-from fmu_mesh.results.result_reading import Columns, read_result
+from fmu_mesh.results.formats import read_result
+from fmu_mesh.results.recording import Columns
 from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.system.records import RecordPlan

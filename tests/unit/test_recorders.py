@@ -15,9 +15,10 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.formats import result_endings, result_format
 from fmu_mesh.results.parquet_file import ParquetFile
-from fmu_mesh.results.recording import ResultFile, ResultFormat, result_endings, result_format
-from fmu_mesh.results.result_files import rows_left
+from fmu_mesh.results.record_files import rows_left
+from fmu_mesh.results.recording import ResultFile, ResultFormat
 from fmu_mesh.ros.bags.mcap_file import McapFile
 from tests.helpers import write_config
 

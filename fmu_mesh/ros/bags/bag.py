@@ -19,8 +19,8 @@ from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
 from ...installing import importing
-from ...results.recording import reading
-from ...text import listed, nearest, nearest_file
+from ...results.formats import near_hint, reading
+from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value
 from ...variables.value_types import nested
 from ...wire.views import InstanceInfo
@@ -71,10 +71,7 @@ class Bag:
             from rosbags.highlevel import AnyReader  # noqa: PLC0415 an optional dependency
         self.path = path
         if not files.exists(path):
-            near = nearest_file(path)
-            raise ConfigurationError(
-                f"the bag '{path}' does not exist.", hint=f"Did you mean '{near}'?" if near is not None else None
-            )
+            raise ConfigurationError(f"the bag '{path}' does not exist.", hint=near_hint(path))
         if files.is_folder(path) and not (path / "metadata.yaml").is_file():
             raise ConfigurationError(
                 f"the folder '{path}' is no bag: it has no metadata.yaml.",

@@ -172,7 +172,7 @@ class McapContent:
         if last is None:
             return 0, 0
         row = (last - self.recording.first) // self.recording.every
-        if there == {topic.name for topic in self.recording.topics if self.recording.is_due(topic, row)}:
+        if there == self.recording.due(row):
             return row + 1, len(self.chunks)
         return row, changed
 
