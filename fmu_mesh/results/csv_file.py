@@ -121,22 +121,17 @@ class CsvFile(BlockFile):
         Raises:
             ConfigurationError: nothing is known, and it does not begin as a result file does.
         """
-        lines, end, quoted = 0, kept.size, False
         with path.open("r+b") as file:
             start = file.read(1 + len(_TIME)).decode(errors="replace").lstrip('"')
             if not kept.size and not (start.startswith(_TIME) or _TIME.startswith(start)):
                 raise ConfigurationError(f"'{path}' is no result file: its first column is not '{_TIME}'.")
-            offset = file.seek(kept.size)
+            end, rest = file.seek(kept.size), b""
+            rows = kept.rows if kept.size else -1  # the first line is the heading
             while piece := file.read(_READ_BYTES):
-                for number, part in enumerate(piece.split(b'"')):  # a String may contain line ends
-                    if number:
-                        quoted = not quoted
-                        offset += 1
-                    if not quoted and (last := part.rfind(b"\n")) >= 0:
-                        lines += part.count(b"\n")
-                        end = offset + last + 1
-                    offset += len(part)
-            rows = kept.rows + lines - (0 if kept.size else 1)  # the first line is the heading
+                rest += piece
+                size = _end_of_rows(rest)
+                rows += sum(part.count(b"\n") for part in rest[:size].split(b'"')[::2])  # not within texts
+                end, rest = end + size, rest[size:]
             file.truncate(end if rows > 0 else 0)
         return max(rows, 0)
 

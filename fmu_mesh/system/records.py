@@ -10,7 +10,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
@@ -45,13 +44,13 @@ _PREFIXES: dict[str, tuple[Causality, ...]] = {
 }
 """What a pattern with one of these words and a colon before it matches."""
 
+_WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
+
 _MOST_LOCALS = 100
 """Locals of an instance without outputs and states that are recorded where nothing is chosen."""
 
 _DEFAULT_FILE = f"{RecordConfig().file}"
 """How the name of a file ends that nobody has chosen."""
-
-_WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
 
 
 class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -150,9 +149,8 @@ def record_warnings(
         if file is not None and section.variables is None:
             instead = [(name, words) for name, own in variables.descriptions.items() if (words := _by_default(own)[1])]
             if instead:
-                found = (
-                    f"no outputs with numbers, so others are recorded: {listed([f'of {n} {w}' for n, w in instead])}"
-                )
+                others = listed([f"of {name} {words}" for name, words in instead])
+                found = f"no outputs with numbers, so others are recorded: {others}"
                 every = f"local:{instead[0][0]}.*" if len(instead) == 1 else "local:*"
                 warnings.add(f"{place}.variables", found, f"`{every}` in this list for all locals")
             elif str(file) not in files:
@@ -246,17 +244,20 @@ def _add_matched(
     findings: Findings,
 ) -> None:
     """Add the columns of all variables that a pattern matches."""
-    pattern = _pattern(reference, place, variables, findings)
-    if pattern is None:
+    word, text = _parts(reference)
+    try:
+        names = matched(text, [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}])
+    except ValueError as error:
+        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
         return
-    found = _matched(pattern, variables)
+    found = _named(names, word, variables)
     for instance, variable in found:
         for element in variable.elements:
             columns.setdefault((instance, element), None)
-    instance, dot, _ = _parts(reference)[1].partition(".")
+    instance, dot, _ = text.partition(".")
     possible = variables if is_pattern(instance) or not dot else {instance} & variables.keys()
     if not found and all(variables[name] is not None for name in possible):
-        _nothing_matches(reference, pattern, place, variables, findings)
+        _nothing_matches(reference, names, place, variables, findings)
 
 
 def _add_named(
@@ -301,20 +302,11 @@ def _resolved(
     return resolve_variable(reference, place, variables, "output", findings)
 
 
-class _Pattern(NamedTuple):
-    """What a pattern matches: whole names `instance.variable`, of variables with one of the causalities."""
-
-    names: set[str]
-    causalities: tuple[Causality, ...]
-
-
 def _is_pattern(reference: str, variables: Variables) -> bool:
     """Whether a text is a pattern; a variable of exactly this name comes first, as names may have any characters."""
     instance, _, name = reference.partition(".")
-    if name in (variables.get(instance) or ()):
-        return False
-    word, colon, _ = reference.partition(":")
-    return is_pattern(reference) or (bool(colon) and word in _PREFIXES)
+    is_name = name in (variables.get(instance) or ())
+    return not is_name and (is_pattern(reference) or _parts(reference)[1] != reference)
 
 
 def _parts(reference: str) -> tuple[str, str]:
@@ -323,45 +315,33 @@ def _parts(reference: str) -> tuple[str, str]:
     return (word, text) if colon and word in _PREFIXES else ("out", reference)
 
 
-def _pattern(reference: str, place: str, variables: Variables, findings: Findings) -> _Pattern | None:
-    """The pattern that a text is; None after a finding."""
-    word, text = _parts(reference)
-    every = [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}]
-    try:
-        return _Pattern(matched(text, every), _PREFIXES[word])
-    except ValueError as error:
-        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
-        return None
-
-
-def _matched(pattern: _Pattern, variables: Variables) -> list[tuple[str, Variable]]:
-    """The variables that a pattern matches, in the order of the file and of the model descriptions."""
+def _named(names: set[str], word: str, variables: Variables) -> list[tuple[str, Variable]]:
+    """The variables with these names that a word stands for, in the order of the file and the model descriptions."""
     return [
         (instance, variable)
         for instance, own in variables.items()
         for variable in (own or {}).values()
-        if variable.causality in pattern.causalities
+        if variable.causality in _PREFIXES[word]
         and not is_text(variable.type)
-        and f"{instance}.{variable.name}" in pattern.names
+        and f"{instance}.{variable.name}" in names
     ]
 
 
-def _nothing_matches(reference: str, pattern: _Pattern, place: str, variables: Variables, findings: Findings) -> None:
-    """Say what a pattern that matches nothing may have been meant to be."""
+def _nothing_matches(reference: str, names: set[str], place: str, variables: Variables, findings: Findings) -> None:
+    """Say what a pattern that matches nothing may have been meant to be; ``names`` are those it would match."""
     word, text = _parts(reference)
-    every = [(f"{instance}.{v.name}", v) for instance, own in variables.items() for v in (own or {}).values()]
-    names = [name for name, v in every if v.causality in pattern.causalities and not is_text(v.type)]
-    texts = [
-        name for name, v in every if v.causality in pattern.causalities and is_text(v.type) and name in pattern.names
-    ]
-    others = [own for own in _PREFIXES if _matched(pattern._replace(causalities=_PREFIXES[own]), variables)]
+    every = {f"{i}.{v.name}": v for i, own in variables.items() for v in (own or {}).values()}
+    possible = {name: v for name, v in every.items() if v.causality in _PREFIXES[word]}
+    numbers = [name for name, v in possible.items() if not is_text(v.type)]
+    texts = [name for name in possible if name in names and name not in numbers]
+    others = [other for other in _PREFIXES if _named(names, other, variables)]
     found = f"{shown(reference)}, which matches no {_WORDS[word]}"
     if texts:
         findings.add(place, found, "each String and Binary by its whole name", texts[0])
-    elif not names:
+    elif not numbers:
         findings.add(place, found, f"another pattern: this mesh has no {_WORDS[word]}s with numbers")
     elif others:
         findings.add(place, found, f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}")
     else:
-        near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), names)
-        findings.add(place, found, f"a pattern for one of {listed(names)}", near)
+        near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), numbers)
+        findings.add(place, found, f"a pattern for one of {listed(numbers)}", near)
