@@ -287,10 +287,11 @@ class _Table:
         heading = file.readline().removeprefix(BOM_UTF8)  # Excel writes one
         while heading.count(b'"') % 2 and len(heading) < _PIECE_BYTES and (more := file.readline(_PIECE_BYTES)):
             heading += more  # a name may contain line ends
-        first, *self.names = next(csv.reader([heading.decode()], strict=True), []) or [None]
-        if first != _TIME:
-            found = f"its first column is '{first[:40]}'" if first is not None else "it is empty"
+        names = next(csv.reader([heading.decode()], strict=True), [])
+        if names[:1] != [_TIME]:
+            found = f"its first column is '{names[0][:40]}'" if names else "it is empty"
             raise ConfigurationError(f"'{path}' is no result file: {found}, not '{_TIME}'.")
+        self.names = names[1:]
         self.is_begun = heading.endswith(b"\n")
         self._path = path
         self._line = 1 + heading.count(b"\n")

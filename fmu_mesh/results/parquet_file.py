@@ -16,7 +16,7 @@ import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Self
@@ -54,11 +54,6 @@ class ParquetFile:
     Args:
         path: the file; its folder is created, and the first row replaces an older file.
         schema: the columns as pyarrow has them, the time first.
-
-    Attributes:
-        path: the file.
-        rows: number of rows written so far; after `close`, the number of rows in the file.
-        kept: what the operating system has of the stream.
 
     Raises:
         ConfigurationError: the file cannot be written, or another run writes it.
@@ -119,10 +114,10 @@ class ParquetFile:
                 return int(open_parquet(file).metadata.num_rows)
         rows = 0
         if stream.stat().st_size:
-            with _Stream(stream) as batches, _GroupWriter(path, batches.schema) as groups:
+            with _batches(stream) as (schema, batches, notes), closing(_GroupWriter(path, schema)) as groups:
                 for batch in batches:
                     groups.add(batch)
-                rows = groups.finish(batches.notes)
+                rows = groups.finish(notes)
         stream.unlink()
         return rows
 
@@ -132,11 +127,11 @@ class ParquetFile:
         pyarrow_module()
         stream = ParquetFile.growing_file(path)
         if stream.is_file() and not path.exists():
-            with _Stream(stream) as batches:
-                none, names = columns_of(path, batches.schema)
+            with _batches(stream) as (schema, batches, notes):
+                none, names = columns_of(path, schema)
                 for batch in batches:
                     yield none._replace(**arrays_of(batch, names))
-                yield none._replace(metadata=with_notes(none.metadata, batches.notes))
+                yield none._replace(metadata=with_notes(none.metadata, notes))
             return
         with opened(path) as file:
             content = open_parquet(file)
@@ -167,7 +162,9 @@ class ParquetFile:
         while done < len(times):
             count = min(len(times) - done, self._block_rows - self._waiting)
             if self._texts:
-                count = self._rows_of_texts([arrays[place][done : done + count] for place in self._texts])
+                texts = np.column_stack([arrays[place][done : done + count] for place in self._texts]).tolist()
+                sizes = np.cumsum([sum(map(len, row)) for row in texts])
+                count = max(1, int(np.searchsorted(sizes, _BLOCK_BYTES, side="right")))
             block = slice(self._waiting, self._waiting + count)
             for own, array in zip(self._block, arrays, strict=True):
                 own[block] = array[done : done + count]
@@ -204,7 +201,7 @@ class ParquetFile:
         """Write the end of the draft; if there is none because it could not be written, make it of the stream again."""
         stream = self.growing_file(self.path)
         if self._groups is not None:
-            with self._groups as groups:
+            with closing(self._groups) as groups:
                 groups.finish(self._noted)
             stream.unlink()
         elif self.kept.rows:
@@ -245,59 +242,36 @@ class ParquetFile:
         except OSError:
             groups, self._groups, self._stream_only = self._groups, None, True
             if groups is not None:
-                groups.abandon()
+                groups.close()
             raise
 
-    @staticmethod
-    def _rows_of_texts(columns: Sequence[NDArray[Any]]) -> int:
-        """How many of these rows fit into a batch; at least one."""
-        sizes = np.cumsum([sum(map(len, row)) for row in np.column_stack(columns).tolist()])
-        return max(1, int(np.searchsorted(sizes, _BLOCK_BYTES, side="right")))
 
-
-class _Stream:
-    """The batches of a stream, up to the first one that is not complete.
-
-    Args:
-        path: the stream.
-
-    Attributes:
-        schema: of the stream.
-        notes: the entries of the batches that were read.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.notes: list[Mapping[str, Any]] = []
-        self._pa = pyarrow_module()
-        self._file = path.open("rb")
+@contextmanager
+def _batches(path: Path) -> Iterator[tuple[Any, Iterator[Any], list[dict[str, Any]]]]:
+    """The schema of a stream, its batches up to the first one that is not complete, and the entries noted in them."""
+    pa, notes = pyarrow_module(), list[dict[str, Any]]()
+    with path.open("rb") as file:
         try:
-            self._reader = self._pa.ipc.open_stream(self._file)
-        except (self._pa.ArrowException, OSError) as error:
-            self._file.close()
+            reader = pa.ipc.open_stream(file)
+        except (pa.ArrowException, OSError) as error:
             raise no_result(path, f"its heading is not complete ({error})") from error
-        self.schema = self._reader.schema
 
-    def __enter__(self) -> Self:
-        return self
+        def complete() -> Iterator[Any]:
+            while True:
+                try:
+                    batch, own = reader.read_next_batch_with_custom_metadata()
+                    batch.validate(full=True)  # wrong offsets of texts would crash
+                    if own is not None:
+                        notes.extend(decoded_json(own[KEY], list[dict[str, Any]]))
+                except (StopIteration, pa.ArrowException, OSError, KeyError, ValueError):
+                    return  # the end, or a batch that is cut off
+                yield batch
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def __iter__(self) -> Iterator[Any]:
-        while True:
-            try:
-                batch, own = self._reader.read_next_batch_with_custom_metadata()
-                batch.validate(full=True)  # wrong offsets of texts would crash
-                if own is not None:
-                    self.notes += decoded_json(own[KEY], list[dict[str, Any]])
-            except (StopIteration, self._pa.ArrowException, OSError, KeyError, ValueError):
-                # The end, or a batch that is cut off.
-                return
-            yield batch
+        yield reader.schema, complete(), notes
 
 
 class _GroupWriter:
-    """Writes a draft of the Parquet file, which gets its name at the end; a context manager, which removes the draft.
+    """Writes a draft of the Parquet file, which gets its name at the end; `close` removes the draft.
 
     A batch is kept until its row group is complete. So it must own its memory. A row group is compressed on a thread of
     its own, because that takes tens of milliseconds, in which nodes would have to wait for the recorder. If two groups
@@ -331,20 +305,7 @@ class _GroupWriter:
         self._compressing = ThreadPoolExecutor(1, "parquet")
         self._begun: Future[None] | None = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.abandon()
-
     def add(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
-        """Add the rows of a batch.
-
-        Raises:
-            OSError: the draft cannot be written; it is removed.
-        """
         while batch.num_rows:
             part = batch.slice(0, _GROUP_ROWS - self._rows)
             batch = batch.slice(part.num_rows)
@@ -354,11 +315,7 @@ class _GroupWriter:
                 self._write()
 
     def finish(self, notes: Sequence[Mapping[str, Any]]) -> int:
-        """Write the end, and give the file its name; return the number of its rows. Without a row, there is no file.
-
-        Raises:
-            OSError: the draft cannot be written; it is removed.
-        """
+        """Write the end, and give the file its name; return the number of its rows. Without a row, there is no file."""
         if self._rows:
             self._write()
         self._wait()
@@ -371,7 +328,7 @@ class _GroupWriter:
             self._draft.close()
         return self._written
 
-    def abandon(self) -> None:
+    def close(self) -> None:
         """Remove the draft, unless it has become the file."""
         writer, self._writer = self._writer, None
         if writer is None:
@@ -379,8 +336,8 @@ class _GroupWriter:
         self._compressing.shutdown(cancel_futures=True)
         with suppress(OSError):
             writer.close()
-        with suppress(_Abandoned, OSError), self._draft:
-            raise _Abandoned
+        with suppress(OSError), self._draft:
+            raise OSError("the draft is of no use")  # so it is removed
 
     def _keep(self, batch: Any) -> None:  # noqa: ANN401  pyarrow has no types
         """Keep a batch for the row group; many small ones become a large one, which takes less memory."""
@@ -401,15 +358,7 @@ class _GroupWriter:
         self._begun = self._compressing.submit(self._writer.write_table, table, row_group_size=_GROUP_ROWS)
 
     def _wait(self) -> None:
-        """Wait until the row group that was begun is written.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Wait until the row group that was begun is written, or raise why it cannot be."""
         begun, self._begun = self._begun, None
         if begun is not None:
             begun.result()
-
-
-class _Abandoned(Exception):
-    """A draft is of no use."""

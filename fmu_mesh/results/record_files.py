@@ -54,10 +54,11 @@ def open_results(
     files: list[ResultFile] = []
     try:
         for record in system.records:
-            metadata = metadata_of(loaded, system, record, digest=digest, contents=contents) if digest else {}
             place = places.get(record.file, "record")
-            of_rows = record.variables, place, record.first, record.every
-            recording = Recording(loaded, descriptions, *of_rows, to_builtins(metadata))
+            recording = Recording(loaded, descriptions, record.variables, place, record.first, record.every)
+            if digest:
+                metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
+                recording = replace(recording, metadata=to_builtins(metadata))
             files.append(required_format(record.file).open(Path(record.file), recording))
     except BaseException:
         for file in files:

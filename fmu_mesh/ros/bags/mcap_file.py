@@ -57,11 +57,6 @@ class McapFile:
         recording: what is recorded.
         plan: the topics, and how often the clock ticks.
 
-    Attributes:
-        path: the file.
-        rows: number of rows written so far; after `close`, the number of rows in the file.
-        kept: what the operating system has.
-
     Raises:
         ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
