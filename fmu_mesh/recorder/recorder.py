@@ -196,7 +196,9 @@ class Recorder:
             if message is None:
                 self._write_rows()
                 self._tell_progress()
-                self._flush()
+                if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
+                    self._flushed = now
+                    self._files.flush()
                 if (wishes := self._wishes()) is None:
                     continue
                 message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LOOK_S, wishes)
@@ -259,11 +261,6 @@ class Recorder:
         """The rows from which points are written are complete, and nobody has overwritten them."""
         for source in self._sources.values():
             source.check(first, end)
-
-    def _flush(self) -> None:
-        if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
-            self._flushed = now
-            self._files.flush()
 
     def _tell_progress(self) -> None:
         """Tell how many points are written; the first one before, because nothing is written until all are there."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,13 @@ class RowBuffer:
         self._waiting: list[list[Value]] = []
         self._arrays: list[NDArray[Any]] = []
         self._writing = threading.Lock()
-        self._places = {column: place for place, column in enumerate(union_of(records))}
-        self._files.begin(grid, records, self._column_of)
+        places = {column: place for place, column in enumerate(union_of(records))}
+
+        def column_of(instance: str, variable: str) -> ReadColumn:
+            place = places[instance, variable]
+            return lambda first, end: self._arrays[place][first - self._first : end - self._first]
+
+        self._files.begin(grid, records, column_of)
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:
@@ -84,15 +90,11 @@ class RowBuffer:
         Raises:
             ConfigurationError: a file cannot be written.
         """
-        if not self._writing.acquire(timeout=_CLOSE_S):
-            return  # another thread is writing to a disk that does not answer
-        try:
-            try:
+        if self._writing.acquire(timeout=_CLOSE_S):  # or another thread is writing to a disk that does not answer
+            with ExitStack() as stack:
+                stack.callback(self._writing.release)
+                stack.callback(self._files.close)
                 self._write()
-            finally:
-                self._files.close()
-        finally:
-            self._writing.release()
 
     def _write(self) -> None:
         rows, self._waiting = self._waiting, []
@@ -107,7 +109,3 @@ class RowBuffer:
             self._files.write(self._first, self._first + len(rows))
         finally:
             self._first += len(rows)
-
-    def _column_of(self, instance: str, variable: str) -> ReadColumn:
-        place = self._places[instance, variable]
-        return lambda first, end: self._arrays[place][first - self._first : end - self._first]

@@ -47,27 +47,14 @@ class RowWriter:
         if RECORDER not in plan.nodes:
             return
         node = plan.nodes[RECORDER]
-        own = {link.source: runners[link.source] for link in node.links_in}
-        sources = {
-            link.source: RecordedSource(
-                link, plan.grid.last_point, [SourceRows(own[link.source].outputs, own[link.source].counter)], None
-            )
-            for link in node.links_in
-        }
+        sources = {}
+        for link in node.links_in:
+            rows = SourceRows(runners[link.source].outputs, runners[link.source].counter)
+            sources[link.source] = RecordedSource(link, plan.grid.last_point, [rows], None)
         self._rows = min(place.rows for place in node.rings)
         self._sources = list(sources.values())
         records = node.records[: len(self._files.counted)]
         self._files.begin(plan.grid, records, lambda instance, variable: sources[instance].column(variable))
-
-    @property
-    def rows(self) -> int:
-        """Number of rows in the file."""
-        return sum(rows for _, rows in self.counted)
-
-    @property
-    def file(self) -> str | None:
-        """The path of the file."""
-        return next((file for file, _ in self.counted), None)
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:

@@ -216,11 +216,10 @@ def _chosen(section: RecordConfig, place: str, variables: Variables, findings: F
             for variable in _by_default(description)[0]
             for element in variable.elements
         )
-    columns: dict[tuple[str, str], str | None] = {}  # where a column is named; None: only patterns match it
+    choice = _Choice(variables, findings)
     for index, reference in enumerate(section.variables):
-        add = _add_matched if _is_pattern(reference, variables) else _add_named
-        add(reference, f"{place}[{index}]", columns, variables, findings)
-    return tuple(columns)
+        choice.add(reference, f"{place}[{index}]")
+    return tuple(choice.columns)
 
 
 def _by_default(description: ModelDescription) -> tuple[Sequence[Variable], str]:
@@ -236,112 +235,102 @@ def _by_default(description: ModelDescription) -> tuple[Sequence[Variable], str]
     return changing[:_MOST_LOCALS], f"{first}its locals that change ({len(changing)})" if changing else ""
 
 
-def _add_matched(
-    reference: str,
-    place: str,
-    columns: dict[tuple[str, str], str | None],
-    variables: Variables,
-    findings: Findings,
-) -> None:
-    """Add the columns of all variables that a pattern matches."""
-    word, text = _parts(reference)
-    try:
-        names = matched(text, [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}])
-    except ValueError as error:
-        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
-        return
-    found = _named(names, word, variables)
-    for instance, variable in found:
-        for element in variable.elements:
-            columns.setdefault((instance, element), None)
-    instance, dot, _ = text.partition(".")
-    possible = variables if is_pattern(instance) or not dot else {instance} & variables.keys()
-    if not found and all(variables[name] is not None for name in possible):
-        _nothing_matches(reference, names, place, variables, findings)
+class _Choice:
+    """The columns that names and patterns stand for.
 
+    Attributes:
+        columns: (instance, variable), and the place where it is named; None: only patterns match it.
+    """
 
-def _add_named(
-    reference: str,
-    place: str,
-    columns: dict[tuple[str, str], str | None],
-    variables: Variables,
-    findings: Findings,
-) -> None:
-    """Add the columns of a variable, or of an element of an array, that is named."""
-    instance, _, name = reference.partition(".")
-    first = columns.get((instance, name))
-    end = None if first else _resolved(reference, place, variables, findings)
-    names: tuple[str, ...] = (name,)
-    if end is not None:
-        variable, element = end
-        names = (element_name(variable.name, element),) if element else variable.elements
-        first = next((where for one in names if (where := columns.get((instance, one)))), None)
-        if variable.causality == "independent":
-            found = f"'{reference}', the independent variable"
-            findings.add(place, found, "another variable: its values are in the column time")
-    if first:
-        findings.add(place, f"'{reference}' a second time (first: {first})", "every variable at most once")
-    for one in names:
-        columns[instance, one] = first or place
+    def __init__(self, variables: Variables, findings: Findings) -> None:
+        self.columns: dict[tuple[str, str], str | None] = {}
+        self._variables = variables
+        self._findings = findings
 
+    def add(self, reference: str, place: str) -> None:
+        """Add what a name or a pattern stands for; names come first, as those of variables may have any characters."""
+        instance, _, name = reference.partition(".")
+        word, colon, text = reference.partition(":")
+        has_word = bool(colon) and word in _PREFIXES
+        if name in (self._variables.get(instance) or ()) or not (has_word or is_pattern(reference)):
+            self._add_named(reference, place)
+        else:
+            self._add_matched(reference, place, *((word, text) if has_word else ("out", reference)))
 
-def _resolved(
-    reference: str, place: str, variables: Variables, findings: Findings
-) -> tuple[Variable, tuple[int, ...]] | None:
-    """As `resolve_variable`; the nearest name is that of any variable where no output is near."""
-    instance, _, name = reference.partition(".")
-    own = variables.get(instance)
-    is_clock = own is not None and variables.descriptions[instance].clock(name) is not None
-    if own and name and name not in own and split_element(name) is None and not is_clock:
-        outputs = [variable.name for variable in own.values() if variable.causality == "output"]
-        near = nearest(name, own) if nearest(name, outputs) is None else None
-        if near is not None:
-            found = f"the unknown variable '{name}' of instance '{instance}'"
-            findings.add(place, found, f"one of the {len(own)} variables of '{instance}'", near)
-            return None
-    return resolve_variable(reference, place, variables, "output", findings)
+    def _add_matched(self, reference: str, place: str, word: str, text: str) -> None:
+        variables = self._variables
+        try:
+            names = matched(text, [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}])
+        except ValueError as error:
+            expected = f"a regular expression of Python after `{EXPRESSION}`"
+            self._findings.add(place, f"{shown(reference)} ({error})", expected)
+            return
+        found = self._matched(names, word)
+        for instance, variable in found:
+            for element in variable.elements:
+                self.columns.setdefault((instance, element), None)
+        instance, dot, _ = text.partition(".")
+        possible = variables if is_pattern(instance) or not dot else {instance} & variables.keys()
+        if not found and all(variables[name] is not None for name in possible):
+            self._nothing_matches(f"{shown(reference)}, which matches no {_WORDS[word]}", place, word, text, names)
 
+    def _matched(self, names: set[str], word: str) -> list[tuple[str, Variable]]:
+        """The variables with these names that a word stands for, in the order of the file and the descriptions."""
+        return [
+            (instance, variable)
+            for instance, own in self._variables.items()
+            for variable in (own or {}).values()
+            if variable.causality in _PREFIXES[word]
+            and not is_text(variable.type)
+            and f"{instance}.{variable.name}" in names
+        ]
 
-def _is_pattern(reference: str, variables: Variables) -> bool:
-    """Whether a text is a pattern; a variable of exactly this name comes first, as names may have any characters."""
-    instance, _, name = reference.partition(".")
-    is_name = name in (variables.get(instance) or ())
-    return not is_name and (is_pattern(reference) or _parts(reference)[1] != reference)
+    def _nothing_matches(self, found: str, place: str, word: str, text: str, names: set[str]) -> None:
+        """Say what a pattern may have been meant to be; ``names`` are those that it matches without its word."""
+        every = {f"{i}.{v.name}": v for i, own in self._variables.items() for v in (own or {}).values()}
+        possible = {name: v for name, v in every.items() if v.causality in _PREFIXES[word]}
+        numbers = [name for name, v in possible.items() if not is_text(v.type)]
+        texts = [name for name in possible if name in names and name not in numbers]
+        others = [other for other in _PREFIXES if self._matched(names, other)]
+        if texts:
+            expected, near = "each String and Binary by its whole name", texts[0]
+        elif not numbers:
+            expected, near = f"another pattern: this mesh has no {_WORDS[word]}s with numbers", None
+        elif others:
+            expected, near = f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}"
+        else:
+            expected = f"a pattern for one of {listed(numbers)}"
+            near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), numbers)
+        self._findings.add(place, found, expected, near)
 
+    def _add_named(self, reference: str, place: str) -> None:
+        """Add a variable, or an element of an array; of a name that is not known the column, for later findings."""
+        instance, _, name = reference.partition(".")
+        first = self.columns.get((instance, name))
+        end = None if first else self._resolved(reference, place)
+        names: tuple[str, ...] = (name,)
+        if end is not None:
+            variable, element = end
+            names = (element_name(variable.name, element),) if element else variable.elements
+            first = next((where for one in names if (where := self.columns.get((instance, one)))), None)
+            if variable.causality == "independent":
+                found = f"'{reference}', the independent variable"
+                self._findings.add(place, found, "another variable: its values are in the column time")
+        if first:
+            self._findings.add(place, f"'{reference}' a second time (first: {first})", "every variable at most once")
+        for one in names:
+            self.columns[instance, one] = first or place
 
-def _parts(reference: str) -> tuple[str, str]:
-    """The word before a pattern that says what it matches, and the pattern."""
-    word, colon, text = reference.partition(":")
-    return (word, text) if colon and word in _PREFIXES else ("out", reference)
-
-
-def _named(names: set[str], word: str, variables: Variables) -> list[tuple[str, Variable]]:
-    """The variables with these names that a word stands for, in the order of the file and the model descriptions."""
-    return [
-        (instance, variable)
-        for instance, own in variables.items()
-        for variable in (own or {}).values()
-        if variable.causality in _PREFIXES[word]
-        and not is_text(variable.type)
-        and f"{instance}.{variable.name}" in names
-    ]
-
-
-def _nothing_matches(reference: str, names: set[str], place: str, variables: Variables, findings: Findings) -> None:
-    """Say what a pattern that matches nothing may have been meant to be; ``names`` are those it would match."""
-    word, text = _parts(reference)
-    every = {f"{i}.{v.name}": v for i, own in variables.items() for v in (own or {}).values()}
-    possible = {name: v for name, v in every.items() if v.causality in _PREFIXES[word]}
-    numbers = [name for name, v in possible.items() if not is_text(v.type)]
-    texts = [name for name in possible if name in names and name not in numbers]
-    others = [other for other in _PREFIXES if _named(names, other, variables)]
-    found = f"{shown(reference)}, which matches no {_WORDS[word]}"
-    if texts:
-        findings.add(place, found, "each String and Binary by its whole name", texts[0])
-    elif not numbers:
-        findings.add(place, found, f"another pattern: this mesh has no {_WORDS[word]}s with numbers")
-    elif others:
-        findings.add(place, found, f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}")
-    else:
-        near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), numbers)
-        findings.add(place, found, f"a pattern for one of {listed(numbers)}", near)
+    def _resolved(self, reference: str, place: str) -> tuple[Variable, tuple[int, ...]] | None:
+        """As `resolve_variable`; the nearest name is that of any variable where no output is near."""
+        instance, _, name = reference.partition(".")
+        own = self._variables.get(instance)
+        is_clock = own is not None and self._variables.descriptions[instance].clock(name) is not None
+        if own and name and name not in own and split_element(name) is None and not is_clock:
+            outputs = [variable.name for variable in own.values() if variable.causality == "output"]
+            near = nearest(name, own) if nearest(name, outputs) is None else None
+            if near is not None:
+                found = f"the unknown variable '{name}' of instance '{instance}'"
+                self._findings.add(place, found, f"one of the {len(own)} variables of '{instance}'", near)
+                return None
+        return resolve_variable(reference, place, self._variables, "output", self._findings)
