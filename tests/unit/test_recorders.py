@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import fmu_mesh
 from fmu_mesh import plugins
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
@@ -125,6 +126,19 @@ def test_an_installation_that_is_older_than_its_source_says_how_to_install_again
         plugins.plugin("fmu_mesh.not_yet", "csv")
 
     assert raised.value.hint == f"Install it again, as you did before, from {Path(__file__).parents[2]}."
+
+
+def test_a_package_that_reads_a_file_at_once_is_still_understood(tmp_path: Path, offer: Offer) -> None:
+    offer("tables", "table", "table_of_a_package:Table")
+    (tmp_path / "tables" / "table_of_a_package.py").write_text(
+        "import numpy as np\nfrom fmu_mesh.results.recording import Columns\n\n"
+        "class Table:\n    def read(path):\n        return Columns(np.zeros(1), {'a.x': np.ones(1)})\n"
+    )
+
+    with pytest.warns(DeprecationWarning, match=r"Table.read\(path\) becomes pieces\(path, types\)"):
+        result = fmu_mesh.Result.read(tmp_path / "some.table")
+
+    assert result["a.x"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("noted", "rows"), [((2, 3), 2), ((2, 1000), 0), (None, 0)])

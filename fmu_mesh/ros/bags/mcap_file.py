@@ -240,17 +240,10 @@ def _layout(recording: Recording, plan: RosPlan) -> RecordedMcap:
 
 
 def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
-    """The topics that hold the recorded variables.
+    """The topics that hold the recorded variables; None if a finding makes it impossible to go on.
 
     A topic of the `ros` section is recorded as it is if all of its variables are recorded. Every other recorded
     variable has a topic of its own, with the name and the type that the section gives it by default.
-
-    Args:
-        recording: what is recorded.
-        findings: where findings go.
-
-    Returns:
-        None if a finding makes it impossible to go on.
     """
     loaded, descriptions = recording.loaded, recording.descriptions
     section = loaded.config.ros or RosConfig()
