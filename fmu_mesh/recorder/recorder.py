@@ -4,6 +4,27 @@ It has its own thread in the master's process, and its own inbox, liveliness tok
 ahead of the rows that are not written yet than the window of the recorder. So no row is dropped, and memory is bounded.
 """
 
+# Who meets here. The recorder is a thread of the master's process; the master is the main thread of it. The nodes are
+# other processes, often on the same host. They meet in two places: counters in shared memory, which the nodes raise and
+# this thread reads (and the other way round for the progress), and the inbox, into which Zenoh's threads put frames and
+# messages, and the main thread the end of the run (`__exit__`). Only this thread touches the sources and the files
+# until it has ended; then the main thread writes what is left and closes them.
+#
+# What may go wrong:
+# * A node could overwrite rows that are not written yet. The windows forbid it, and the stamps of all rows are compared
+#   before and after they are read: a row that is not the one expected ends the run and never becomes a value.
+# * The run may fail in Initialization Mode, after rows of point 0 are complete. So nothing is written before the master
+#   says that all nodes have begun (ADR 50): the last result stays.
+# * A run that ends early still has rows on their way. This thread waits half a second for the nodes to say that they
+#   have sent their last ones, and not for those that are lost.
+# * The reason of such an end comes from the master of this process and not by a message: on the other thread a message
+#   may arrive after the end.
+#
+# What was tried and given up: a thread that never slept while rows came took a processor from a node that steps, and
+# the interpreter from the master; one that woke up only five times a second let the run wait at point 0. Now it sleeps
+# until half a window is there, or for 5 ms. A recorder thread for each file would read the same rings several times
+# (ADR 60). The rings and counters are ADR 58.
+
 from __future__ import annotations
 
 import logging

@@ -1,5 +1,9 @@
 """Collects rows of single values and writes many at once into the result files: used by a run in one process."""
 
+# Two threads meet here: the one that steps, and the one that watches it, which saves the rows if a call of an FMU does
+# not return. Both write under a lock. If the disk does not answer either, the watching thread gives up after half a
+# second: a process that ends must not wait for it. The files are ADR 50 and 60.
+
 from __future__ import annotations
 
 import threading

@@ -7,6 +7,18 @@ text, or no library.
 The last row may be cut off where a run was killed, or goes on.
 """
 
+# Why lines are made in C, and why twice. The recorder shares the processors with nodes that step, and most of its time
+# is the text of numbers. orjson makes it fast, but it has to be split into cells again: to find its commas took NumPy a
+# quarter of the recorder's time (ADR 7). `csv_rows.c` writes the digits of a whole block into memory that is used again,
+# and copies the text of a value that has not changed. Python has the same characters for texts and for machines without
+# the library; tests compare both.
+#
+# What may go wrong: the writer may be killed at any byte, and a reader may look at any moment. So `write` gives whole
+# rows to the operating system, nothing is buffered, and everybody who reads finds the end of the last whole row with
+# `_end_of_rows`: quotation marks are counted, because a text may contain line ends. Threads: rows are written by one
+# thread at a time, and the file may be closed by another one (`RecordFiles`); the C function holds no lock and keeps
+# nothing but the memory that it is given. An old result is replaced by the first row only (ADR 50).
+
 from __future__ import annotations
 
 import base64

@@ -3,6 +3,9 @@
 Knows neither how the instances are stepped nor when the run ends.
 """
 
+# Two threads meet here: the one that steps and writes, and the one that watches it, which closes the file if a call of
+# an FMU does not return. The lock and its deadline are those of `fmu_mesh.recorder.row_buffer`; see ADR 50 and 60.
+
 from __future__ import annotations
 
 import threading
