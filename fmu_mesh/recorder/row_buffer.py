@@ -76,11 +76,7 @@ class RowBuffer:
         self._waiting.append(row)
 
     def write(self, *, flush: bool = False) -> None:
-        """Give the new rows to the files; with ``flush``, other processes can read them then.
-
-        Raises:
-            ConfigurationError: a file cannot be written; the others have their rows.
-        """
+        """As `RecordFiles.write`, for the new rows; with ``flush``, other processes can read them then."""
         if flush:
             self.flushed_at = time.monotonic()
         with self._writing:
@@ -89,11 +85,7 @@ class RowBuffer:
                 self._files.flush()
 
     def close(self) -> None:
-        """Write what is left and close the files.
-
-        Raises:
-            ConfigurationError: a file cannot be written.
-        """
+        """Write what is left and close the files (see `RecordFiles.close`)."""
         if self._writing.acquire(timeout=_CLOSE_S):  # or another thread is writing to a disk that does not answer
             with ExitStack() as stack:
                 stack.callback(self._writing.release)

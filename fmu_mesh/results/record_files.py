@@ -40,11 +40,8 @@ def open_results(
 ) -> list[ResultFile]:
     """Open the result files of a run, in their order; none if nothing is recorded.
 
-    Args:
-        loaded: the configuration.
-        system: the system of this configuration.
-        digest: the digest of the mesh, for the metadata; without it the files have none, which saves milliseconds.
-        contents: the SHA-256 of the model of each instance, for the metadata.
+    Their metadata have the digest of the mesh and the SHA-256 of the model of each instance (``contents``). Without a
+    digest they have no metadata, which saves milliseconds.
 
     Raises:
         ConfigurationError: a file cannot be written, or another run is writing it. All files are as they were.
@@ -105,13 +102,7 @@ class RecordFiles:
         return tuple((str(own.file.path), own.file.rows) for own in self._files)
 
     def begin(self, grid: TimeGrid, records: Sequence[RecordPlan], column_of: Callable[[str, str], ReadColumn]) -> None:
-        """Choose what the files get.
-
-        Args:
-            grid: the communication points.
-            records: the plan of each file.
-            column_of: how the values of a variable of an instance are read.
-        """
+        """Choose what the files get; ``column_of`` says how the values of a variable of an instance are read."""
         columns: dict[tuple[str, str], ReadColumn] = {}
         for own, record in zip(self._files, records, strict=True):
             for key in record.variables:
@@ -232,19 +223,13 @@ class _RecordFile:
 def rows_left(result_files: Sequence[str], folder: Path) -> tuple[tuple[str, int], ...]:
     """Each result file of a killed process, and the number of rows in it. What follows the last row is cut off.
 
-    Args:
-        result_files: paths of the files.
-        folder: the folder of the run.
+    ``folder`` is that of the run, with the notes.
     """
     return tuple((file, _rows_left(Path(file), folder / _note_of(number))) for number, file in enumerate(result_files))
 
 
 def what_is_kept(files: Sequence[tuple[str, int]]) -> str | None:
-    """The sentence for a run that ended early and left rows; None if there are no rows, as on a device.
-
-    Args:
-        files: each result file, and the number of its rows.
-    """
+    """The sentence for a run that ended early, and left these numbers of rows; None if there are none."""
     kept = [(where, rows) for file, rows in files if rows and (where := _where(file)) is not None]
     if not kept:
         return None

@@ -99,10 +99,7 @@ class ResultFormat(Protocol):
     def check(self, recording: Recording, findings: Findings) -> None:
         """Add a finding for everything that a file of this format cannot hold.
 
-        Args:
-            recording: what is to be recorded.
-            findings: where findings go, each with its path in the configuration: that of the section and a key, such
-                as `record.variables` or `record[1].variables`.
+        A finding has a path in the configuration: `Recording.place` and a key, such as `record[1].variables`.
 
         Raises:
             ConfigurationError: a package that the format needs is missing.
@@ -110,11 +107,7 @@ class ResultFormat(Protocol):
         ...
 
     def open(self, path: Path, recording: Recording) -> ResultFile:
-        """Open a result file.
-
-        Args:
-            path: absolute path of the file; its folder may not exist yet.
-            recording: what is recorded; `check` has found nothing wrong with it.
+        """Open a result file for what `check` has found nothing wrong with. The folder of the path may not exist yet.
 
         Raises:
             ConfigurationError: the file cannot be written, or another run is writing it.
@@ -201,10 +194,7 @@ class ResultFile(Protocol):
         """Add what happened during the run to the metadata of the file (see `with_notes`).
 
         The operating system has it after the next `flush` at the latest. Without a row, nothing is written. A format
-        that has no place for metadata does nothing.
-
-        Args:
-            entry: an object of JSON; it is not changed any more.
+        that has no place for metadata does nothing. The entry is an object of JSON, and is not changed any more.
         """
         ...
 

@@ -100,7 +100,7 @@ CheckRecord = Callable[[RecordPlan, str, Mapping[str, ModelDescription], Finding
 """Adds a finding for everything that the format of a file cannot hold, given the place of its section."""
 
 
-def resolve_records(  # noqa: PLR0913, PLR0917  a section, what it may refer to, and where findings go
+def resolve_records(  # noqa: PLR0913, PLR0917  sections, what they may refer to, and where findings go
     loaded: LoadedConfig,
     variables: Variables,
     grid: TimeGrid | None,
@@ -115,7 +115,7 @@ def resolve_records(  # noqa: PLR0913, PLR0917  a section, what it may refer to,
         variables: all variables of all instances; None in place of those that are not known.
         grid: the communication points; None after a finding about them.
         findings: where findings go.
-        obstacles: where findings go about the files themselves, such as a folder of that name, or a missing package.
+        obstacles: where those about the files themselves go, such as a missing package.
         check: what the formats say about their files.
     """
     records: list[RecordPlan] = []

@@ -133,15 +133,7 @@ def metadata_of(
     digest: str = "",
     contents: Mapping[str, str] = {},
 ) -> RunMetadata:
-    """What a result file of this run says about it.
-
-    Args:
-        loaded: the configuration, options applied.
-        system: the system of this configuration.
-        record: the plan of the file, one of the system.
-        digest: the digest of the mesh.
-        contents: the SHA-256 of the model of each instance.
-    """
+    """What a result file of this run says about it; ``contents`` has the SHA-256 of the model of each instance."""
     variables = {}
     for instance, name in record.variables:
         of = system.instances[instance].description.variable_of(name)
@@ -244,11 +236,6 @@ def machine() -> dict[str, str]:
 
 
 def machine_difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """In words why two machines may calculate other last digits; empty if there is no reason, or it is not known.
-
-    Args:
-        here: the `machine` of one result, perhaps among `versions`.
-        there: that of the other one.
-    """
+    """In words why two machines (`machine`) may calculate other last digits; empty if no reason is known."""
     keys = [key for key in machine() if key in here and key in there and here[key] != there[key]]
     return ", ".join(f"{key} '{here[key]}' and '{there[key]}'" for key in keys)
