@@ -98,7 +98,7 @@ def test_a_damaged_row_does_not_end_the_rows(path: Path) -> None:
     damaged = tail.read(["a.x"])
     _add(path, b"0.2,1.0,1.0,true\n0.3,2.0,1.0,true\n")
 
-    assert damaged is None
+    assert _known(damaged) == ([], [[]])  # and not None, which is the end of the file
     assert _known(tail.read(["a.x"])) == ([0.3], [[2.0]])
     tail.close()
 
