@@ -5,7 +5,7 @@ Knows results only by their arrays and units.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ class Side(NamedTuple):
 
     Attributes:
         title: what messages call it.
-        columns: the names of its variables.
+        columns: the names of its variables; of thousands a collection that finds one at once.
         pieces: its rows, piece by piece; times do not decrease.
         all: all of its rows.
         unit: the unit of a variable by its name; None if it is not known.
@@ -36,7 +36,7 @@ class Side(NamedTuple):
     """
 
     title: str
-    columns: Sequence[str]
+    columns: Collection[str]
     pieces: Callable[[], Iterator[Columns]]
     all: Callable[[], Columns]
     unit: Callable[[str], str | None]

@@ -415,7 +415,7 @@ class Result(Mapping[str, NDArray[Any]]):
         """This result, as it is compared with another one."""
         return Side(
             str(short_path(self.file)) if self.file is not None else self.title,
-            [*self],
+            dict.fromkeys(self),
             self._pieces,
             lambda: self._columns,
             self._unit,
