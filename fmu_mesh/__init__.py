@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from .api.mesh_check import Check
     from .api.open_system import System, SystemState
     from .api.package_inspection import PackageInspection, inspect_package
-    from .api.recovering import recover
     from .api.rerunning import rerun
     from .api.result import Result
     from .api.run_handle import Run
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from .instances.python.component import Component, component
     from .instances.python.declarations import Input, Output, Parameter
     from .pictures.system_graph import SystemGraph
+    from .results.formats import recover
     from .sweeps.sweep_result import SweepResult
     from .sweeps.sweeping import Sweep, sweep
     from .sweeps.variants import Range
@@ -114,7 +114,7 @@ _PLACES = {
     "Output": "instances.python.declarations",
     "Parameter": "instances.python.declarations",
     "Result": "api.result",
-    "recover": "api.recovering",
+    "recover": "results.formats",
     "rerun": "api.rerunning",
     "Run": "api.run_handle",
     "Range": "sweeps.variants",

@@ -5,14 +5,14 @@ Knows results only by their arrays and units.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.recording import Columns
+from ..results.recording import Columns
 from ..variables.units import BaseUnit, Linear, conversion
 from .comparison import Comparison, FirstDifference, Rows, VariableDifference
 
@@ -27,7 +27,7 @@ class Side(NamedTuple):
 
     Attributes:
         title: what messages call it.
-        columns: the names of its variables.
+        columns: the names of its variables; of thousands a collection that finds one at once.
         pieces: its rows, piece by piece; times do not decrease.
         all: all of its rows.
         unit: the unit of a variable by its name; None if it is not known.
@@ -36,7 +36,7 @@ class Side(NamedTuple):
     """
 
     title: str
-    columns: Sequence[str]
+    columns: Collection[str]
     pieces: Callable[[], Iterator[Columns]]
     all: Callable[[], Columns]
     unit: Callable[[str], str | None]
@@ -77,8 +77,9 @@ def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0
         tallies = {name: _Tally(here, there, name, (rtol, atol)) for name in both}
         matching, own, other = _matched(here, there)
         for name, tally in tallies.items():
-            values = _values_there(matching, own.times, other, tally.converted(other.values[name]))
-            tally.add(own.times[matching.here], own.values[name][matching.here], values)
+            values = values_in_unit_of(here, there, name, other.values[name])
+            of_rows = _values_there(matching, own.times, other, values)
+            tally.add(own.times[matching.here], own.values[name][matching.here], of_rows)
     found = {name: tally.difference for name, tally in tallies.items()}
     firsts = [(tally.first, name) for name, tally in tallies.items() if tally.first is not None]
     first = min(firsts, default=None, key=lambda own: own[0][0])  # of equal rows the first variable
@@ -154,7 +155,7 @@ def _in_step(here: Side, there: Side, tallies: Mapping[str, _Tally]) -> _Matchin
         if apart > _near(one, two):
             return None
         for name, tally in tallies.items():
-            tally.add(own.times, own.values[name], tally.converted(other.values[name]))
+            tally.add(own.times, own.values[name], values_in_unit_of(here, there, name, other.values[name]))
         rows += len(own.times)
     if one.rows and two.rows:
         near, shorter = _near(one, two), min(one, two, key=lambda span: span.rows)
@@ -242,29 +243,21 @@ def _nearest(times: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
 
 
 class _Tally:
-    """What differs in one variable, of the rows so far.
-
-    Attributes:
-        first: (row, time, value here, value there) of the first row beyond the tolerance, by the number of the compared
-            row.
-    """
+    """What differs in one variable, of the rows so far; ``first``: number, time and values of the first such row."""
 
     def __init__(self, here: Side, there: Side, name: str, tolerances: tuple[float, float]) -> None:
-        self._name, self._here, self._there, (self._rtol, self._atol) = name, here, there, tolerances
+        self._titles, (self._rtol, self._atol) = (here.title, there.title), tolerances
         self._unit, (self._note, self._change) = here.unit(name), _conversion(here, there, name)
         self.first: tuple[int, float, Any, Any] | None = None
         self._rows = self._wrong = 0
         self._mismatch, self._is_unequal, self._are_texts = self._change is None, False, False
         self._largest = self._steepest = (-1.0, 0.0)
 
-    def converted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The values of the other result, in the unit of this one."""
-        return values_in_unit_of(self._here, self._there, self._name, values)
-
     def add(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> None:
         """Add rows: their times in s, and both values."""
         if (own.dtype == object) != (other.dtype == object):
-            self._note = self._note or f"{_kind(own)} in {self._here.title}, {_kind(other)} in {self._there.title}"
+            here, there = self._titles
+            self._note = self._note or f"{_kind(own)} in {here}, {_kind(other)} in {there}"
             self._mismatch = True
         wrong = np.ones(len(times), bool) if self._mismatch else self._beyond(times, own, other)
         self._wrong += int(wrong.sum())

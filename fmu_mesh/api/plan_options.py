@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ..config.plain_values import plain
-from ..recorder.arrays_file import ENDING
 from ..run.run_plan import RunPlan
+from ..system.records import IN_MEMORY
 from ..wire.runtime import run_name, runtime_folder
 
 __all__ = ["memory_file", "memory_of", "with_record"]
@@ -42,11 +42,11 @@ def memory_file() -> Path:
 
     If this process is killed, the next run of this user removes them.
     """
-    return runtime_folder() / f"{_MEMORY}{run_name()}" / f"rows{ENDING}"
+    return runtime_folder() / f"{_MEMORY}{run_name()}" / f"rows{IN_MEMORY}"
 
 
 def memory_of(plan: RunPlan) -> Path | None:
     """The file for results that stay in memory; None if they go where the configuration says."""
     file = Path(plan.plan.system.result_file or "")
-    own = file.suffix == ENDING and file.parent.name.startswith(_MEMORY) and file.parent.parent == runtime_folder()
+    own = file.suffix == IN_MEMORY and file.parent.name.startswith(_MEMORY) and file.parent.parent == runtime_folder()
     return file if own else None

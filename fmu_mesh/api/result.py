@@ -20,11 +20,13 @@ from ..instances.python.unit_names import base_unit_of
 from ..pictures.drawing import thinned
 from ..pictures.result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOptions, figure_of
 from ..pictures.tables import html_table
-from ..recorder.csv_file import CsvFile
-from ..recorder.parquet_file import ParquetFile
+from ..results.column_names import chosen_names, of_one_instance
+from ..results.csv_file import CsvFile
+from ..results.formats import read_result, result_pieces
+from ..results.parquet_file import ParquetFile
+from ..results.recording import Columns, ResultFile, joined
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
-from ..system.recording import ResultFile, joined
 from ..system.run_metadata import machine_difference
 from ..system.system import ResolvedSystem
 from ..text import listed, short_path
@@ -33,7 +35,6 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import DTYPES, VariableType, is_float
 from .compared_rows import Side, compared, differences_of, values_in_unit_of
 from .comparison import Comparison
-from .result_reading import Columns, chosen_names, of_one_instance, read_result, result_pieces
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -414,7 +415,7 @@ class Result(Mapping[str, NDArray[Any]]):
         """This result, as it is compared with another one."""
         return Side(
             str(short_path(self.file)) if self.file is not None else self.title,
-            [*self],
+            dict.fromkeys(self),
             self._pieces,
             lambda: self._columns,
             self._unit,

@@ -18,7 +18,8 @@ from msgspec.structs import replace
 
 from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
 from ..printing import paragraph
-from ..recorder.arrays_file import bytes_of_a_row, read_arrays
+from ..results.arrays_file import bytes_of_a_row
+from ..results.formats import read_result
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.launcher import Launcher
 from ..run.options import StartOptions
@@ -28,7 +29,6 @@ from ..simtime import ENDLESS
 from ..wire.views import MeshStatus
 from .plan_options import memory_of
 from .result import Result, result_of, types_of
-from .result_reading import Columns
 
 if TYPE_CHECKING:
     from ..run.in_process import InProcessRun
@@ -219,10 +219,11 @@ class RunThread:
         if self._memory is None or outcome is None:
             return result_of(self.plan, outcome)
         types = types_of(self.plan.plan.system) or {}
-        times, arrays = read_arrays(self._memory, list(types.values()))
-        columns = Columns(times, dict(zip(types, arrays, strict=True)))
         return Result(
-            self.plan.mesh, outcome=replace(outcome, file=None, files=()), system=self.plan.plan.system, columns=columns
+            self.plan.mesh,
+            outcome=replace(outcome, file=None, files=()),
+            system=self.plan.plan.system,
+            columns=read_result(self._memory, types),
         )
 
 
@@ -265,7 +266,7 @@ def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None
     """
     types = types_of(plan.plan.system) or {}
     last, records = plan.plan.grid.last_point, plan.plan.system.records
-    size = records[0].rows_before(last + 1) * bytes_of_a_row(list(types.values())) if records else 0
+    size = records[0].rows_before(last + 1) * bytes_of_a_row(types.values()) if records else 0
     if last < ENDLESS and size > limit:
         raise _too_large(plan.mesh, limit, size)
     if last >= ENDLESS and to_its_end and size and not plan.plan.system.config.simulation.real_time_factor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from ..api.recovering import recover
+from ..results.formats import recover
 from .arguments import Runs
 
 __all__ = ["RUNS"]

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.recording import result_format
-from .csv_tail import CsvTail
+from ..results.formats import followed
+from ..results.recording import Tail
 from .curve import BoundedCurve
 
 __all__ = ["ResultSource"]
@@ -23,56 +23,6 @@ _OLD_PIECES: Final = 2
 """Of older rows fewer are read at once, so that new ones are not late."""
 _FAR_BEHIND: Final = 64 << 20
 """Bytes of a result file that the dashboard reads late; beyond it, it leaves rows out."""
-
-
-class Tail(Protocol):
-    """The rows of a result file in pieces, while it grows and afterwards.
-
-    Attributes:
-        path: the result file.
-        names: the columns without `time`.
-    """
-
-    path: Path
-    names: Sequence[str]
-
-    @property
-    def replaced(self) -> bool:
-        """Whether the file is gone, or that of another run."""
-        ...
-
-    @property
-    def behind(self) -> int:
-        """Bytes of the file that were not read yet."""
-        ...
-
-    def skip(self) -> None:
-        """Go on with the rows that are written from now on."""
-        ...
-
-    def read(self, columns: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """The next rows, a few megabytes of them; None if there is no new one.
-
-        Returns:
-            The times in s, shape `(rows,)`, and the values, shape `(columns, rows)`. What is no number is NaN.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
-
-
-def open_tail(path: Path) -> Tail | None:
-    """Open a result file; None if there is none, or in a format that cannot be read while it grows."""
-    if path.suffix == ".csv":
-        return CsvTail.open(path)
-    try:
-        from .parquet_tail import ParquetTail  # noqa: PLC0415  pyarrow is optional
-    except ImportError:
-        return None
-    found = result_format(path) if path.suffix == ".parquet" else None
-    return ParquetTail.open(path, found.growing_file(path)) if found is not None else None
 
 
 class ResultSource:
@@ -105,7 +55,7 @@ class ResultSource:
             self.close()
             forget()
         if self._new is None:
-            if self._path is None or (new := open_tail(self._path)) is None:
+            if self._path is None or (new := followed(self._path)) is None:
                 return
             self._new = _Reader(new)
             self._new.skip()
@@ -116,7 +66,7 @@ class ResultSource:
             return
         self._new.feed(curves)
         added = {name: curve for name, curve in curves.items() if self._filled.get(name) is not curve}
-        if added and self._old is None and (old := open_tail(self._new.tail.path)) is not None:
+        if added and self._old is None and (old := followed(self._new.tail.path)) is not None:
             self._old, self._filling = _Reader(old), added
             self._filled = {name: curve for name, curve in self._filled.items() if name in curves} | added
         if self._old is not None and self._old.feed(self._filling, _OLD_PIECES):
@@ -171,9 +121,15 @@ class _Reader:
             rows = self.tail.read(list(curves))
             if rows is None:
                 return True
-            times, values = rows
-            for curve, column in zip(curves.values(), values, strict=True):
-                curve.add(times, column, self.after)
-            if len(times):
-                self.after = float(times[-1])
+            for name, curve in curves.items():
+                curve.add(rows.times, as_floats(rows.values[name]), self.after)
+            if len(rows.times):
+                self.after = float(rows.times[-1])
         return False
+
+
+def as_floats(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Values of any type as floats: a truth value as 0 or 1, and what is no number as NaN."""
+    if values.dtype != object:
+        return values.astype(np.float64)
+    return np.array([value if isinstance(value, int | float) else np.nan for value in values], np.float64)

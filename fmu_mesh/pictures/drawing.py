@@ -19,7 +19,7 @@ from ..errors import ConfigurationError
 from ..files import replaced
 from ..installing import require
 from ..printing import printable
-from ..system.recording import Columns, joined
+from ..results.recording import Columns, joined
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,6 +4,27 @@ It has its own thread in the master's process, and its own inbox, liveliness tok
 ahead of the rows that are not written yet than the window of the recorder. So no row is dropped, and memory is bounded.
 """
 
+# Who meets here. The recorder is a thread of the master's process; the master is the main thread of it. The nodes are
+# other processes, often on the same host. They meet in two places: counters in shared memory, which the nodes raise and
+# this thread reads (and the other way round for the progress), and the inbox, into which Zenoh's threads put frames and
+# messages, and the main thread the end of the run (`__exit__`). Only this thread touches the sources and the files
+# until it has ended; then the main thread writes what is left and closes them.
+#
+# What may go wrong:
+# * A node could overwrite rows that are not written yet. The windows forbid it, and the stamps of all rows are compared
+#   before and after they are read: a row that is not the one expected ends the run and never becomes a value.
+# * The run may fail in Initialization Mode, after rows of point 0 are complete. So nothing is written before the master
+#   says that all nodes have begun (ADR 50): the last result stays.
+# * A run that ends early still has rows on their way. This thread waits half a second for the nodes to say that they
+#   have sent their last ones, and not for those that are lost.
+# * The reason of such an end comes from the master of this process and not by a message: on the other thread a message
+#   may arrive after the end.
+#
+# What was tried and given up: a thread that never slept while rows came took a processor from a node that steps, and
+# the interpreter from the master; one that woke up only five times a second let the run wait at point 0. Now it sleeps
+# until half a window is there, or for 5 ms. A recorder thread for each file would read the same rings several times
+# (ADR 60). The rings and counters are ADR 58.
+
 from __future__ import annotations
 
 import logging
@@ -11,6 +32,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -19,9 +41,11 @@ import zenoh
 from msgspec import to_builtins
 
 from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
+from ..results.growth import GrowthWatch, ReadColumn
+from ..results.record_files import RecordFiles
+from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
 from ..system.plan import RECORDER, Link, NodePlan
-from ..system.recording import ResultFile
 from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
@@ -40,8 +64,6 @@ from ..wire.messages import (
     SetValue,
     decode_json,
 )
-from .growth import GrowthWatch, ReadColumn
-from .record_files import RecordFiles
 
 __all__ = ["RecordedSource", "Recorder"]
 
@@ -71,6 +93,7 @@ class Recorder:
         files: the result files, in the order of the plan; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
         growth: looks at all rows.
+        notes: the folder of the run, if somebody counts the rows when this process was killed (`rows_left`).
         launch: the launcher that started this process; None if it was started manually.
         memory: the shared memory of this host; None if nothing is shared.
 
@@ -85,6 +108,7 @@ class Recorder:
         has_begun: Callable[[], bool] = lambda: True,
         *,
         growth: GrowthWatch | None = None,
+        notes: Path | None = None,
         launch: str | None = None,
         memory: HostMemory | None = None,
     ) -> None:
@@ -95,7 +119,7 @@ class Recorder:
         self._rows = min(place.rows for place in plan.rings)
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
-        self._files = RecordFiles(files, growth)
+        self._files = RecordFiles(files, growth, notes)
         self._has_begun = has_begun
         self._written = 0
         self._told = 0
@@ -195,7 +219,9 @@ class Recorder:
             if message is None:
                 self._write_rows()
                 self._tell_progress()
-                self._flush()
+                if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
+                    self._flushed = now
+                    self._files.flush()
                 if (wishes := self._wishes()) is None:
                     continue
                 message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LONGEST_SLEEP_S, wishes)
@@ -258,11 +284,6 @@ class Recorder:
         """The rows from which points are written are complete, and nobody has overwritten them."""
         for source in self._sources.values():
             source.check(first, end)
-
-    def _flush(self) -> None:
-        if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
-            self._flushed = now
-            self._files.flush()
 
     def _tell_progress(self) -> None:
         """Tell how many points are written; the first one before, because nothing is written until all are there."""

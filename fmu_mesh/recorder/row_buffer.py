@@ -1,21 +1,26 @@
 """Collects rows of single values and writes many at once into the result files: used by a run in one process."""
 
+# Two threads meet here: the one that steps, and the one that watches it, which saves the rows if a call of an FMU does
+# not return. Both write under a lock. If the disk does not answer either, the watching thread gives up after half a
+# second: a process that ends must not wait for it. The files are ADR 50 and 60.
+
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..results.growth import GrowthWatch, ReadColumn
+from ..results.record_files import RecordFiles
+from ..results.recording import ResultFile
 from ..simtime import TimeGrid
-from ..system.recording import ResultFile
 from ..system.records import RecordPlan, union_of
 from ..variables.value_types import DTYPES, Value, VariableType
-from .growth import GrowthWatch, ReadColumn
-from .record_files import RecordFiles
 
 __all__ = ["RowBuffer"]
 
@@ -54,8 +59,13 @@ class RowBuffer:
         self._waiting: list[list[Value]] = []
         self._arrays: list[NDArray[Any]] = []
         self._writing = threading.Lock()
-        self._places = {column: place for place, column in enumerate(union_of(records))}
-        self._files.begin(grid, records, self._column_of)
+        places = {column: place for place, column in enumerate(union_of(records))}
+
+        def column_of(instance: str, variable: str) -> ReadColumn:
+            place = places[instance, variable]
+            return lambda first, end: self._arrays[place][first - self._first : end - self._first]
+
+        self._files.begin(grid, records, column_of)
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:
@@ -67,11 +77,7 @@ class RowBuffer:
         self._waiting.append(row)
 
     def write(self, *, flush: bool = False) -> None:
-        """Give the new rows to the files; with ``flush``, other processes can read them then.
-
-        Raises:
-            ConfigurationError: a file cannot be written; the others have their rows.
-        """
+        """As `RecordFiles.write`, for the new rows; with ``flush``, other processes can read them then."""
         if flush:
             self.flushed_at = time.monotonic()
         with self._writing:
@@ -80,20 +86,14 @@ class RowBuffer:
                 self._files.flush()
 
     def close(self) -> None:
-        """Write what is left and close the files.
-
-        Raises:
-            ConfigurationError: a file cannot be written.
-        """
-        if not self._writing.acquire(timeout=_OTHER_WRITER_S):
-            return  # another thread is writing to a disk that does not answer
-        try:
-            try:
+        """Write what is left and close the files (see `RecordFiles.close`)."""
+        if self._writing.acquire(
+            timeout=_OTHER_WRITER_S
+        ):  # else another thread writes to a disk that does not answer
+            with ExitStack() as stack:
+                stack.callback(self._writing.release)
+                stack.callback(self._files.close)
                 self._write()
-            finally:
-                self._files.close()
-        finally:
-            self._writing.release()
 
     def _write(self) -> None:
         rows, self._waiting = self._waiting, []
@@ -108,7 +108,3 @@ class RowBuffer:
             self._files.write(self._first, self._first + len(rows))
         finally:
             self._first += len(rows)
-
-    def _column_of(self, instance: str, variable: str) -> ReadColumn:
-        place = self._places[instance, variable]
-        return lambda first, end: self._arrays[place][first - self._first : end - self._first]

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..files import remove_tree
+from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import (
     STOPPED,
@@ -36,7 +37,6 @@ from .child import Child, Process, executed, how_it_ended, is_other_python
 from .events import Event, OutputLine, Reachable, Status, decode_event
 from .fork_server import ForkServer, fork_server
 from .outcome import Outcome
-from .results import rows_left, what_is_kept
 from .run_plan import RunPlan
 
 __all__ = ["Launcher"]

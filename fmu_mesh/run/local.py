@@ -24,14 +24,14 @@ from ..instances.contract import Instance, LogMessage, Showing
 from ..instances.process_end import process_ends
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..recorder.growth import GrowthWatch
 from ..recorder.row_buffer import RowBuffer
+from ..results.growth import GrowthWatch
+from ..results.record_files import open_results, what_is_kept
 from ..system.layout import Layout
 from ..system.plan import Plan
 from .local_system import LocalSystem, opening_of
 from .one_process import OneProcess
 from .outcome import Outcome
-from .results import open_results, what_is_kept
 
 __all__ = ["LocalMesh"]
 

@@ -13,7 +13,7 @@ from ..config.call_options import option_fields
 from ..config.findings import Findings
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
-from ..recorder.arrays_file import ENDING
+from ..system.records import IN_MEMORY
 from ..text import listed, nearest, option_text
 from .options import PlanOptions
 
@@ -110,5 +110,5 @@ def _with_record(records: list[Plain], key: str, value: Plain) -> list[Plain]:
 
     Of what stays in memory, or of variables that the option names, there is one section.
     """
-    others = records[1:] if isinstance(value, str) and not value.endswith(ENDING) else []
+    others = records[1:] if isinstance(value, str) and not value.endswith(IN_MEMORY) else []
     return [_replaced(records[0] if records else None, (key,), value), *others]

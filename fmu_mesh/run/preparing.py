@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -22,6 +23,7 @@ from ..instances.configuration import examine_data
 from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, claims, content, describe, expected_model
+from ..results.formats import check_record, warn_of_endings
 from ..ssp.configuration_files import read_configuration
 from ..system.plan import Plan, make_plan
 from ..system.point_loops import warn_of_point_loops
@@ -172,10 +174,11 @@ def planned(
         path = loaded.resolve(own.path) if own.path else Path()
         return known.claims(path, own, descriptions[name], loaded.config.limits)
 
-    system = build(loaded, descriptions, findings, scenario, claimed, obstacles)
+    system = build(loaded, descriptions, findings, scenario, claimed, obstacles, partial(check_record, loaded))
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warnings = loaded.findings()
+    warn_of_endings(loaded, system.records, warnings)
     warn_of_point_loops(plan, warnings)
     plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))
     run = RunPlan(

@@ -32,11 +32,11 @@ from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
 from ..node.stepping import Runner
-from ..recorder.growth import GrowthWatch
+from ..results.growth import GrowthWatch
+from ..results.recording import ResultFile
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..system.plan import Plan, make_plan
-from ..system.recording import ResultFile
 from .local_system import opening_of
 from .one_process import OneProcess
 from .outcome import Outcome
@@ -156,7 +156,7 @@ class RepeatedRuns:
     @property
     def rows(self) -> int:
         """Rows of the last run."""
-        return self._run.writer.rows if self._run is not None else 0
+        return sum(rows for _, rows in self._run.writer.counted) if self._run is not None else 0
 
     def close(self) -> None:
         """Free all models, and remove their files; on the thread of the runs. May be called twice."""
@@ -259,7 +259,7 @@ class _Run:
         """How a run ended that did not fail."""
         time_s, writer = self._plan.grid.time(self.point), self.writer
         ended_by = self._first[1].report() if self._first is not None else None
-        rows, file, files = writer.rows, writer.file, writer.counted
+        file, rows = writer.counted[0] if writer.counted else (None, 0)
         return Outcome(
             "done",
             self.point,
@@ -268,7 +268,7 @@ class _Run:
             rows,
             file,
             ended_by=ended_by,
-            files=files,
+            files=writer.counted,
             warnings=writer.warnings,
         )
 

@@ -21,8 +21,9 @@ from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
 from ..master.master import Master, MasterSettings
 from ..node.node import Node
-from ..recorder.growth import GrowthWatch
 from ..recorder.recorder import Recorder
+from ..results.growth import GrowthWatch
+from ..results.record_files import open_results
 from ..system.plan import MASTER, RECORDER
 from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
@@ -32,7 +33,6 @@ from .child import is_other_python
 from .events import Event, Log, Reachable, Status
 from .outcome import Outcome
 from .process import RunProcess
-from .results import open_results
 from .run_plan import MANUAL, NodeRun, RunPlan
 from .wiring import patient, wiring
 
@@ -185,19 +185,14 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         recorder = failure = None
         try:
             if RECORDER in plan.nodes:
-                results = open_results(
-                    run.loaded,
-                    plan.system,
-                    process.folder if process.is_child else None,
-                    digest=plan.digest,
-                    contents=run.contents,
-                )
+                results = open_results(run.loaded, plan.system, digest=plan.digest, contents=run.contents)
                 with Recorder(
                     plan.nodes[RECORDER],
                     session,
                     results,
                     lambda: master.has_begun,
                     growth=GrowthWatch(plan),
+                    notes=process.folder if process.is_child else None,
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
                 ) as recorder:

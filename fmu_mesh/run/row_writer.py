@@ -3,6 +3,9 @@
 Knows neither how the instances are stepped nor when the run ends.
 """
 
+# Two threads meet here: the one that steps and writes, and the one that watches it, which closes the file if a call of
+# an FMU does not return. The lock and its deadline are those of `fmu_mesh.recorder.row_buffer`; see ADR 50 and 60.
+
 from __future__ import annotations
 
 import threading
@@ -10,13 +13,12 @@ import time
 from collections.abc import Mapping
 
 from ..node.stepping import Runner
-from ..recorder.growth import GrowthWatch
-from ..recorder.record_files import RecordFiles
 from ..recorder.recorder import RecordedSource
+from ..results.growth import GrowthWatch
+from ..results.record_files import RecordFiles, what_is_kept
+from ..results.recording import ResultFile
 from ..system.plan import RECORDER, Plan
-from ..system.recording import ResultFile
 from ..wire.frames import SourceRows
-from .results import what_is_kept
 
 __all__ = ["RowWriter"]
 
@@ -49,27 +51,14 @@ class RowWriter:
         if RECORDER not in plan.nodes:
             return
         node = plan.nodes[RECORDER]
-        own = {link.source: runners[link.source] for link in node.links_in}
-        sources = {
-            link.source: RecordedSource(
-                link, plan.grid.last_point, [SourceRows(own[link.source].outputs, own[link.source].counter)], None
-            )
-            for link in node.links_in
-        }
+        sources = {}
+        for link in node.links_in:
+            rows = SourceRows(runners[link.source].outputs, runners[link.source].counter)
+            sources[link.source] = RecordedSource(link, plan.grid.last_point, [rows], None)
         self._rows = min(place.rows for place in node.rings)
         self._sources = list(sources.values())
         records = node.records[: len(self._files.counted)]
         self._files.begin(plan.grid, records, lambda instance, variable: sources[instance].column(variable))
-
-    @property
-    def rows(self) -> int:
-        """Number of rows in the file."""
-        return sum(rows for _, rows in self.counted)
-
-    @property
-    def file(self) -> str | None:
-        """The path of the file."""
-        return next((file for file, _ in self.counted), None)
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:

@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 
 from ..api.result import Result, imported_pandas
-from ..api.result_reading import chosen_names
 from ..errors import CallRefused, UnknownName
 from ..pictures.result_drawing import in_unit
 from ..pictures.sweep_drawing import VariantCurve, curves_figure, heat_map_figure
 from ..pictures.tables import html_table
+from ..results.column_names import chosen_names
 from ..system.system import ResolvedSystem
 from ..text import listed, nearest
 from .sweep_folder import SweepFolder, Wanted, cells_of

@@ -1,31 +1,40 @@
 """Which variables each result file has, and at which points: names and patterns of the section `record`.
 
-Owns `RecordPlan` and the meaning of patterns. Formats are `fmu_mesh.system.recording`.
+Owns `RecordPlan` and the meaning of patterns. Knows no format: what a file can hold is checked by a function that the
+caller gives (`fmu_mesh.results.formats.check_record`).
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..config.mesh import RecordConfig
-from ..errors import ConfigurationError
 from ..files import archive_on_the_way
 from ..simtime import TimeGrid, steps_between
 from ..text import EXPRESSION, is_pattern, listed, matched, nearest, short_number, shown
 from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
-from .recording import Recording, has_unknown_ending, is_in_memory, result_endings, result_format
 
-__all__ = ["RecordPlan", "record_paths", "record_warnings", "resolve_records", "union_of"]
+__all__ = [
+    "IN_MEMORY",
+    "CheckRecord",
+    "RecordPlan",
+    "record_paths",
+    "record_warnings",
+    "resolve_records",
+    "union_of",
+]
+
+IN_MEMORY = ".arrays"
+"""The ending of what the library keeps in memory; no file that anybody names."""
 
 _PREFIXES: dict[str, tuple[Causality, ...]] = {
     "out": ("output",),
@@ -35,13 +44,13 @@ _PREFIXES: dict[str, tuple[Causality, ...]] = {
 }
 """What a pattern with one of these words and a colon before it matches."""
 
+_WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
+
 _MOST_LOCALS = 100
 """Locals of an instance without outputs and states that are recorded where nothing is chosen."""
 
 _DEFAULT_FILE = f"{RecordConfig().file}"
 """How the name of a file ends that nobody has chosen."""
-
-_WORDS = {"out": "output", "in": "input", "local": "local variable", "param": "parameter"}
 
 
 class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,8 +96,17 @@ def union_of(records: Sequence[RecordPlan]) -> tuple[tuple[str, str], ...]:
     return tuple(dict.fromkeys(column for record in records for column in record.variables))
 
 
-def resolve_records(
-    loaded: LoadedConfig, variables: Variables, grid: TimeGrid | None, findings: Findings, obstacles: Findings
+CheckRecord = Callable[[RecordPlan, str, Mapping[str, ModelDescription], Findings], None]
+"""Adds a finding for everything that the format of a file cannot hold, given the place of its section."""
+
+
+def resolve_records(  # noqa: PLR0913, PLR0917  sections, what they may refer to, and where findings go
+    loaded: LoadedConfig,
+    variables: Variables,
+    grid: TimeGrid | None,
+    findings: Findings,
+    obstacles: Findings,
+    check: CheckRecord,
 ) -> tuple[RecordPlan, ...]:
     """The result files of a configuration; one without a path or without columns is left out.
 
@@ -97,7 +115,8 @@ def resolve_records(
         variables: all variables of all instances; None in place of those that are not known.
         grid: the communication points; None after a finding about them.
         findings: where findings go.
-        obstacles: where findings go about the files themselves, such as a folder of that name, or a missing package.
+        obstacles: where those about the files themselves go, such as a missing package.
+        check: what the formats say about their files.
     """
     records: list[RecordPlan] = []
     first_of: dict[str, str] = {}
@@ -108,7 +127,7 @@ def resolve_records(
         if file is None:
             continue
         known = tuple((i, v) for i, v in chosen if (own := variables.descriptions.get(i)) and own.variable_of(v))
-        _check_format(file, Recording(loaded, variables.descriptions, known, place, first, section.every), obstacles)
+        check(RecordPlan(file, known, first, section.every), place, variables.descriptions, obstacles)
         other = first_of.setdefault(file, place)
         if other != place:
             findings.add(f"{place}.file", f"'{section.file}', which is also the file of {other}", "a file of its own")
@@ -123,24 +142,19 @@ def resolve_records(
 def record_warnings(
     loaded: LoadedConfig, variables: Variables, records: Sequence[RecordPlan], warnings: Findings
 ) -> None:
-    """Warn of files without the outputs of an instance, and of endings that nobody offers: they still give a CSV."""
+    """Warn of files without the outputs of an instance."""
     files = {record.file for record in records}
     for place, section in loaded.config.records.items():
         file = _path(loaded, section)
         if file is not None and section.variables is None:
             instead = [(name, words) for name, own in variables.descriptions.items() if (words := _by_default(own)[1])]
             if instead:
-                found = (
-                    f"no outputs with numbers, so others are recorded: {listed([f'of {n} {w}' for n, w in instead])}"
-                )
+                others = listed([f"of {name} {words}" for name, words in instead])
+                found = f"no outputs with numbers, so others are recorded: {others}"
                 every = f"local:{instead[0][0]}.*" if len(instead) == 1 else "local:*"
                 warnings.add(f"{place}.variables", found, f"`{every}` in this list for all locals")
             elif str(file) not in files:
                 warnings.add(place, "nothing is recorded: there are no outputs, states or locals with numbers", "")
-        if file is not None and str(file) in files and has_unknown_ending(file):
-            found = f"'{section.file}', an ending of no installed format, so the file becomes a CSV"
-            endings = " or ".join(result_endings())
-            warnings.add(f"{place}.file", found, f"a name ending in {endings}; from version 0.3 on this is an error")
 
 
 def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
@@ -151,7 +165,7 @@ def record_paths(loaded: LoadedConfig) -> dict[str, Path]:
 
 def _is_named(loaded: LoadedConfig, place: str, section: RecordConfig) -> bool:
     """Whether somebody named the file and expects results in it: with `variables: []`, only an option names it."""
-    if section.file is None or is_in_memory(section.file):
+    if section.file is None or Path(section.file).suffix.lower() == IN_MEMORY:
         return False
     in_file = f"{place}.file" in loaded.lines or not section.file.endswith(_DEFAULT_FILE)
     return f"{place}.file" in loaded.overrides or (in_file and section.variables is None)
@@ -175,19 +189,6 @@ def _file(loaded: LoadedConfig, place: str, section: RecordConfig, findings: Fin
     elif (file := archive_on_the_way(path)) is not None:
         findings.add(place, f"'{text}' in the file '{file}'", "a file in a folder; choose one with `output=...`")
     return str(path)
-
-
-def _check_format(file: str, recording: Recording, findings: Findings) -> None:
-    """Check that a file of this name can be written, and can hold what is recorded."""
-    place, text = f"{recording.place}.file", recording.loaded.config.records[recording.place].file
-    try:
-        if (format_ := result_format(file)) is None:
-            endings = " or ".join(result_endings())
-            findings.add(place, f"'{text}', a format that is not written", f"a name ending in {endings}")
-        else:
-            format_.check(recording, findings)
-    except ConfigurationError as error:  # a package is missing
-        findings.add(place, str(error), "")
 
 
 def _first_point(section: RecordConfig, place: str, grid: TimeGrid | None, findings: Findings) -> int:
@@ -215,11 +216,10 @@ def _chosen(section: RecordConfig, place: str, variables: Variables, findings: F
             for variable in _by_default(description)[0]
             for element in variable.elements
         )
-    columns: dict[tuple[str, str], str | None] = {}  # where a column is named; None: only patterns match it
+    choice = _Choice(variables, findings)
     for index, reference in enumerate(section.variables):
-        add = _add_matched if _is_pattern(reference, variables) else _add_named
-        add(reference, f"{place}[{index}]", columns, variables, findings)
-    return tuple(columns)
+        choice.add(reference, f"{place}[{index}]")
+    return tuple(choice.columns)
 
 
 def _by_default(description: ModelDescription) -> tuple[Sequence[Variable], str]:
@@ -235,130 +235,102 @@ def _by_default(description: ModelDescription) -> tuple[Sequence[Variable], str]
     return changing[:_MOST_LOCALS], f"{first}its locals that change ({len(changing)})" if changing else ""
 
 
-def _add_matched(
-    reference: str,
-    place: str,
-    columns: dict[tuple[str, str], str | None],
-    variables: Variables,
-    findings: Findings,
-) -> None:
-    """Add the columns of all variables that a pattern matches."""
-    pattern = _pattern(reference, place, variables, findings)
-    if pattern is None:
-        return
-    found = _matched(pattern, variables)
-    for instance, variable in found:
-        for element in variable.elements:
-            columns.setdefault((instance, element), None)
-    instance, dot, _ = _parts(reference)[1].partition(".")
-    possible = variables if is_pattern(instance) or not dot else {instance} & variables.keys()
-    if not found and all(variables[name] is not None for name in possible):
-        _nothing_matches(reference, pattern, place, variables, findings)
+class _Choice:
+    """The columns that names and patterns stand for.
 
+    Attributes:
+        columns: (instance, variable), and the place where it is named; None: only patterns match it.
+    """
 
-def _add_named(
-    reference: str,
-    place: str,
-    columns: dict[tuple[str, str], str | None],
-    variables: Variables,
-    findings: Findings,
-) -> None:
-    """Add the columns of a variable, or of an element of an array, that is named."""
-    instance, _, name = reference.partition(".")
-    first = columns.get((instance, name))
-    end = None if first else _resolved(reference, place, variables, findings)
-    names: tuple[str, ...] = (name,)
-    if end is not None:
-        variable, element = end
-        names = (element_name(variable.name, element),) if element else variable.elements
-        first = next((where for one in names if (where := columns.get((instance, one)))), None)
-        if variable.causality == "independent":
-            found = f"'{reference}', the independent variable"
-            findings.add(place, found, "another variable: its values are in the column time")
-    if first:
-        findings.add(place, f"'{reference}' a second time (first: {first})", "every variable at most once")
-    for one in names:
-        columns[instance, one] = first or place
+    def __init__(self, variables: Variables, findings: Findings) -> None:
+        self.columns: dict[tuple[str, str], str | None] = {}
+        self._variables = variables
+        self._findings = findings
 
+    def add(self, reference: str, place: str) -> None:
+        """Add what a name or a pattern stands for; names come first, as those of variables may have any characters."""
+        instance, _, name = reference.partition(".")
+        word, colon, text = reference.partition(":")
+        has_word = bool(colon) and word in _PREFIXES
+        if name in (self._variables.get(instance) or ()) or not (has_word or is_pattern(reference)):
+            self._add_named(reference, place)
+        else:
+            self._add_matched(reference, place, *((word, text) if has_word else ("out", reference)))
 
-def _resolved(
-    reference: str, place: str, variables: Variables, findings: Findings
-) -> tuple[Variable, tuple[int, ...]] | None:
-    """As `resolve_variable`; the nearest name is that of any variable where no output is near."""
-    instance, _, name = reference.partition(".")
-    own = variables.get(instance)
-    is_clock = own is not None and variables.descriptions[instance].clock(name) is not None
-    if own and name and name not in own and split_element(name) is None and not is_clock:
-        outputs = [variable.name for variable in own.values() if variable.causality == "output"]
-        near = nearest(name, own) if nearest(name, outputs) is None else None
-        if near is not None:
-            found = f"the unknown variable '{name}' of instance '{instance}'"
-            findings.add(place, found, f"one of the {len(own)} variables of '{instance}'", near)
-            return None
-    return resolve_variable(reference, place, variables, "output", findings)
+    def _add_matched(self, reference: str, place: str, word: str, text: str) -> None:
+        variables = self._variables
+        try:
+            names = matched(text, [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}])
+        except ValueError as error:
+            expected = f"a regular expression of Python after `{EXPRESSION}`"
+            self._findings.add(place, f"{shown(reference)} ({error})", expected)
+            return
+        found = self._matched(names, word)
+        for instance, variable in found:
+            for element in variable.elements:
+                self.columns.setdefault((instance, element), None)
+        instance, dot, _ = text.partition(".")
+        possible = variables if is_pattern(instance) or not dot else {instance} & variables.keys()
+        if not found and all(variables[name] is not None for name in possible):
+            self._nothing_matches(f"{shown(reference)}, which matches no {_WORDS[word]}", place, word, text, names)
 
+    def _matched(self, names: set[str], word: str) -> list[tuple[str, Variable]]:
+        """The variables with these names that a word stands for, in the order of the file and the descriptions."""
+        return [
+            (instance, variable)
+            for instance, own in self._variables.items()
+            for variable in (own or {}).values()
+            if variable.causality in _PREFIXES[word]
+            and not is_text(variable.type)
+            and f"{instance}.{variable.name}" in names
+        ]
 
-class _Pattern(NamedTuple):
-    """What a pattern matches: whole names `instance.variable`, of variables with one of the causalities."""
+    def _nothing_matches(self, found: str, place: str, word: str, text: str, names: set[str]) -> None:
+        """Say what a pattern may have been meant to be; ``names`` are those that it matches without its word."""
+        every = {f"{i}.{v.name}": v for i, own in self._variables.items() for v in (own or {}).values()}
+        possible = {name: v for name, v in every.items() if v.causality in _PREFIXES[word]}
+        numbers = [name for name, v in possible.items() if not is_text(v.type)]
+        texts = [name for name in possible if name in names and name not in numbers]
+        others = [other for other in _PREFIXES if self._matched(names, other)]
+        if texts:
+            expected, near = "each String and Binary by its whole name", texts[0]
+        elif not numbers:
+            expected, near = f"another pattern: this mesh has no {_WORDS[word]}s with numbers", None
+        elif others:
+            expected, near = f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}"
+        else:
+            expected = f"a pattern for one of {listed(numbers)}"
+            near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), numbers)
+        self._findings.add(place, found, expected, near)
 
-    names: set[str]
-    causalities: tuple[Causality, ...]
+    def _add_named(self, reference: str, place: str) -> None:
+        """Add a variable, or an element of an array; of a name that is not known the column, for later findings."""
+        instance, _, name = reference.partition(".")
+        first = self.columns.get((instance, name))
+        end = None if first else self._resolved(reference, place)
+        names: tuple[str, ...] = (name,)
+        if end is not None:
+            variable, element = end
+            names = (element_name(variable.name, element),) if element else variable.elements
+            first = next((where for one in names if (where := self.columns.get((instance, one)))), None)
+            if variable.causality == "independent":
+                found = f"'{reference}', the independent variable"
+                self._findings.add(place, found, "another variable: its values are in the column time")
+        if first:
+            self._findings.add(place, f"'{reference}' a second time (first: {first})", "every variable at most once")
+        for one in names:
+            self.columns[instance, one] = first or place
 
-
-def _is_pattern(reference: str, variables: Variables) -> bool:
-    """Whether a text is a pattern; a variable of exactly this name comes first, as names may have any characters."""
-    instance, _, name = reference.partition(".")
-    if name in (variables.get(instance) or ()):
-        return False
-    word, colon, _ = reference.partition(":")
-    return is_pattern(reference) or (bool(colon) and word in _PREFIXES)
-
-
-def _parts(reference: str) -> tuple[str, str]:
-    """The word before a pattern that says what it matches, and the pattern."""
-    word, colon, text = reference.partition(":")
-    return (word, text) if colon and word in _PREFIXES else ("out", reference)
-
-
-def _pattern(reference: str, place: str, variables: Variables, findings: Findings) -> _Pattern | None:
-    """The pattern that a text is; None after a finding."""
-    word, text = _parts(reference)
-    every = [f"{instance}.{name}" for instance, own in variables.items() for name in own or {}]
-    try:
-        return _Pattern(matched(text, every), _PREFIXES[word])
-    except ValueError as error:
-        findings.add(place, f"{shown(reference)} ({error})", f"a regular expression of Python after `{EXPRESSION}`")
-        return None
-
-
-def _matched(pattern: _Pattern, variables: Variables) -> list[tuple[str, Variable]]:
-    """The variables that a pattern matches, in the order of the file and of the model descriptions."""
-    return [
-        (instance, variable)
-        for instance, own in variables.items()
-        for variable in (own or {}).values()
-        if variable.causality in pattern.causalities
-        and not is_text(variable.type)
-        and f"{instance}.{variable.name}" in pattern.names
-    ]
-
-
-def _nothing_matches(reference: str, pattern: _Pattern, place: str, variables: Variables, findings: Findings) -> None:
-    """Say what a pattern that matches nothing may have been meant to be."""
-    word, text = _parts(reference)
-    every = [(f"{instance}.{v.name}", v) for instance, own in variables.items() for v in (own or {}).values()]
-    names = [name for name, v in every if v.causality in pattern.causalities and not is_text(v.type)]
-    texts = [
-        name for name, v in every if v.causality in pattern.causalities and is_text(v.type) and name in pattern.names
-    ]
-    others = [own for own in _PREFIXES if _matched(pattern._replace(causalities=_PREFIXES[own]), variables)]
-    found = f"{shown(reference)}, which matches no {_WORDS[word]}"
-    if texts:
-        findings.add(place, found, "each String and Binary by its whole name", texts[0])
-    elif not names:
-        findings.add(place, found, f"another pattern: this mesh has no {_WORDS[word]}s with numbers")
-    elif others:
-        findings.add(place, found, f"a pattern for {_WORDS[others[0]]}s, as it matches some", f"{others[0]}:{text}")
-    else:
-        near = nearest(re.sub(r"[*?]", "", text.removeprefix(EXPRESSION)), names)
-        findings.add(place, found, f"a pattern for one of {listed(names)}", near)
+    def _resolved(self, reference: str, place: str) -> tuple[Variable, tuple[int, ...]] | None:
+        """As `resolve_variable`; the nearest name is that of any variable where no output is near."""
+        instance, _, name = reference.partition(".")
+        own = self._variables.get(instance)
+        is_clock = own is not None and self._variables.descriptions[instance].clock(name) is not None
+        if own and name and name not in own and split_element(name) is None and not is_clock:
+            outputs = [variable.name for variable in own.values() if variable.causality == "output"]
+            near = nearest(name, own) if nearest(name, outputs) is None else None
+            if near is not None:
+                found = f"the unknown variable '{name}' of instance '{instance}'"
+                self._findings.add(place, found, f"one of the {len(own)} variables of '{instance}'", near)
+                return None
+        return resolve_variable(reference, place, self._variables, "output", self._findings)

@@ -22,7 +22,6 @@ import numpy as np
 from .. import __version__
 from ..config.instance_sections import KIND
 from ..config.loading import LoadedConfig
-from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .records import RecordPlan
@@ -134,18 +133,13 @@ def metadata_of(
     digest: str = "",
     contents: Mapping[str, str] = {},
 ) -> RunMetadata:
-    """What a result file of this run says about it.
-
-    Args:
-        loaded: the configuration, options applied.
-        system: the system of this configuration.
-        record: the plan of the file, one of the system.
-        digest: the digest of the mesh.
-        contents: the SHA-256 of the model of each instance.
-    """
-    models = {}
-    for name, own in system.instances.items():
-        models[name] = ModelOrigin(own.fmu, contents.get(name, ""), own.description.guid)
+    """What a result file of this run says about it; ``contents`` has the SHA-256 of the model of each instance."""
+    variables = {}
+    for instance, name in record.variables:
+        of = system.instances[instance].description.variable_of(name)
+        assert of is not None  # the system is valid
+        origin = of.causality, of.variability, of.unit, of.description or ""
+        variables[f"{instance}.{name}"] = RecordedVariable(of.type, of.declared_type, *origin)
     grid = system.grid
     return RunMetadata(
         format=_FORMAT,
@@ -157,7 +151,10 @@ def metadata_of(
         section=system.records.index(record),
         first=record.first,
         every=record.every,
-        models=models,
+        models={
+            name: ModelOrigin(own.fmu, contents.get(name, ""), own.description.guid)
+            for name, own in system.instances.items()
+        },
         files=scenario_files(loaded, system),
         start_values={
             name: {variable: to_plain(value) for variable, value in own.start_values.items()}
@@ -166,7 +163,7 @@ def metadata_of(
         start_time=grid.start_time,
         step_size=grid.step_size,
         stop_time=grid.stop_time,
-        variables={f"{instance}.{name}": _recorded(system, instance, name) for instance, name in record.variables},
+        variables=variables,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         host=socket.gethostname(),
     )
@@ -201,19 +198,6 @@ def _finite(value: Any) -> Any:  # noqa: ANN401  anything that a configuration c
             return [_finite(inner) for inner in value]
         case _:
             return value
-
-
-def _recorded(system: ResolvedSystem, instance: str, name: str) -> RecordedVariable:
-    variable: Variable | None = system.instances[instance].description.variable_of(name)
-    assert variable is not None  # the system is valid
-    return RecordedVariable(
-        variable.type,
-        variable.declared_type,
-        variable.causality,
-        variable.variability,
-        variable.unit,
-        variable.description or "",
-    )
 
 
 @cache
@@ -252,11 +236,6 @@ def machine() -> dict[str, str]:
 
 
 def machine_difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """In words why two machines may calculate other last digits; empty if there is no reason, or it is not known.
-
-    Args:
-        here: the `machine` of one result, perhaps among `versions`.
-        there: that of the other one.
-    """
+    """In words why two machines (`machine`) may calculate other last digits; empty if no reason is known."""
     keys = [key for key in machine() if key in here and key in there and here[key] != there[key]]
     return ", ".join(f"{key} '{here[key]}' and '{there[key]}'" for key in keys)

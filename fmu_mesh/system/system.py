@@ -26,7 +26,7 @@ from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.linear_inputs import check_extrapolation
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
-from fmu_mesh.system.records import RecordPlan, record_warnings, resolve_records, union_of
+from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
@@ -103,6 +103,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     scenario: Scenario | None = None,
     claims: ClaimsOf = lambda _name: {},
     obstacles: Findings | None = None,
+    check_record: CheckRecord = lambda *_: None,
 ) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
@@ -115,6 +116,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
         claims: what an instance claims of its process.
         obstacles: where findings go that prevent a run on this host, and not its plan, such as a missing package; None:
             to the others. An error has them, too.
+        check_record: what the format of each result file says about it; its findings are obstacles.
 
     Raises:
         ConfigurationError: there are findings; it has all of them.
@@ -137,7 +139,8 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     connections += coupled_connections(config, variables, connections, collected)
     if obstacles is not None:
         obstacles.explain(collected.places)
-    records = resolve_records(loaded, variables, grid, collected, collected if obstacles is None else obstacles)
+    of_files = collected if obstacles is None else obstacles
+    records = resolve_records(loaded, variables, grid, collected, of_files, check_record)
     sources = {c.target: c.source.partition(".")[0] for c in config.connections}  # also those of wrong connections
     sources |= {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
     prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+import fmu_mesh
+from fmu_mesh.dashboard.curve import BoundedCurve
+from fmu_mesh.dashboard.result_source import ResultSource
 from tests.fmus.helpers import find_fmu
 from tests.helpers import Place, rows_of, wait_until, write_config
 
@@ -78,7 +81,7 @@ def test_what_is_cut_off_within_a_row_is_not_counted(extended: Place) -> None:
     program = (
         "from pathlib import Path\n"
         "from fmu_mesh.files import Kept\n"
-        "from fmu_mesh.system.recording import result_format\n"
+        "from fmu_mesh.results.formats import result_format\n"
         "print(result_format('pair.jsonl').keep_whole_rows(Path('pair.jsonl'), Kept(1, 14)))"
     )
 
@@ -113,10 +116,69 @@ def test_what_the_format_cannot_hold_is_a_finding_of_check(extended: Place) -> N
     assert "'all.binary_out', which is Binary; expected types that JSON has, or a .csv file" in checked.errors
 
 
-def test_a_format_that_can_only_be_written_is_not_plotted(extended: Place) -> None:
+def test_its_results_are_compared_and_plotted_as_those_of_a_csv(extended: Place) -> None:
     config = write_config(extended.folder)
 
-    launched = extended.run("launch", config, "--output", "pair.jsonl", "--plot", "pair.png")
+    runs = [
+        extended.run("launch", config, "--output", "pair.jsonl", "--plot", "pair.png"),
+        extended.run("launch", config, "--output", "pair.csv"),
+        extended.run("compare", "pair.jsonl", "pair.csv"),
+    ]
+
+    assert [run.wait() for run in runs] == [0, 0, 0], extended.story()
+    assert (extended.folder / "pair.png").is_file()
+
+
+def test_a_cut_off_file_is_recovered_and_read_before_and_after(
+    tmp_path: Path, installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(installed)
+    result = tmp_path / "pair.jsonl"
+    result.write_text('{"time": 0.0, "a.s": "x"}\n{"time": 0.5, "a.s": "y"}\n{"time": 1')
+
+    before = fmu_mesh.Result.read(result)
+    rows = fmu_mesh.recover(result)
+
+    assert rows == 2
+    assert result.read_text().endswith('"y"}\n')
+    for found in (before, fmu_mesh.Result.read(result)):
+        assert found.times.tolist() == [0.0, 0.5]
+        assert found["a.s"].tolist() == ["x", "y"]
+
+
+def test_the_page_follows_a_growing_file_of_the_package(
+    tmp_path: Path, installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(installed)
+    result, curves = tmp_path / "pair.jsonl", {"a.x": BoundedCurve(0.0, 1.0)}
+    result.write_text('{"time": 0.0, "a.x": 1.0}\n{"time": 1.0, "a.')
+    source = ResultSource(result)
+
+    source.read(lambda: curves, lambda: None)
+    with result.open("a") as file:
+        file.write('x": 2.0}\n{"time": 2.0, "a.x": true}\n')
+    source.read(lambda: curves, lambda: None)
+
+    assert source.names == ["a.x"]
+    change = curves["a.x"].since(0)
+    assert sorted(zip(change.t_low, change.low, strict=True)) == [(0.0, 1.0), (1.0, 2.0), (2.0, 1.0)]
+    source.close()
+
+
+def test_a_format_that_can_only_be_written_is_not_plotted(extended: Place, installed: Path) -> None:
+    information = installed / "written-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: written\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[fmu_mesh.recorders]\nwritten = written:Written\n")
+    (installed / "written.py").write_text(
+        "from fmu_mesh_extension.json_lines import JsonLinesFile as Lines\n\n"
+        "class Written:\n"
+        "    check, open = Lines.check, Lines.open\n"
+        "    growing_file, keep_whole_rows = Lines.growing_file, Lines.keep_whole_rows\n"
+    )
+    config = write_config(extended.folder)
+
+    launched = extended.run("launch", config, "--output", "pair.written", "--plot", "pair.png")
 
     assert launched.wait() == 2
     assert "its format can only be written" in launched.message

@@ -10,13 +10,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from fmu_mesh.results.formats import followed
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
-from fmu_mesh.dashboard.result_source import open_tail
 from fmu_mesh.errors import ConfigurationError, Finding, FmuMeshError
-from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.ros.bags.bag import Bag
 from fmu_mesh.ros.bags.mcap_file import McapFile
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
@@ -61,9 +61,8 @@ def play_bag(path: Path) -> None:
 
 def follow(path: Path) -> None:
     """What the dashboard reads while a run goes on."""
-    if (tail := open_tail(path)) is not None:
-        with suppress(FmuMeshError):
-            tail.read(tail.names[:1])
+    if (tail := followed(path)) is not None:
+        tail.read(tail.names[:1])
         tail.close()
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+from fmu_mesh.results.formats import check_record
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -193,7 +195,7 @@ def test_a_valid_configuration_survives_the_way_through_a_file(config: Config) -
 def test_any_valid_structure_builds_or_is_a_configuration_error(config: Config) -> None:
     loaded = LoadedConfig(config, FILE)
     with contextlib.suppress(ConfigurationError):
-        build(loaded, dict.fromkeys(config.instances, GAIN))
+        build(loaded, dict.fromkeys(config.instances, GAIN), check_record=partial(check_record, loaded))
 
 
 @relaxed

@@ -26,12 +26,12 @@ from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import LoopNotConverged, StepFailed, TerminationRequested
 from fmu_mesh.instances.registry import decode_section
+from fmu_mesh.results.record_files import open_result
 from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.repeated import RepeatedRuns
-from fmu_mesh.run.results import open_result
 from fmu_mesh.run.run_plan import RunPlan
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection

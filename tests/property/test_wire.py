@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fmu_mesh.errors import ErrorReport, FmuMeshError, FrameGap, MessageRefused
-from fmu_mesh.recorder.csv_file import CsvFile
+from fmu_mesh.results.csv_file import CsvFile
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring, Rows
 from fmu_mesh.system.layout import Layout

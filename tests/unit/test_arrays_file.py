@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fmu_mesh.results.formats import read_result
 from numpy.typing import NDArray
 
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.arrays_file import ArraysFile, read_arrays
+from fmu_mesh.results.arrays_file import ArraysFile
 from fmu_mesh.variables.value_types import VariableType
 
-TYPES: list[VariableType] = ["Float64", "Boolean", "String"]
+TYPES: dict[str, VariableType] = {"a.x": "Float64", "a.flag": "Boolean", "a.text": "String"}
 
 
 def some(rows: int) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
@@ -25,22 +26,22 @@ def some(rows: int) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
 @pytest.mark.parametrize("rows", [0, 1, 3_855, 3_856, 20_000])  # a row has 17 bytes, a block 65,536
 def test_rows_of_any_number_are_read_as_they_were_written(tmp_path: Path, rows: int) -> None:
     times, columns = some(rows)
-    file = ArraysFile(tmp_path / "a.arrays", TYPES)
+    file = ArraysFile(tmp_path / "a.arrays", 1 + len(TYPES))
 
     file.write(times, columns)
     file.write(times, columns)
     file.close()
 
-    read_times, read_columns = read_arrays(tmp_path / "a.arrays", TYPES)
+    read = read_result(tmp_path / "a.arrays", TYPES)
     assert file.rows == 2 * rows
-    assert read_times.tolist() == times.tolist() * 2
-    assert [column.tolist() for column in read_columns] == [column.tolist() * 2 for column in columns]
+    assert read.times.tolist() == times.tolist() * 2
+    assert [column.tolist() for column in read.values.values()] == [column.tolist() * 2 for column in columns]
 
 
 def test_a_file_is_cut_after_its_last_whole_block(tmp_path: Path) -> None:
     path = tmp_path / "a.arrays"
     times, columns = some(10_000)
-    file = ArraysFile(path, TYPES)
+    file = ArraysFile(path, 1 + len(TYPES))
     file.write(times, columns)
     file.close()
     with path.open("r+b") as written:
@@ -49,4 +50,4 @@ def test_a_file_is_cut_after_its_last_whole_block(tmp_path: Path) -> None:
     rows = ArraysFile.keep_whole_rows(path, Kept())
 
     assert 0 < rows < 10_000
-    assert read_arrays(path, TYPES)[0].tolist() == times[:rows].tolist()
+    assert read_result(path, TYPES).times.tolist() == times[:rows].tolist()

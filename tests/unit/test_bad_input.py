@@ -17,7 +17,7 @@ import fmu_mesh
 from fmu_mesh import text
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.recorder.csv_file import CsvFile
+from fmu_mesh.results.csv_file import CsvFile
 from tests.helpers import FMUS
 
 GOOD = f"""\

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from fmu_mesh.api.compared_rows import Side, compared
 from fmu_mesh.api.mesh_builder import Mesh, load
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, ConfigurationError
 from fmu_mesh.instances.python.unit_names import base_unit_of
+from fmu_mesh.results.recording import Columns
 
 ROOT = Path(__file__).parents[2]
 NAN, INF = math.nan, math.inf

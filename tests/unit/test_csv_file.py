@@ -13,7 +13,7 @@ import pytest
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.csv_file import CsvFile
+from fmu_mesh.results.csv_file import CsvFile
 from fmu_mesh.variables.model_description import VariableType
 
 COLUMNS: list[tuple[str, VariableType]] = [

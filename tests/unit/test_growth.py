@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.recorder.growth import GrowthWatch
+from fmu_mesh.results.growth import GrowthWatch
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.variables.model_description import Variable

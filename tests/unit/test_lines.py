@@ -12,7 +12,7 @@ import orjson
 import pytest
 from numpy.typing import NDArray
 
-from fmu_mesh.recorder.csv_file import NativeLines, python_lines
+from fmu_mesh.results.csv_file import NativeLines, python_lines
 from fmu_mesh.rings.library import load_library
 from fmu_mesh.variables.value_types import DTYPES, TYPES, Value, VariableType, is_text
 

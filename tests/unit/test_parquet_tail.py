@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.dashboard.parquet_tail import ParquetTail
 from fmu_mesh.instances.configuration import parse
-from fmu_mesh.recorder.parquet_file import ParquetFile
-from fmu_mesh.system.recording import Recording
+from fmu_mesh.results.parquet_file import ParquetFile
+from fmu_mesh.results.parquet_tail import ParquetTail
+from fmu_mesh.results.recording import Recording
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 
 CONFIG = "mesh: m\nsimulation: {stop_time: 1.0, step_size: 0.1}\ninstances: {a: {fmu: A.fmu}}\n"
@@ -50,8 +50,11 @@ def _opened(path: Path) -> ParquetTail:
 def _numbers(tail: ParquetTail) -> list[float]:
     """The values of `a.x` that are new, halved."""
     rows = tail.read(["a.x"])
-    assert rows is None or rows[0].tolist() == (rows[1][0] / 2 * 0.1).tolist()
-    return [] if rows is None else (rows[1][0] / 2).tolist()
+    if rows is None:
+        return []
+    numbers: list[float] = (rows.values["a.x"] / 2).tolist()
+    assert rows.times.tolist() == [number * 0.1 for number in numbers]
+    return numbers
 
 
 def test_rows_come_once_while_the_file_grows_and_none_is_missing_at_its_end(path: Path) -> None:
@@ -95,7 +98,8 @@ def test_a_complete_file_is_read_from_its_first_row_on(path: Path) -> None:
     rows = tail.read(["a.flag", "a.x"])
 
     assert rows is not None
-    assert rows[1].tolist() == [[1, 0, 1, 0, 1], [0, 2, 4, 6, 8]]
+    assert rows.values["a.flag"].tolist() == [True, False, True, False, True]
+    assert rows.values["a.x"].tolist() == [0, 2, 4, 6, 8]
     assert (_numbers(tail), tail.replaced) == ([], False)
     tail.close()
 

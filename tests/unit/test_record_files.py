@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.record_files import ReadColumn, RecordFiles
 from fmu_mesh.recorder.row_buffer import RowBuffer
+from fmu_mesh.results.record_files import ReadColumn, RecordFiles
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.records import RecordPlan
 

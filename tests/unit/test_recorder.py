@@ -15,8 +15,8 @@ import zenoh
 
 from fmu_mesh.errors import MeshLost
 from fmu_mesh.recorder import recorder as module
-from fmu_mesh.recorder.csv_file import CsvFile
 from fmu_mesh.recorder.recorder import Recorder
+from fmu_mesh.results.csv_file import CsvFile
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan

@@ -9,16 +9,18 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from fmu_mesh.results.formats import result_endings, result_format
 
+import fmu_mesh
 from fmu_mesh import plugins
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.parquet_file import ParquetFile
+from fmu_mesh.results.record_files import rows_left
+from fmu_mesh.results.recording import ResultFile, ResultFormat
 from fmu_mesh.ros.bags.mcap_file import McapFile
-from fmu_mesh.run.results import rows_left
-from fmu_mesh.system.recording import ResultFile, ResultFormat, result_endings, result_format
 from tests.helpers import write_config
 
 Offer = Callable[..., None]
@@ -60,7 +62,7 @@ def test_the_ending_of_its_name_chooses_the_format_of_a_result_file(name: str, e
 
 
 def test_a_format_of_another_package_is_found_by_its_ending(offer: Offer) -> None:
-    offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
+    offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
 
     assert result_format("a.table") is CsvFile
     assert result_endings() == [".csv", ".mcap", ".parquet", ".table"]
@@ -80,7 +82,7 @@ def test_only_our_own_entry_points_are_read_for_a_format_of_ours(monkeypatch: py
 def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], offer: Offer
 ) -> None:
-    offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
+    offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
     config = write_config(tmp_path, record={"file": "pair.feather"})
 
     codes = main(["check", str(config)]), main(["launch", str(config), "--output", "pair.json"])
@@ -93,8 +95,8 @@ def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
 
 
 def test_two_packages_with_one_ending_are_both_named(offer: Offer) -> None:
-    offer("tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
-    offer("more-tables", "table", "fmu_mesh.recorder.csv_file:CsvFile")
+    offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
+    offer("more-tables", "table", "fmu_mesh.results.csv_file:CsvFile")
 
     with pytest.raises(ConfigurationError, match=r"the packages 'more-tables', 'tables' both offer 'table'"):
         result_format("a.table")
@@ -124,6 +126,19 @@ def test_an_installation_that_is_older_than_its_source_says_how_to_install_again
         plugins.plugin("fmu_mesh.not_yet", "csv")
 
     assert raised.value.hint == f"Install it again, as you did before, from {Path(__file__).parents[2]}."
+
+
+def test_a_package_that_reads_a_file_at_once_is_still_understood(tmp_path: Path, offer: Offer) -> None:
+    offer("tables", "table", "table_of_a_package:Table")
+    (tmp_path / "tables" / "table_of_a_package.py").write_text(
+        "import numpy as np\nfrom fmu_mesh.results.recording import Columns\n\n"
+        "class Table:\n    def read(path):\n        return Columns(np.zeros(1), {'a.x': np.ones(1)})\n"
+    )
+
+    with pytest.warns(DeprecationWarning, match=r"Table.read\(path\) becomes pieces\(path, types\)"):
+        result = fmu_mesh.Result.read(tmp_path / "some.table")
+
+    assert result["a.x"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("noted", "rows"), [((2, 3), 2), ((2, 1000), 0), (None, 0)])

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fmu_mesh.results.formats import result_endings
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,11 +16,9 @@ from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data, parse
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.overriding import with_options
-from fmu_mesh.system.recording import result_endings
 from fmu_mesh.system.records import RecordPlan
-from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription, Variable
-from tests.unit.test_system import ARRAYS, DESCRIPTIONS, FILE, built, findings_of, text
+from tests.unit.test_system import ARRAYS, DESCRIPTIONS, FILE, built, checked, findings_of, text
 
 ENDINGS = " or ".join(result_endings())
 OUTPUTS = ["pendulum.a", "pendulum.der(a,2)", "pendulum.count", "pendulum.flag", "pendulum.mode", "delay.y"]
@@ -70,7 +69,7 @@ def test_what_several_patterns_and_a_name_stand_for_is_recorded_once_at_its_firs
 def test_a_pattern_matches_arrays_as_a_whole() -> None:
     loaded = parse(text(rest="record: {variables: ['delay.y*', delay.data]}"), FILE)
 
-    recorded = build(loaded, ARRAYS).recorded
+    recorded = checked(loaded, ARRAYS).recorded
 
     assert [name for _, name in recorded] == [*(f"y[{i},{j}]" for i in (1, 2) for j in (1, 2, 3)), "data"]
 
@@ -104,7 +103,7 @@ def test_a_mesh_without_such_variables_is_told_as_such() -> None:
     loaded = parse(text(rest="record: {variables: ['local:*']}"), FILE)
 
     with pytest.raises(ConfigurationError, match="this mesh has no local variables with numbers"):
-        build(loaded, dict.fromkeys(DESCRIPTIONS, DESCRIPTIONS["delay"]))
+        checked(loaded, dict.fromkeys(DESCRIPTIONS, DESCRIPTIONS["delay"]))
 
 
 def test_a_pattern_is_no_finding_where_a_model_is_not_known() -> None:
@@ -112,7 +111,7 @@ def test_a_pattern_is_no_finding_where_a_model_is_not_known() -> None:
     broken = loaded.finding("instances.pendulum.fmu", "a broken file", "an FMU")
 
     with pytest.raises(ConfigurationError) as caught:
-        build(loaded, {"delay": DESCRIPTIONS["delay"]}, [broken])
+        checked(loaded, {"delay": DESCRIPTIONS["delay"]}, [broken])
 
     assert [finding.path for finding in caught.value.findings] == ["instances.pendulum.fmu", "record.variables[1]"]
 
@@ -170,7 +169,7 @@ def test_a_wrong_section_is_a_finding(section: str, expected: str) -> None:
     loaded, findings = examined(f"record: {section}")
 
     with pytest.raises(ConfigurationError) as caught:
-        build(loaded, DESCRIPTIONS, findings)
+        checked(loaded, DESCRIPTIONS, findings)
 
     assert [str(finding).removeprefix(f"{FILE}:") for finding in caught.value.findings] == [f"7: {expected}"]
 
@@ -179,7 +178,7 @@ def test_what_is_right_in_a_list_is_checked_beside_what_is_wrong() -> None:
     loaded, findings = examined("record: [3, {file: a.csv, evry: 2}, {file: a.csv, variables: [delay.z]}]")
 
     with pytest.raises(ConfigurationError) as caught:
-        build(loaded, DESCRIPTIONS, findings)
+        checked(loaded, DESCRIPTIONS, findings)
 
     assert [finding.path for finding in caught.value.findings] == [
         "record[0]",
@@ -222,7 +221,7 @@ def test_the_rows_of_some_points_are_those_whose_points_are_selected(
 def test_an_output_replaces_the_first_file(record: str, files: list[str]) -> None:
     loaded, findings = examined(f"record: {record}", PlanOptions(output=Path("/out.csv")))
 
-    system = build(loaded, DESCRIPTIONS, findings)
+    system = checked(loaded, DESCRIPTIONS, findings)
 
     assert [own.file for own in system.records] == files
     assert system.records[0].every == (2 if "every" in record else 1)
@@ -232,7 +231,7 @@ def test_a_wrong_output_is_a_finding_about_the_option() -> None:
     loaded, findings = examined("record: [{file: a.csv}, {file: b.csv}]", PlanOptions(output=Path("/out.xlsx")))
 
     with pytest.raises(ConfigurationError, match=r"`output='/out\.xlsx'`: '/out.xlsx', a format that is not written"):
-        build(loaded, DESCRIPTIONS, findings)
+        checked(loaded, DESCRIPTIONS, findings)
 
 
 def test_of_what_stays_in_memory_there_is_one() -> None:
@@ -240,7 +239,7 @@ def test_of_what_stays_in_memory_there_is_one() -> None:
         "record: [{file: a.csv, variables: [delay.y]}, {file: b.csv}]", PlanOptions(output="/run/rows.arrays")
     )
 
-    assert [own.variables for own in build(loaded, DESCRIPTIONS, findings).records] == [(("delay", "y"),)]
+    assert [own.variables for own in checked(loaded, DESCRIPTIONS, findings).records] == [(("delay", "y"),)]
 
 
 def without_outputs(count: int, *, states: tuple[str, ...] = ()) -> ModelDescription:
@@ -256,7 +255,7 @@ def without_outputs(count: int, *, states: tuple[str, ...] = ()) -> ModelDescrip
 
 def recorded_of(model: ModelDescription, rest: str = "") -> tuple[list[str], list[str]]:
     """The columns and the warnings of a mesh whose `delay` is this model."""
-    system = build(parse(text(rest=rest), FILE), {"pendulum": DESCRIPTIONS["pendulum"], "delay": model})
+    system = checked(parse(text(rest=rest), FILE), {"pendulum": DESCRIPTIONS["pendulum"], "delay": model})
     columns = [".".join(column) for column in system.recorded if column[0] == "delay"]
     return columns, [str(warning).removeprefix(f"{FILE}:") for warning in system.warnings]
 
@@ -295,14 +294,14 @@ def test_a_named_file_without_columns_is_a_finding(output: Path | None) -> None:
     nothing = without_outputs(0)
 
     with pytest.raises(ConfigurationError, match="into which nothing is recorded; expected variables in"):
-        build(loaded, {"pendulum": nothing, "delay": nothing}, findings)
+        checked(loaded, {"pendulum": nothing, "delay": nothing}, findings)
 
 
 @pytest.mark.parametrize("record", ["", "record: {every: 2}"])
 def test_a_file_that_nobody_named_and_that_gets_nothing_is_a_warning(record: str) -> None:
     nothing = without_outputs(0)
 
-    system = build(parse(text(rest=record), FILE), {"pendulum": nothing, "delay": nothing})
+    system = checked(parse(text(rest=record), FILE), {"pendulum": nothing, "delay": nothing})
 
     assert system.records == ()
     assert [warning.found for warning in system.warnings] == [
@@ -313,7 +312,7 @@ def test_a_file_that_nobody_named_and_that_gets_nothing_is_a_warning(record: str
 def test_what_stays_in_memory_may_be_nothing() -> None:
     loaded, findings = examined("record: {variables: []}", PlanOptions(output="/run/rows.arrays"))
 
-    assert build(loaded, DESCRIPTIONS, findings).records == ()
+    assert checked(loaded, DESCRIPTIONS, findings).records == ()
 
 
 def examined(rest: str, options: PlanOptions | None = None) -> tuple[LoadedConfig, Findings]:

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.errors import CallRefused, ConfigurationError, UnknownName
+from fmu_mesh.results.recording import Columns
 from fmu_mesh.sweeps.reductions import Reduction, check_reductions, read_reduction, reduced_value
 from fmu_mesh.variables.value_types import VariableType
 

@@ -21,12 +21,12 @@ from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import ConfigurationError, FmuMeshError, Interrupted, LoadFailed
 from fmu_mesh.instances.contract import LogMessage
 from fmu_mesh.instances.fmi.loaded_fmu import LoadedFmu
+from fmu_mesh.results.record_files import open_result
 from fmu_mesh.rings import native
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.preparing import KnownModels
 from fmu_mesh.run.repeated import RepeatedRuns
-from fmu_mesh.run.results import open_result
 from fmu_mesh.run.run_plan import RunPlan
 from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked
@@ -466,7 +466,7 @@ def test_of_an_fmu_that_hangs_the_rows_are_kept(tmp_path: Path, faulty: Path) ->
     script = tmp_path / "hanging.py"
     script.write_text(
         "import os, sys\nfrom pathlib import Path\nimport fmu_mesh\n"
-        "from fmu_mesh.run.repeated import RepeatedRuns\nfrom fmu_mesh.run.results import open_result\n\n"
+        "from fmu_mesh.run.repeated import RepeatedRuns\nfrom fmu_mesh.results.record_files import open_result\n\n"
         "def end(error):\n    print(error, flush=True)\n    os._exit(3)\n\n"
         f"mesh, runs = fmu_mesh.load({str(config)!r}), RepeatedRuns(Path({str(tmp_path / 'runs')!r}), on_hang=end)\n"
         "for hang_at in (1e9, 1.0):\n"

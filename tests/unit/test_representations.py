@@ -12,10 +12,10 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.pictures.graph_drawing import GraphNode, GraphVariable
 from fmu_mesh.pictures.system_graph import graph_of
 from fmu_mesh.pictures.tables import html_table
+from fmu_mesh.results.recording import Columns
 from tests.helpers import FMUS
 
 PAIR = """

@@ -14,11 +14,11 @@ from matplotlib.text import Annotation
 
 from fmu_mesh.api.mesh_builder import load
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, ConfigurationError
 from fmu_mesh.pictures.drawing import PALETTE
 from fmu_mesh.pictures.result_drawing import Curve, Curves, PictureOptions, figure_of, in_unit
+from fmu_mesh.results.recording import Columns
 
 ROOT = Path(__file__).parents[2]
 TIMES = np.linspace(0.0, 1.0, 11)

@@ -24,15 +24,15 @@ from pyarrow import parquet
 import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.dashboard.parquet_tail import ParquetTail
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.instances.configuration import parse
-from fmu_mesh.recorder import parquet_file, parquet_groups
-from fmu_mesh.recorder.csv_file import CsvFile
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results import parquet_file
+from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.parquet_file import ParquetFile
+from fmu_mesh.results.parquet_tail import ParquetTail
+from fmu_mesh.results.recording import Recording, ResultFile, ResultFormat, with_notes
 from fmu_mesh.ros.bags.mcap_file import McapFile
-from fmu_mesh.system.recording import Recording, ResultFile, ResultFormat, with_notes
 from fmu_mesh.system.schedule import SeriesFile
 from fmu_mesh.system.series_files import columns_of, content_of, read_series
 from fmu_mesh.variables.model_description import ModelDescription, Variable
@@ -418,10 +418,10 @@ def test_elements_of_lists_are_curves_and_scenarios(tmp_path: Path) -> None:
 
     assert list(again.names) == columns_of(path)[1:] == list(columns)
     assert growing is not None
-    assert growing[1].tolist() == [columns["it.part[1]"].tolist(), columns["it.Float64[2,1]"].tolist()]
+    assert all(same(growing.values[name], columns[name]) for name in ("it.part[1]", "it.Float64[2,1]"))
     whole = again.read(["it.Float64[2,1]"])
     assert whole is not None
-    assert whole[1].tolist() == [columns["it.Float64[2,1]"].tolist()] == [series[1]]
+    assert whole.values["it.Float64[2,1]"].tolist() == columns["it.Float64[2,1]"].tolist() == series[1]
     tail.close()
     again.close()
 
@@ -494,8 +494,8 @@ import os, sys
 from pathlib import Path
 import pyarrow.parquet
 from fmu_mesh import Result
-from fmu_mesh.dashboard.parquet_tail import ParquetTail
-from fmu_mesh.recorder.parquet_file import ParquetFile
+from fmu_mesh.results.parquet_tail import ParquetTail
+from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.system.series_files import SeriesFile, content_of, read_series
 from fmu_mesh.variables.model_description import Variable
 
@@ -527,7 +527,7 @@ def test_reading_parquet_starts_no_thread(tmp_path: Path) -> None:
 def test_row_groups_are_bounded_and_small_batches_become_large_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(parquet_groups, "_GROUP_ROWS", 5000)
+    monkeypatch.setattr(parquet_file, "_GROUP_ROWS", 5000)
     path, types = tmp_path / "a.parquet", ["Float64", "String"]
     file = ParquetFile.open(path, recording(types))  # type: ignore[arg-type]  # literals
 

@@ -15,11 +15,11 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 import fmu_mesh
-from fmu_mesh.api import result_reading
 from fmu_mesh.api.result import Result
-from fmu_mesh.api.result_reading import Columns
 from fmu_mesh.pictures import drawing
-from fmu_mesh.recorder.csv_file import NativeLines, python_lines
+from fmu_mesh.results import csv_file
+from fmu_mesh.results.csv_file import NativeLines, python_lines
+from fmu_mesh.results.recording import Columns
 
 TEXTS = ["one, two", 'a "b"', "line\nbreak", "", "plain", "é"]
 NUMBERS = [0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1.7976931348623157e308, 1 / 3, 0.1]
@@ -46,7 +46,7 @@ def written(path: Path, columns: dict[str, Any]) -> Path:
 
 @pytest.mark.parametrize("size", [1, 7, 100, 4096])
 def test_pieces_of_any_size_give_the_same_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int) -> None:
-    monkeypatch.setattr(result_reading, "_PIECE_BYTES", size)
+    monkeypatch.setattr(csv_file, "_PIECE_BYTES", size)
     columns = columns_of(200)
 
     result = Result.read(written(tmp_path / "a.csv", columns))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fmu_mesh.results.formats import check_record, warn_of_endings
+from msgspec.structs import replace
 
-from fmu_mesh.config.loading import read_file
+from fmu_mesh.config.loading import LoadedConfig, read_file
 from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.instances.configuration import examine_data, parse
@@ -90,7 +94,17 @@ connections: [{connections}]
 
 
 def built(config: str, **start_values: Any) -> ResolvedSystem:  # noqa: ANN401 as a file has them
-    return build(parse(config, FILE, start_values), DESCRIPTIONS)
+    return checked(parse(config, FILE, start_values), DESCRIPTIONS)
+
+
+def checked(
+    loaded: LoadedConfig, descriptions: Mapping[str, ModelDescription], findings: Iterable[Finding] = ()
+) -> ResolvedSystem:
+    """The system of a configuration, with what the formats of its result files say."""
+    system = build(loaded, descriptions, findings, check_record=partial(check_record, loaded))
+    warnings = loaded.findings()
+    warn_of_endings(loaded, system.records, warnings)
+    return replace(system, warnings=(*system.warnings, *warnings))
 
 
 def findings_of(config: str, **start_values: Any) -> list[str]:  # noqa: ANN401 as a file has them

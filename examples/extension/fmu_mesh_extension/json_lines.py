@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from fmu_mesh.results.tails import LineTail
 from numpy.typing import NDArray
 
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.files import Kept, open_alone
-from fmu_mesh.system.recording import Recording
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.files import Kept, open_alone, opened
+from fmu_mesh.results.recording import Columns, Recording
+from fmu_mesh.variables.value_types import DTYPES, VariableType
 
 _BUFFER_BYTES = 1 << 16
+_LINES = 10_000
 
 
 class JsonLinesFile:
@@ -59,6 +63,27 @@ class JsonLinesFile:
             file.truncate(kept.size + rest.rfind(b"\n") + 1)
         return kept.rows + rest.count(b"\n")
 
+    @staticmethod
+    def pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:
+        """Some thousands of rows at a time; the last line may be cut off where the run was killed, or goes on."""
+        with opened(path) as file:
+            names = _names(path, file.readline())
+            file.seek(0)
+            while lines := [line for _, line in zip(range(_LINES), file, strict=False)]:
+                yield _columns(b"".join(lines[: -1 if not lines[-1].endswith(b"\n") else None]), names, types)
+
+    @staticmethod
+    def follow(path: Path) -> LineTail | None:
+        """The page shows the rows while they are written."""
+        file = opened(path)
+        try:
+            names = _names(path, file.readline())
+            file.seek(0)
+        except BaseException:
+            file.close()
+            raise
+        return LineTail(path, file, names, _columns)
+
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time."""
         for row in zip(times.tolist(), *(column.tolist() for column in columns), strict=True):
@@ -89,3 +114,21 @@ class JsonLinesFile:
             self.flush()
         finally:
             self._file.close()
+
+
+def _names(path: Path, line: bytes) -> list[str]:
+    """The columns without the time, which are those of the first row."""
+    time, *names = json.loads(line)
+    if time != "time":
+        raise ConfigurationError(f"'{path}' is no result file: its first value is '{time}', not 'time'.")
+    return names
+
+
+def _columns(data: bytes, names: Sequence[str], types: Mapping[str, VariableType] = {}) -> Columns:
+    """Some columns of whole rows; without a type, numpy finds it."""
+    rows = [json.loads(line) for line in data.splitlines()]
+    values = {
+        name: np.array([row[name] for row in rows], DTYPES[types[name]] if name in types else None) for name in names
+    }
+    texts = {name: array.astype(object) for name, array in values.items() if array.dtype.kind == "U"}
+    return Columns(np.array([row["time"] for row in rows], np.float64), values | texts)

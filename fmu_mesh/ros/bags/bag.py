@@ -23,9 +23,9 @@ from ...config.mesh import RosConfig, RosTopicConfig
 from ...config.scenario_section import ScenarioSource, ScenarioValues
 from ...errors import ConfigurationError
 from ...installing import importing
-from ...system.recording import reading
+from ...results.formats import near_hint, reading
 from ...system.scenario import BagValues, is_bag
-from ...text import listed, nearest, nearest_file
+from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value
 from ..gateway.mapping import Resolver, message_types
 from ..messages.assembling import Disassembler
@@ -73,10 +73,7 @@ class Bag:
             from rosbags.rosbag2 import Reader  # noqa: PLC0415 an optional dependency
         self.path = path
         if not files.exists(path):
-            near = nearest_file(path)
-            raise ConfigurationError(
-                f"the bag '{path}' does not exist.", hint=f"Did you mean '{near}'?" if near is not None else None
-            )
+            raise ConfigurationError(f"the bag '{path}' does not exist.", hint=near_hint(path))
         if files.is_folder(path) and not (path / "metadata.yaml").is_file():
             raise ConfigurationError(
                 f"the folder '{path}' is no bag: it has no metadata.yaml.",

@@ -5,11 +5,10 @@ Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.m
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from io import BufferedWriter
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -21,15 +20,16 @@ from ...config.findings import Findings
 from ...config.mesh import RosConfig
 from ...files import Kept, open_alone
 from ...installing import importing
-from ...system.recording import Columns, Recording
+from ...results.recording import Columns, Recording, Tail
 from ...variables.model_description import ModelDescription
+from ...variables.value_types import VariableType
 from ..gateway.mapping import Resolver, message_types
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
 from ..messages.stamp import nanoseconds, to_stamp
 from ..messages.topics import CLOCK_TOPIC, RosPlan, Topic
-from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns, has_passed
+from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns
 
 __all__ = ["McapFile"]
 
@@ -55,11 +55,6 @@ class McapFile:
         recording: what is recorded.
         plan: the topics, and how often the clock ticks.
 
-    Attributes:
-        path: the file.
-        rows: number of rows written so far; after `close`, the number of rows in the file.
-        kept: what the operating system has.
-
     Raises:
         ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
@@ -76,16 +71,18 @@ class McapFile:
         self._mcap = writer(self._file)
         self._types = types = plan.types
         self._schemas: dict[str, int] = {}
+        layout = _layout(recording, plan)
         self._topics = [
-            _RecordedTopic(topic, index, self._channel(topic.name, topic.message), types) for topic in plan.topics
+            _RecordedTopic(topic, columns, index, self._channel(topic.name, topic.message), types)
+            for topic, columns in zip(plan.topics, layout.topics, strict=False)
         ]
-        self._clock_points = plan.clock_points
-        if self._clock_points is not None:
+        self._clock_ticks = layout.topics[-1] if plan.clock_points is not None else None
+        if self._clock_ticks is not None:
             self._clock = Codec(types, CLOCK)
             self._clock_channel = self._channel(CLOCK_TOPIC, CLOCK)
         self._about = {
             "metadata": msgspec.json.encode(recording.metadata).decode(),
-            "recording": msgspec.json.encode(_recorded(recording, plan)).decode(),
+            "recording": msgspec.json.encode(layout).decode(),
         }
         self._waiting: list[Mapping[str, Any]] = []
 
@@ -118,20 +115,17 @@ class McapFile:
         return finish_mcap(path, kept)
 
     @staticmethod
-    def read(path: Path) -> Columns:
-        """Read a result file. What a field has rounded, such as a Float64 in a float32, comes back rounded."""
+    def pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:  # noqa: ARG004 the file has them
+        """All rows. What a field has rounded, such as a Float64 in a float32, comes back rounded."""
         _writer_class()
         from .mcap_reading import read_mcap  # noqa: PLC0415 an optional dependency
 
-        return read_mcap(path)
+        yield read_mcap(path)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    @staticmethod
+    def follow(path: Path) -> Tail | None:  # noqa: ARG004 as above
+        """There is nothing to follow: Foxglove and `ros2 bag` show bags."""
+        return None
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length."""
@@ -144,10 +138,10 @@ class McapFile:
         for row, time in enumerate(times.tolist()):
             point, stamp = self._first + self.rows * self._every, nanoseconds(time)
             before = point - self._every if self.rows else -1
-            if self._clock_points is not None and has_passed(self._clock_points, before, point):
+            if self._clock_ticks is not None and self._clock_ticks.is_due(before, point):
                 self._add(self._clock_channel, stamp, self._clock.encode({"clock": to_stamp(time)}), point)
             for topic, fields in zip(self._topics, values, strict=True):
-                if topic.due(before, point):
+                if topic.is_due(before, point):
                     self._add(topic.channel, stamp, topic.message([field[row] for field in fields], time), point)
             self.rows += 1
 
@@ -195,16 +189,14 @@ class McapFile:
 class _RecordedTopic:
     """One topic of a recording."""
 
-    def __init__(self, topic: Topic, index: dict[str, int], channel: int, types: MessageTypes) -> None:
+    def __init__(
+        self, topic: Topic, columns: TopicColumns, index: dict[str, int], channel: int, types: MessageTypes
+    ) -> None:
         self.channel = channel
-        self._steps = sorted({port.step_points for port in topic.ports})
-        self._columns = [[index[f"{port.instance}.{name}"] for name in port.variable.elements] for port in topic.ports]
+        self.is_due = columns.is_due
+        self._columns = [[index[name] for name in names] for _, names in columns.fields]
         self._are_arrays = [bool(port.variable.shape) for port in topic.ports]
         self.message = Assembler(topic, types).make
-
-    def due(self, before: int, point: int) -> bool:
-        """Whether one of the variables has a new value at ``point`` that it did not have at the point ``before``."""
-        return any(has_passed(step, before, point) for step in self._steps)
 
     def values(self, columns: Sequence[NDArray[Any]]) -> list[Any]:
         """The value of each field in each row: of an array all elements, as a row of one block."""
@@ -214,7 +206,7 @@ class _RecordedTopic:
         ]
 
 
-def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:
+def _layout(recording: Recording, plan: RosPlan) -> RecordedMcap:
     """Where the columns are in the file, for those who read it."""
     topics = [
         TopicColumns(
@@ -228,11 +220,11 @@ def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:
     ]
     if plan.clock_points is not None:
         topics.append(TopicColumns(CLOCK_TOPIC, (plan.clock_points,)))
-    columns = []
-    for (instance, name), (column, type_) in zip(recording.recorded, recording.columns, strict=True):
-        variable = recording.descriptions[instance].variable_of(name)
-        assert variable is not None  # the system is valid
-        columns.append(RecordedColumn(column, type_, variable.unit))
+    columns = [
+        RecordedColumn(f"{instance}.{name}", variable.type, variable.unit)
+        for instance, name in recording.recorded
+        for variable in [recording.variable(instance, name)]
+    ]
     simulation = recording.loaded.config.simulation
     return RecordedMcap(
         simulation.start_time,
@@ -246,13 +238,10 @@ def _recorded(recording: Recording, plan: RosPlan) -> RecordedMcap:
 
 
 def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
-    """The topics that hold the recorded variables.
+    """The topics that hold the recorded variables; None if a finding makes it impossible to go on.
 
     A topic of the `ros` section is recorded as it is if all of its variables are recorded. Every other recorded
     variable has a topic of its own, with the name and the type that the section gives it by default.
-
-    Returns:
-        None if a finding makes it impossible to go on.
     """
     loaded, descriptions = recording.loaded, recording.descriptions
     section = loaded.config.ros or RosConfig()
@@ -299,8 +288,7 @@ def _whole(recording: Recording, findings: Findings) -> list[tuple[str, str]]:
     columns = set(recording.recorded)
     whole: dict[tuple[str, str], None] = {}
     for instance, name in recording.recorded:
-        variable = recording.descriptions[instance].variable_of(name)
-        assert variable is not None  # the system is valid
+        variable = recording.variable(instance, name)
         if (instance, variable.name) not in whole and not {(instance, e) for e in variable.elements} <= columns:
             findings.add(
                 f"{recording.place}.variables",

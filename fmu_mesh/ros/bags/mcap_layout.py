@@ -13,7 +13,7 @@ import msgspec
 from ...variables.value_types import VariableType
 from ..messages.definitions import Distribution
 
-__all__ = ["NOTE", "RECORDING", "ROWS", "RecordedColumn", "RecordedMcap", "TopicColumns", "has_passed"]
+__all__ = ["NOTE", "RECORDING", "ROWS", "RecordedColumn", "RecordedMcap", "TopicColumns"]
 
 RECORDING: Final = "fmu_mesh"
 NOTE: Final = "fmu_mesh.note"
@@ -41,6 +41,10 @@ class TopicColumns(msgspec.Struct, frozen=True):
     steps: tuple[int, ...]
     fields: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
+    def is_due(self, before: int, point: int) -> bool:
+        """Whether it has a message in the row of ``point``, which follows that of the point ``before``, or -1."""
+        return any(point // step > before // step for step in self.steps)
+
 
 class RecordedMcap(msgspec.Struct, frozen=True):
     """Where the columns of a run are in its MCAP.
@@ -63,13 +67,7 @@ class RecordedMcap(msgspec.Struct, frozen=True):
     first: int = 0
     every: int = 1
 
-    def is_due(self, topic: TopicColumns, row: int) -> bool:
-        """Whether a topic has a message in a row."""
+    def due(self, row: int) -> set[str]:
+        """The topics that have a message in a row."""
         point = self.first + row * self.every
-        before = point - self.every if row else -1
-        return any(has_passed(step, before, point) for step in topic.steps)
-
-
-def has_passed(step: int, before: int, point: int) -> bool:
-    """Whether one of the points after ``before``, up to ``point``, is a multiple of ``step``."""
-    return point // step > before // step
+        return {topic.name for topic in self.topics if topic.is_due(point - self.every if row else -1, point)}

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel, McapRecord, Message, Schema
+from mcap.records import Channel, Message, Schema
 from numpy.typing import NDArray
 
 from ...files import opened
+from ...results.recording import Columns
 from ...simtime import ENDLESS, TimeGrid
-from ...system.recording import Columns
 from ...variables.value_types import DTYPES, VariableType, is_text
 from ..messages.cdr import HEADER_SIZE, Codec
 from ..messages.definitions import NUMBERS, Basic, MessageTypes, path_parts
-from .mcap_layout import RecordedMcap, TopicColumns
+from .mcap_layout import TopicColumns
 from .mcap_records import McapContent
 
 __all__ = ["read_mcap"]
@@ -31,50 +31,38 @@ def read_mcap(path: Path) -> Columns:
     """
     with opened(path) as file:
         content = McapContent(file, path)
-        recording = content.recording
+        channels = _channels(content)
         rows = content.rows if content.rows is not None else content.whole_rows()[0]
-        reader = _ColumnReader(recording)
-        for chunk in content.chunks:
-            for record in content.records_of(chunk):
-                reader.take(record)
-        return reader.columns(rows)._replace(metadata=content.metadata)
+    recording = content.recording
+    first, every = recording.first, recording.every
+    grid = TimeGrid(recording.start_time, recording.step_size, ENDLESS)
+    times = grid.times(first, first + rows * every)[::every]
+    types = {column.name: column.type for column in recording.columns}
+    found: dict[str, NDArray[Any]] = {}
+    for channel in channels:
+        found |= channel.columns(times, types, first, every)
+    units = {column.name: column.unit for column in recording.columns if column.unit is not None}
+    return Columns(times, {name: found[name] for name in types}, units, content.metadata)
 
 
-class _ColumnReader:
-    """Collects the values of the columns from the records of all chunks."""
-
-    def __init__(self, recording: RecordedMcap) -> None:
-        self._recording = recording
-        self._types = MessageTypes(recording.distribution)
-        self._schemas: dict[int, str] = {}
-        self._topics = {topic.name: topic for topic in recording.topics}
-        self._channels: dict[int, _ChannelReader] = {}
-
-    def take(self, record: McapRecord) -> None:
-        """Take the next record."""
-        match record:
-            case Message():
-                if record.channel_id in self._channels:
-                    self._channels[record.channel_id].add(record)
-            case Schema():
-                self._types.define(record.name, record.data.decode())
-                self._schemas[record.id] = record.name
-            case Channel() if record.topic in self._topics:
-                topic = self._topics[record.topic]
-                self._channels[record.id] = _ChannelReader(topic, self._types, self._schemas[record.schema_id])
-
-    def columns(self, rows: int) -> Columns:
-        """The columns of the first rows."""
-        first, every = self._recording.first, self._recording.every
-        grid = TimeGrid(self._recording.start_time, self._recording.step_size, ENDLESS)
-        times = grid.times(first, first + rows * every)[::every]
-        found: dict[str, NDArray[Any]] = {}
-        types = {column.name: column.type for column in self._recording.columns}
-        for channel in self._channels.values():
-            found |= channel.columns(times, types, first, every)
-        columns = self._recording.columns
-        values = {column.name: found[column.name] for column in columns}
-        return Columns(times, values, {column.name: column.unit for column in columns if column.unit is not None})
+def _channels(content: McapContent) -> list[_ChannelReader]:
+    """The messages of all topics with columns."""
+    types = MessageTypes(content.recording.distribution)
+    topics = {topic.name: topic for topic in content.recording.topics}
+    schemas: dict[int, str] = {}
+    channels: dict[int, _ChannelReader] = {}
+    for chunk in content.chunks:
+        for record in content.records_of(chunk):
+            match record:
+                case Message():
+                    if record.channel_id in channels:
+                        channels[record.channel_id].add(record)
+                case Schema():
+                    types.define(record.name, record.data.decode())
+                    schemas[record.id] = record.name
+                case Channel() if record.topic in topics:
+                    channels[record.id] = _ChannelReader(topics[record.topic], types, schemas[record.schema_id])
+    return list(channels.values())
 
 
 class _ChannelReader:

@@ -39,7 +39,7 @@ from mcap.stream_reader import breakup_chunk
 
 from ...errors import ConfigurationError
 from ...files import Kept, decoded_json
-from ...system.recording import metadata_in, with_notes
+from ...results.recording import metadata_in, with_notes
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap
 
 __all__ = ["McapContent", "finish_mcap"]
@@ -75,13 +75,10 @@ def finish_mcap(path: Path, kept: Kept) -> int:
 
 
 class _PlacedChunk:
-    """A chunk, and the message indexes that follow it.
+    """A chunk without its data, and the message indexes that follow it.
 
     Attributes:
-        offset: of the chunk in the file.
         length: of its record.
-        chunk: without its data.
-        compressed_size: of its data.
         indexes: the offset of the message index of each channel.
         index_length: of all of these records.
         counts: the number of messages of each channel.
@@ -148,8 +145,7 @@ class McapContent:
     def records_of(self, placed: _PlacedChunk) -> list[McapRecord]:
         """The schemas, channels and messages of a chunk."""
         self.file.seek(placed.offset + _HEAD.size)
-        chunk = Chunk.read(_stream(self.file.read(placed.length - _HEAD.size)))
-        return breakup_chunk(chunk, validate_crc=True)
+        return breakup_chunk(Chunk.read(self._record(placed.length)), validate_crc=True)
 
     def whole_rows(self) -> tuple[int, int]:
         """The number of whole rows, and the index of the first chunk that has messages of another one."""
@@ -172,7 +168,7 @@ class McapContent:
         if last is None:
             return 0, 0
         row = (last - self.recording.first) // self.recording.every
-        if there == {topic.name for topic in self.recording.topics if self.recording.is_due(topic, row)}:
+        if there == self.recording.due(row):
             return row + 1, len(self.chunks)
         return row, changed
 
@@ -201,18 +197,11 @@ class McapContent:
 
     def _record(self, length: int) -> ReadDataStream:
         """The content of the record whose head was read last."""
-        return _stream(self.file.read(length - _HEAD.size))
+        return ReadDataStream(io.BytesIO(self.file.read(length - _HEAD.size)))
 
 
 def _write_end(file: BinaryIO, content: McapContent, rows: int, changed: int) -> None:
-    """Write the end of a file after its whole rows.
-
-    Args:
-        file: the file.
-        content: what is in it.
-        rows: the number of whole rows.
-        changed: index of the first chunk with messages of a row that is not whole.
-    """
+    """Write the end of a file after its whole rows; from the chunk ``changed`` on there are messages of another row."""
     # The last chunk is always written again: its message indexes may be missing.
     first = min(changed, len(content.chunks) - 1)
     records = [r for r in content.records_of(content.chunks[first]) if not isinstance(r, Message) or r.sequence < rows]
@@ -317,10 +306,6 @@ def _chunk_index(placed: _PlacedChunk) -> ChunkIndex:
         message_start_time=chunk.message_start_time,
         uncompressed_size=chunk.uncompressed_size,
     )
-
-
-def _stream(content: bytes) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(content))
 
 
 def _taken(out: RecordBuilder) -> bytes:

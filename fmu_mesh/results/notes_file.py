@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from ..files import opened, replaced
-from ..system.recording import metadata_in
+from .recording import metadata_in
 
 __all__ = ["NotesFile", "read_notes"]
 
@@ -43,7 +43,8 @@ class NotesFile:
         Raises:
             OSError: it cannot be written.
         """
-        start = _pretty(self._metadata).removesuffix(b"\n}") + b',\n  "set": ['
+        metadata = msgspec.json.format(msgspec.json.encode(self._metadata), indent=2)
+        start = metadata.removesuffix(b"\n}") + b',\n  "set": ['
         with replaced(self._path) as draft:
             draft.write_bytes(start + b"]\n}\n")
             self._descriptor = os.open(draft, os.O_WRONLY | os.O_CLOEXEC)
@@ -98,10 +99,6 @@ def read_notes(path: Path) -> dict[str, Any]:
 
 def _beside(path: Path) -> Path:
     return path.with_name(path.name + _ENDING)
-
-
-def _pretty(metadata: Mapping[str, Any]) -> bytes:
-    return msgspec.json.format(msgspec.json.encode(metadata), indent=2)
 
 
 def _write_all(descriptor: int, text: bytes, offset: int) -> None:

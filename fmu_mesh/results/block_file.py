@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..config.findings import Findings
 from ..files import Kept, open_alone
-from ..system.recording import Recording
+from .recording import Recording
 
 __all__ = ["BlockFile"]
 
@@ -22,7 +22,7 @@ _BLOCK_NUMBERS = 16384
 
 
 class BlockFile(ABC):
-    """A result file (`ResultFile`); a subclass says what a block is.
+    """A result file (`ResultFile`) whose rows can be read while it grows; a subclass says what a block is.
 
     Args:
         path: the file; its folder is created, and the first row replaces an older file.
@@ -50,7 +50,7 @@ class BlockFile(ABC):
 
     @staticmethod
     def growing_file(path: Path) -> Path:
-        """The file itself: its rows can be read while it grows."""
+        """The file itself."""
         return path
 
     @staticmethod

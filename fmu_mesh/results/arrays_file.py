@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,57 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files import Kept
-from ..system.recording import Recording
 from ..variables.value_types import DTYPES, VariableType, is_text
 from .block_file import BlockFile
+from .recording import Columns, Recording, Tail
 
-__all__ = ["ENDING", "ArraysFile", "bytes_of_a_row", "read_arrays"]
-
-ENDING = ".arrays"
+__all__ = ["ArraysFile", "bytes_of_a_row"]
 
 _HEAD = struct.Struct("<qq")
 """Number of bytes that follow, and number of rows in them."""
 
 
-def bytes_of_a_row(types: Sequence[VariableType]) -> int:
+def bytes_of_a_row(types: Iterable[VariableType]) -> int:
     """The size of a row in bytes, time included; texts are not counted, as their size is not known."""
     return 8 + sum(np.dtype(DTYPES[type_]).itemsize for type_ in types if not is_text(type_))
 
 
-def read_arrays(path: Path, types: Sequence[VariableType]) -> tuple[NDArray[np.float64], list[NDArray[Any]]]:
-    """Read a file of this module.
-
-    Args:
-        path: the file; if it does not exist there are no rows.
-        types: the types of the columns.
-
-    Returns:
-        The times in s, shape `(rows,)`, and an array of the same shape for each column.
-    """
-    all_types: tuple[VariableType, ...] = ("Float64", *types)
-    columns: list[list[NDArray[Any]]] = [[np.zeros(0, DTYPES[type_])] for type_ in all_types]
-    for _, _, block in _blocks(path) if path.exists() else ():
-        for column, part, type_ in zip(columns, msgspec.msgpack.decode(block), all_types, strict=True):
-            column.append(np.array(part, object) if is_text(type_) else np.frombuffer(part, DTYPES[type_]))
-    times, *others = (np.concatenate(column) for column in columns)
-    return times, others
-
-
 class ArraysFile(BlockFile):
-    """Writes rows of results as blocks of arrays.
-
-    Args:
-        path: the file.
-        types: the types of the columns but `time`.
-    """
-
-    def __init__(self, path: Path, types: Sequence[VariableType]) -> None:
-        super().__init__(path, 1 + len(types))
+    """Writes rows of results as blocks of arrays."""
 
     @classmethod
     def open(cls, path: Path, recording: Recording) -> Self:
         """Open a file for what a run records."""
-        return cls(path, [type_ for _, type_ in recording.columns])
+        return cls(path, 1 + len(recording.recorded))
 
     @staticmethod
     def keep_whole_rows(path: Path, kept: Kept) -> int:  # noqa: ARG004  the blocks are found from the first one on
@@ -75,6 +46,23 @@ class ArraysFile(BlockFile):
         blocks = [(0, 0, memoryview(b"")), *_blocks(path)]
         os.truncate(path, blocks[-1][0])
         return sum(rows for _, rows, _ in blocks)
+
+    @staticmethod
+    def pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:
+        """The rows of each block; there are none if the file does not exist. ``types`` are those of all columns."""
+        yield Columns(np.zeros(0), {name: np.zeros(0, DTYPES[type_]) for name, type_ in types.items()})
+        for _, _, block in _blocks(path) if path.exists() else ():
+            times, *columns = msgspec.msgpack.decode(block)
+            values = {
+                name: np.array(part, object) if is_text(type_) else np.frombuffer(part, DTYPES[type_])
+                for (name, type_), part in zip(types.items(), columns, strict=True)
+            }
+            yield Columns(np.frombuffer(times, np.float64), values)
+
+    @staticmethod
+    def follow(path: Path) -> Tail | None:  # noqa: ARG004  who has the file knows no types, and no page has the file
+        """There is nothing to follow."""
+        return None
 
     def _block(self, columns: Sequence[NDArray[Any]]) -> bytes:
         block = msgspec.msgpack.encode(

@@ -10,21 +10,20 @@ import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Self, TypeVar
+from typing import Any, BinaryIO, Self, TypeVar
 
-import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from ..system.arrow import open_parquet, places_of, values_at
+from .parquet_arrays import TIME, array_of
+from .recording import Columns
+from .tails import GrowingFile
 
 __all__ = ["ParquetTail"]
 
-_TIME: Final = "time"
-
 
 class ParquetTail:
-    """The rows of a result, batch by batch.
+    """The rows of a result, batch by batch; see `Tail`.
 
     Args:
         path: the result file.
@@ -42,7 +41,7 @@ class ParquetTail:
         self.names: Sequence[str] = [
             name
             for name, (field, _) in self._places.items()
-            if name != _TIME and types[field] not in ("string", "binary")
+            if name != TIME and types[field] not in ("string", "binary")
         ]
         self._batches = batches
 
@@ -56,7 +55,7 @@ class ParquetTail:
     @property
     def replaced(self) -> bool:
         """Whether the file is gone, or that of another run; a stream that has become the file is not."""
-        return not (self._batches.is_there or (self._batches.is_over and self.path.exists()))
+        return self._batches.replaced and not (self._batches.is_over and self.path.exists())
 
     @property
     def behind(self) -> int:
@@ -67,58 +66,28 @@ class ParquetTail:
         """Go on with the rows that are written from now on."""
         self._batches.skip()
 
-    def read(self, columns: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """The rows of the next batch; None if there is no new one.
-
-        Returns:
-            The times in s, shape `(rows,)`, and the values, shape `(columns, rows)`.
-        """
+    def read(self, names: Sequence[str]) -> Columns | None:
+        """These columns of the next batch; None if there is no new one."""
         places, is_over = self._places, self._batches.is_over  # asked before the last batch is
         try:
-            batch = self._batches.next([_TIME, *dict.fromkeys(places[name][0] for name in columns)])
+            batch = self._batches.next([TIME, *dict.fromkeys(places[name][0] for name in names)])
         except (pa.ArrowException, OSError, ValueError):  # it is damaged
             batch = None
-        if batch is None:
-            if is_over and (file := _opened(_Groups, self.path)) is not None:
-                file.skip()  # all of it was in the stream
-                self._batches.close()
-                self._batches = file
-            return None
-        arrays = [values_at(batch, places[name]) for name in (_TIME, *columns)]
-        table = np.array([array.to_numpy(zero_copy_only=False) for array in arrays], float)
-        return table[0], table[1:]
+        if batch is not None:
+            times, *values = [array_of(values_at(batch, places[name])) for name in (TIME, *names)]
+            return Columns(times, dict(zip(names, values, strict=True)))
+        if is_over and (file := _opened(_Groups, self.path)) is not None:
+            file.skip()  # all of it was in the stream
+            self._batches.close()
+            self._batches = file
+        return None
 
     def close(self) -> None:
         """Close the file."""
         self._batches.close()
 
 
-class _File:
-    """An open file that may lose its name; `close` closes it.
-
-    Args:
-        path: the file.
-        file: it, open.
-    """
-
-    def __init__(self, path: Path, file: BinaryIO) -> None:
-        self._path = path
-        self._file = file
-
-    @property
-    def is_there(self) -> bool:
-        """Whether the file still has its name."""
-        try:
-            return os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
-        except OSError:
-            return False
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-class _Stream(_File):
+class _Stream(GrowingFile):
     """The batches of a stream that another process writes.
 
     Attributes:
@@ -137,7 +106,7 @@ class _Stream(_File):
     @property
     def is_over(self) -> bool:
         """Whether the run has ended: then the stream is removed."""
-        return not self._path.exists()
+        return not self.path.exists()
 
     @property
     def behind(self) -> int:
@@ -158,10 +127,10 @@ class _Stream(_File):
     def _message(self) -> Any:  # noqa: ANN401  pyarrow has no types
         """The next message in the memory of the file; None if it is not complete."""
         size = os.fstat(self._file.fileno()).st_size
-        if self._at < size and (self._content is None or len(self._content) < size):
-            self._content = pa.py_buffer(mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ))
         if self._at >= size:
             return None
+        if self._content is None or len(self._content) < size:
+            self._content = pa.py_buffer(mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ))
         source = pa.BufferReader(self._content)
         source.seek(self._at)
         try:
@@ -172,7 +141,7 @@ class _Stream(_File):
         return message
 
 
-class _Groups(_File):
+class _Groups(GrowingFile):
     """The rows of a complete Parquet file.
 
     Attributes:

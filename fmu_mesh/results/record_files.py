@@ -1,0 +1,271 @@
+"""The result files of a run: each gets its own columns, at its own points, from the same rows.
+
+Knows neither where the values come from nor any format: `fmu_mesh.results.formats` finds it by the name of the file.
+
+A run in processes keeps a note for each file in its folder: how many rows the operating system has. The launcher reads
+it if the process that writes was killed, to cut the file off after its last whole row. The note is written before the
+first row. So while it is empty, the result file is not that of this run.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from msgspec import to_builtins
+from msgspec.structs import replace
+
+from ..config.loading import LoadedConfig
+from ..errors import ConfigurationError
+from ..files import Kept, open_alone, unwritable
+from ..simtime import TimeGrid
+from ..system.records import IN_MEMORY, RecordPlan, record_paths
+from ..system.run_metadata import metadata_of
+from ..system.system import ResolvedSystem
+from .formats import reading, required_format
+from .growth import GrowthWatch, ReadColumn
+from .recording import Recording, ResultFile
+
+__all__ = ["ReadColumn", "RecordFiles", "open_result", "open_results", "rows_left", "what_is_kept"]
+
+_NOTE = struct.Struct("<qq")
+
+
+def open_results(
+    loaded: LoadedConfig, system: ResolvedSystem, *, digest: str = "", contents: Mapping[str, str] = {}
+) -> list[ResultFile]:
+    """Open the result files of a run, in their order; none if nothing is recorded.
+
+    Their metadata have the digest of the mesh and the SHA-256 of the model of each instance (``contents``). Without a
+    digest they have no metadata, which saves milliseconds.
+
+    Raises:
+        ConfigurationError: a file cannot be written, or another run is writing it. All files are as they were.
+    """
+    descriptions = {name: instance.description for name, instance in system.instances.items()}
+    places = {str(file): place for place, file in record_paths(loaded).items()}
+    files: list[ResultFile] = []
+    try:
+        for record in system.records:
+            place = places.get(record.file, "record")
+            recording = Recording(loaded, descriptions, record.variables, place, record.first, record.every)
+            if digest:
+                metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
+                recording = replace(recording, metadata=to_builtins(metadata))
+            files.append(required_format(record.file).open(Path(record.file), recording))
+    except BaseException:
+        for file in files:
+            with suppress(OSError):
+                file.close()
+        raise
+    return files
+
+
+def open_result(loaded: LoadedConfig, system: ResolvedSystem) -> ResultFile:
+    """Open the first result file of one of many runs, without metadata; the errors are those of `open_results`."""
+    return open_results(loaded, replace(system, records=system.records[:1]))[0]
+
+
+class RecordFiles:
+    """The open result files of a run.
+
+    Call sequence: `begin`, then `write` and `flush` from one thread at a time; at the end, and after any exception,
+    `close`. A file that cannot be written is only closed then; all others get their rows as before.
+
+    Args:
+        files: the files, in the order of their plans.
+        growth: looks at all rows.
+        notes: the folder of the run, if somebody calls `rows_left` when this process was killed.
+    """
+
+    def __init__(
+        self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
+    ) -> None:
+        self._growth = growth
+        self._files = [
+            _RecordFile(file, notes / _note_of(number) if notes is not None else None)
+            for number, file in enumerate(files)
+        ]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the rows so far warn of."""
+        return self._growth.warnings if self._growth is not None else ()
+
+    @property
+    def counted(self) -> tuple[tuple[str, int], ...]:
+        """The path and the number of rows of each file; after `close`, of those in the file."""
+        return tuple((str(own.file.path), own.file.rows) for own in self._files)
+
+    def begin(self, grid: TimeGrid, records: Sequence[RecordPlan], column_of: Callable[[str, str], ReadColumn]) -> None:
+        """Choose what the files get; ``column_of`` says how the values of a variable of an instance are read."""
+        columns: dict[tuple[str, str], ReadColumn] = {}
+        for own, record in zip(self._files, records, strict=True):
+            for key in record.variables:
+                if key not in columns:
+                    columns[key] = column_of(*key)
+            own.begin(grid, record, [columns[key] for key in record.variables])
+        if self._growth is not None:
+            self._growth.begin(columns)
+
+    def write(self, first: int, end: int) -> None:
+        """Write the rows of the points first to end - 1, as far as they are not written yet.
+
+        Raises:
+            ConfigurationError: a file cannot be written; the others have their rows.
+        """
+        if self._growth is not None:
+            self._growth.look(first, end)
+        self._each(lambda own: own.write(first, end))
+
+    def note(self, entry: Mapping[str, Any]) -> None:
+        """Add what happened to the metadata of all files; the errors are those of `write`."""
+        self._each(lambda own: own.file.note(entry))
+
+    def flush(self) -> None:
+        """Give all rows to the operating system; the errors are those of `write`."""
+        self._each(_RecordFile.flush)
+
+    def close(self) -> None:
+        """Close all files. Nothing happens if they are closed. The errors are those of `write`."""
+        self._raise_first([(own, own.close()) for own in self._files])
+
+    def _each(self, call: Callable[[_RecordFile], None]) -> None:
+        """Do something with each file that can be written; then raise the first error."""
+        self._raise_first([(own, own.tried(call)) for own in self._files])
+
+    @staticmethod
+    def _raise_first(done: Sequence[tuple[_RecordFile, OSError | None]]) -> None:
+        for own, error in done:
+            if error is not None:
+                raise unwritable(own.file.path, error) from error
+
+
+class _RecordFile:
+    """One of the files. After its first error nothing more is written, and no other error is returned."""
+
+    def __init__(self, file: ResultFile, note: Path | None) -> None:
+        self.file = file
+        self._failed = False
+        self._is_open = True
+        self._next = 0
+        self._columns: Sequence[ReadColumn] = ()
+        # Opening is slow, so not with the first row.
+        self._note = os.open(note, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600) if note is not None else None
+        self._noted: Kept | None = None
+
+    def begin(self, grid: TimeGrid, record: RecordPlan, columns: Sequence[ReadColumn]) -> None:
+        """See `RecordFiles.begin`."""
+        self._grid, self._record, self._columns = grid, record, columns
+        self._has_all_points = (record.first, record.every) == (0, 1)
+
+    def tried(self, call: Callable[[_RecordFile], None]) -> OSError | None:
+        """The error of a call that writes; nothing is called after the first error, or after the end."""
+        if self._failed or not self._is_open:
+            return None
+        try:
+            call(self)
+        except OSError as error:
+            self._failed = True
+            return error
+        return None
+
+    def write(self, first: int, end: int) -> None:
+        """See `RecordFiles.write`."""
+        first = max(first, self._next)
+        if first >= end or not self._columns:
+            return
+        rows = self._record.rows_within(first, end)
+        times = self._grid.times(first, end)[rows]
+        if len(times):
+            if self._noted is None:
+                self._note_kept(Kept())
+            columns = [column(first, end) for column in self._columns]
+            if not self._has_all_points:  # a slice of each of thousands takes its time
+                columns = [column[rows] for column in columns]
+            self.file.write(times, columns)
+            self._note_kept(self.file.kept)
+        self._next = end
+
+    def flush(self) -> None:
+        """See `RecordFiles.flush`."""
+        self.file.flush()
+        if self._noted is not None:
+            self._note_kept(self.file.kept)
+
+    def close(self) -> OSError | None:
+        """See `RecordFiles.close`."""
+        if not self._is_open:
+            return None
+        self._is_open = False
+        try:
+            try:
+                self.file.close()
+            finally:
+                if self._noted is not None:
+                    self._note_kept(self.file.kept)
+                if self._note is not None:
+                    os.close(self._note)
+        except OSError as error:
+            return error if not self._failed else None
+        return None
+
+    def _note_kept(self, kept: Kept) -> None:
+        if self._note is not None and kept != self._noted:
+            os.pwrite(self._note, _NOTE.pack(*kept), 0)
+        self._noted = kept
+
+
+def rows_left(result_files: Sequence[str], folder: Path) -> tuple[tuple[str, int], ...]:
+    """Each result file of a killed process, and the number of rows in it. What follows the last row is cut off.
+
+    ``folder`` is that of the run, with the notes.
+    """
+    return tuple((file, _rows_left(Path(file), folder / _note_of(number))) for number, file in enumerate(result_files))
+
+
+def what_is_kept(files: Sequence[tuple[str, int]]) -> str | None:
+    """The sentence for a run that ended early, and left these numbers of rows; None if there are none."""
+    kept = [(where, rows) for file, rows in files if rows and (where := _where(file)) is not None]
+    if not kept:
+        return None
+    if kept[0][0].endswith(f"{IN_MEMORY}'"):
+        return f"What was recorded up to then ({kept[0][1]} rows) is in the `result` of this error."
+    if len(kept) == 1:
+        return f"What was recorded up to then ({kept[0][1]} rows) is in {kept[0][0]}."
+    *others, last = [f"{where} ({rows} rows)" for where, rows in kept]
+    return f"What was recorded up to then is in {', '.join(others)} and {last}."
+
+
+def _where(file: str) -> str | None:
+    """Where the rows of a result file are, in words; None if there is no such file."""
+    path = Path(file)
+    growing = required_format(path).growing_file(path)
+    if growing != path and growing.is_file():
+        return f"'{growing}', from which `fmu-mesh recover {path}` makes the result"
+    return f"'{file}'" if path.is_file() else None
+
+
+def _note_of(number: int) -> str:
+    """The name of the note about a result file."""
+    return f"recorded.{number}" if number else "recorded"
+
+
+def _rows_left(path: Path, note: Path) -> int:
+    if path.exists() and not path.is_file():
+        return 0  # a device keeps nothing
+    try:
+        kept = Kept(*_NOTE.unpack(note.read_bytes()))
+    except (FileNotFoundError, struct.error):
+        kept = None
+    format_ = required_format(path)
+    growing = format_.growing_file(path)
+    # Opening the file makes sure that no other run is writing it, and removes a draft that the process has left.
+    with suppress(ConfigurationError), reading(path), open_alone(growing):
+        if kept is not None and growing.is_file() and growing.stat().st_size >= kept.size:  # or it is another file
+            return format_.keep_whole_rows(path, kept)
+    return 0
