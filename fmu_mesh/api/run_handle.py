@@ -23,6 +23,7 @@ from ..ros.bags.play_options import PlayOptions
 from ..run.options import StartOptions
 from ..text import shown
 from ..wire.client.mesh_client import MeshClient
+from ..wire.client.pausing import replay
 from ..wire.client.readings import Target
 from ..wire.client.waiting import rest, wait_for, wait_for_start
 from ..wire.views import (
@@ -350,8 +351,6 @@ class Run:
             CallRefused: a variable cannot be set, or takes no such value.
             MeshLost: the mesh has ended, or another program controls it too.
         """
-        from .rerunning import replay  # noqa: PLC0415  not for those who only look
-
         replay(self._running(), values, last_point)
         if last_point is not None:
             self.stop()

@@ -1,18 +1,25 @@
-"""Brings a mesh to a point and pauses it there, for those who set values at exact points."""
+"""Brings a mesh to a point and pauses it there, for those who set values at exact points; sets those of a first run."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
+from itertools import groupby
 
-from ...errors import ConfigurationError, DeadlineExceeded, MeshLost
+from ...errors import CallRefused, ConfigurationError, DeadlineExceeded, MeshLost
+from ..messages import SetValue
 from ..views import Command
 from .mesh_client import MeshClient
+from .readings import Target
+from .waiting import rest
 
-__all__ = ["go_on", "paused_at", "wait_until_at"]
+__all__ = ["go_on", "paused_at", "replay", "wait_until_at"]
 
 _LOOK_S = 0.001
 _LONGEST_LOOK_S = 0.05
+_STEP_S = 60.0
+"""How long in s an instance may stay at one point before it has come to the next value of a replay."""
 
 
 def paused_at(client: MeshClient, command: Command) -> int:
@@ -57,3 +64,34 @@ def wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: floa
             )
         never.wait(look)
         look = min(2 * look, _LONGEST_LOOK_S)
+
+
+def replay(client: MeshClient, values: Sequence[SetValue], last_point: int | None) -> None:
+    """Set all values, and let the mesh run on, or to ``last_point``, where it pauses.
+
+    Raises:
+        CallRefused: a value was refused.
+        MeshLost: the mesh has ended, or another program controls it too.
+        DeadlineExceeded: an instance does not come to the point of a value.
+    """
+    hold = paused_at(client, Command("pause"))
+    targets: dict[str, Target] = {}
+    for point, together in groupby(sorted(values, key=lambda value: value.point), key=lambda value: value.point):
+        hold = go_on(client, hold, point)
+        for value in together:
+            name = f"{value.instance}.{value.variable}"
+            if hold != point:
+                raise MeshLost(f"the mesh is at point {hold}, and '{name}' was set at point {point}.")
+            if name not in targets:
+                targets[name] = client.target(name)
+            wait_until_at(client, value.instance, point, _STEP_S)
+            try:
+                client.set(targets[name], value.value, value.time)
+            except ConfigurationError as error:
+                raise CallRefused(
+                    error.message, instance=value.instance, variable=value.variable, hint=error.hint
+                ) from error
+    if last_point is None:
+        client.command(Command("resume"))
+        return
+    rest(client, Command("step", last_point - hold) if last_point > hold else Command("pause"))
