@@ -23,6 +23,7 @@ from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
+from ..run.overriding import memory_file, memory_of
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
@@ -33,14 +34,14 @@ from .mesh_editing import (
     check_part,
     connections_of,
     ends_of,
+    rebased,
     said_by,
     sections_of,
     unknown,
     with_connections,
+    with_record,
     without_instance,
 )
-from .plan_options import memory_file, memory_of, with_record
-from .rebasing import rebased
 
 if TYPE_CHECKING:
     from ..errors import Finding

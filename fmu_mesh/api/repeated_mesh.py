@@ -20,12 +20,12 @@ from ..errors import CallRefused, FmuError, FmuMeshError
 from ..files import Kept, remove_tree
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
+from ..run.overriding import memory_of
 from ..run.repeated import RepeatedRuns
 from ..run.results import open_result
 from ..run.run_plan import RunPlan
 from ..variables.value_types import DTYPES
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
-from .plan_options import memory_of
 from .result import Result, types_of
 from .result_reading import Columns
 from .run_thread import check_memory

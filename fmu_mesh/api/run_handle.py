@@ -11,12 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from ..config.call_options import checked, takes
-from ..errors import (
-    CallRefused,
-    ConfigurationError,
-    FmuMeshError,
-    MeshLost,
-)
+from ..errors import CallRefused, ConfigurationError, FmuMeshError, MeshLost, from_report
 from ..installing import importing
 from ..pictures.notebook_progress import ShownProgress, awaited, progress_of
 from ..ros.bags.play_options import PlayOptions
@@ -38,7 +33,6 @@ from ..wire.views import (
     SetAnswer,
     VariableView,
 )
-from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, target_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
@@ -53,7 +47,11 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
 
 __all__ = ["TIMEOUT_S", "Run"]
 
+TIMEOUT_S = 5.0
+"""Default deadline of a question in s."""
+
 _WAIT_S = 60.0
+_FOREVER_S = 1e9
 
 
 class Run:
@@ -459,7 +457,7 @@ class Run:
         except KeyboardInterrupt:
             if self._own is None:
                 raise
-            raise ended_by_keyboard(self._own) from None
+            raise self._own.end_by_keyboard() from None
 
     async def wait_async(self) -> Result:
         """As `wait`, without blocking the event loop of asyncio; a cancelled wait leaves the run as it is.
@@ -494,7 +492,7 @@ class Run:
             if self._ended is None:
                 future: Future[Result] = Future()
                 self._ended, client = future, self._client()
-                threading.Thread(target=follow, args=(client, future), name="end", daemon=True).start()
+                threading.Thread(target=_follow, args=(client, future), name="end", daemon=True).start()
             return self._ended
 
     def _client(self) -> MeshClient:
@@ -512,7 +510,7 @@ class Run:
                 self._own.over()
             if self._found is None:
                 assert self._own is not None  # otherwise it was found by whoever made this
-                self._found = reach(self._own, self.name, self._way)
+                self._found = self._own.reach(self._way, TIMEOUT_S)
             return self._found
 
     def _running(self) -> MeshClient:
@@ -531,3 +529,20 @@ class Run:
     def _steered(self) -> MeshClient:
         """As `_running` for a run that was started here; a mesh that was found takes commands when it takes them."""
         return self._client() if self._own is None else self._running()
+
+
+def _follow(client: MeshClient, future: Future[Result]) -> None:
+    """Follow a mesh that somebody else has started to its end."""
+    from .result import Result  # noqa: PLC0415  not for those who only look
+
+    try:
+        file, last = client.info().result_file, None
+        with client.statuses(_FOREVER_S) as statuses:
+            for status in statuses:
+                last = status
+        if last is not None and last.error is not None:
+            future.set_exception(from_report(last.error))
+        else:
+            future.set_result(Result(client.keys.mesh, file=Path(file) if file is not None else None))
+    except BaseException as error:  # noqa: BLE001 whoever waits gets it
+        future.set_exception(error)

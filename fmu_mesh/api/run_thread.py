@@ -10,23 +10,35 @@ import logging
 import sys
 import threading
 from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
+from ..errors import (
+    CallRefused,
+    ConfigurationError,
+    DeadlineExceeded,
+    FmuMeshError,
+    Interrupted,
+    KeyboardInterrupted,
+    MeshLost,
+)
 from ..printing import paragraph
 from ..recorder.arrays_file import bytes_of_a_row, read_arrays
 from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.launcher import Launcher
 from ..run.options import StartOptions
 from ..run.outcome import Outcome
+from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
+from ..wire.client.mesh_client import MeshClient
+from ..wire.keys import Keys
+from ..wire.session import Wiring, close_session, open_session
 from ..wire.views import MeshStatus
-from .plan_options import memory_of
 from .result import Result, result_of, types_of
 from .result_reading import Columns
 
@@ -39,6 +51,7 @@ log = logging.getLogger("fmu_mesh.run")
 
 _WARNED_AT = 0.8
 _JOIN_S = 10.0
+_TRY_S = 0.25
 _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.WARNING}
 
 
@@ -111,6 +124,56 @@ class RunThread:
         hint = "Its values are in `run.wait()`." if self.future.exception() is None else "`run.wait()` raises why."
         raise MeshLost(f"the run of mesh '{self.plan.mesh}' has ended", hint=hint)
 
+    def reach(self, way: ExitStack, timeout_s: float) -> MeshClient:
+        """The mesh of this run, once it can be reached.
+
+        Args:
+            way: closes what this opens.
+            timeout_s: deadline of every question of the client.
+
+        Raises:
+            CallRefused: the run is in this process.
+            DeadlineExceeded: it has not started in time.
+            MeshLost: it has ended.
+        """
+        self.over()
+        name, config = self.plan.mesh, self.plan.loaded.config
+        if self.in_process:
+            hint = "Start it with processes=True, or step it by hand with `Mesh.open`."
+            raise CallRefused(f"the run of mesh '{name}' is in this process, where nobody can reach it", hint=hint)
+        if not self.reached.wait(config.timeouts.start):
+            raise DeadlineExceeded(f"mesh '{name}' cannot be reached within {config.timeouts.start:g} s")
+        patience_s = _TRY_S  # Zenoh tries for all of it, also if the mesh ends meanwhile
+        while True:
+            self.over()
+            try:
+                session = open_session(Wiring(mode="client", connect=self.endpoints[:1], patience_s=patience_s))
+            except ConfigurationError as error:
+                patience_s *= 2
+                if patience_s > timeout_s:
+                    raise DeadlineExceeded(f"mesh '{name}' does not answer at {self.endpoints[0]}") from error
+            else:
+                way.callback(close_session, session)
+                keys = Keys(config.zenoh.key_prefix, name)
+                return MeshClient(session, keys, self.endpoints[:1], timeout_s, self.over)
+
+    def end_by_keyboard(self) -> FmuMeshError:
+        """End the run on Ctrl-C, and return its error; a second Ctrl-C does not wait for its processes."""
+        while True:
+            self.interrupt()
+            try:
+                result = self.future.result()
+            except KeyboardInterrupt as error:
+                if self.future.done() and self.future.exception() is error:
+                    return error if isinstance(error, FmuMeshError) else Interrupted("interrupted")
+            except Interrupted as error:
+                named = KeyboardInterrupted(error.message, point=error.point, time=error.time, hint=error.hint)
+                return named.with_result(error.result)
+            except FmuMeshError as error:
+                return error
+            else:
+                return KeyboardInterrupted("interrupted").with_result(result)
+
     def join(self) -> None:
         """Wait until the thread has ended, for some seconds at most."""
         self._thread.join(_JOIN_S)
@@ -165,14 +228,11 @@ class RunThread:
         Raises:
             BaseException: why the run has ended otherwise; one of ours has the result.
         """
-        result = self._result(self._last_outcome())
+        result = self._result(self._runner.outcome if self._runner is not None else None)
         cause = error if self._failure is None or isinstance(self._failure, Interrupted) else self._failure
         if self._stopped and isinstance(cause, Interrupted):
             return result
         raise cause.with_result(result) if isinstance(cause, FmuMeshError) else cause
-
-    def _last_outcome(self) -> Outcome | None:
-        return self._runner.outcome if self._runner is not None else None
 
     def _take(self, event: Event) -> None:
         match event:

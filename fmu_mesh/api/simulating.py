@@ -18,13 +18,13 @@ from msgspec.structs import replace
 from ..config.call_options import takes
 from ..config.plain_values import plain
 from ..errors import CallRefused, ConfigurationError
+from ..run.options import SimulateOptions
 from ..simtime import steps_between
 from ..system.series_files import SeriesRefused, columns_of
 from ..text import shown
 from ..variables.model_description import ModelDescription
 from .mesh_builder import Mesh
 from .result import Result
-from .simulate_options import SimulateOptions
 
 __all__ = ["as_given", "experiment_of", "simulate"]
 

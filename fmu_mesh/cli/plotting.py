@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..api.plan_options import memory_of
 from ..api.result import Result
 from ..api.result_reading import require_readable
 from ..errors import ConfigurationError, FmuMeshError
 from ..installing import require
 from ..pictures.drawing import draw
+from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..text import listed

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..api.simulate_options import SimulateOptions
 from ..config.call_options import option_fields
+from ..run.options import SimulateOptions
 from ..sweeps.sweep_options import SweepOptions
 from .arguments import CommandParser, Parsers, add_json, add_package, add_quiet, count, endpoint, whole
 from .run_options import add_configuration, add_options

@@ -254,7 +254,6 @@ def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
 
 
 SPELLS_FLAGS = {
-    "api/simulate_options.py": "as run/options.py, for `simulate`",
     "run/options.py": "it says how the command line spells them",
     "sweeps/slurm.py": "options of sbatch",
     "sweeps/slurm_sweep.py": "a command that the tasks of a job run",

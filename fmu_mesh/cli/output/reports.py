@@ -13,10 +13,10 @@ from typing import Literal, Self
 import msgspec
 from msgspec.structs import replace
 
-from ...api.plan_options import memory_of
 from ...errors import ErrorReport, FmuMeshError
 from ...run.events import Event, Restarted
 from ...run.outcome import Outcome
+from ...run.overriding import memory_of
 from ...run.run_plan import RunPlan
 from .json_output import Failure, failure_of, print_json
 from .terminal import stdout_as_stderr
