@@ -622,7 +622,8 @@ class Mesh:
         """
         from .repeated_mesh import RepeatedMesh  # noqa: PLC0415  only this needs it
 
-        return RepeatedMesh(self, reset=reset, on_hang=on_hang)
+        mesh = self.from_configuration(self._plain, keeps_code=True)
+        return RepeatedMesh(repr(self), mesh.plan, reset=reset, on_hang=on_hang)
 
     @property
     def _shown_file(self) -> Path:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from msgspec.structs import replace
@@ -29,9 +29,6 @@ from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_nam
 from .result import Result, types_of
 from .result_reading import Columns
 from .run_thread import check_memory
-
-if TYPE_CHECKING:
-    from .mesh_builder import Mesh
 
 __all__ = ["RepeatedMesh"]
 
@@ -55,7 +52,8 @@ class RepeatedMesh:
         True
 
     Args:
-        mesh: the mesh.
+        mesh: the mesh in words.
+        plan: plans a run of it, as `Mesh.plan`.
         reset: reset the instances of FMUs between two runs, and do not make new ones.
         on_hang: called on another thread if an FMU does not return in time.
         before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
@@ -64,13 +62,14 @@ class RepeatedMesh:
 
     def __init__(
         self,
-        mesh: Mesh,
+        mesh: str,
+        plan: Callable[..., RunPlan],
         *,
         reset: bool,
         on_hang: Callable[[FmuError], None],
         before_close: Callable[[Result | BaseException], None] | None = None,
     ) -> None:
-        self._mesh = mesh.from_configuration(mesh.configuration, keeps_code=True)
+        self._mesh, self._plan = mesh, plan
         self._thread = threading.get_ident()
         self._before_close = before_close
         self._rows: _CollectedRows | None = None
@@ -88,7 +87,7 @@ class RepeatedMesh:
         self.close()
 
     def __repr__(self) -> str:
-        return f"<RepeatedMesh of {self._mesh!r}>"
+        return f"<RepeatedMesh of {self._mesh}>"
 
     @takes(PlanOptions)
     def run(self, options: PlanOptions) -> Result:
@@ -109,7 +108,7 @@ class RepeatedMesh:
             raise CallRefused(f"run is not possible, because {why}.")
         if options.output is None and options.record is None:
             options = replace(options, record="memory")
-        plan = self._mesh.plan(**options.given())
+        plan = self._plan(**options.given())
         check_memory(plan, sys.maxsize, to_its_end=True)
         self._rows = rows = _CollectedRows(plan)
         runs = self._runs(plan.mesh)

@@ -273,7 +273,8 @@ class _Hung:
 
 def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
-    with RepeatedMesh(mesh, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
+    own = mesh.from_configuration(mesh.configuration, keeps_code=True)
+    with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
             hung.begin(job.ended)
             try:
