@@ -19,14 +19,13 @@ import msgspec
 import yaml
 from msgspec import NODEFAULT, inspect
 
-from fmu_mesh.api.simulate_options import SimulateOptions
 from fmu_mesh.cli.main import COMMANDS, command_parser
 from fmu_mesh.config.call_options import CallOptions, Option, option_fields
 from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import config_type
 from fmu_mesh.config.structure import describe
 from fmu_mesh.instances.registry import KINDS
-from fmu_mesh.run.options import RunOptions
+from fmu_mesh.run.options import RunOptions, SimulateOptions
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 __all__ = [

@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self
 
 from ..errors import FmuError
@@ -33,7 +32,7 @@ from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
 from .argument_checks import Arguments
-from .times import CallerClock, Instant, RosTime, SecondsClock, Time, clock_from
+from .times import CallerClock, Instant, Nanoseconds, NanosecondsClock, RosTime, SecondsClock, Time
 
 __all__ = ["FMIAdapter"]
 
@@ -118,9 +117,7 @@ class FMIAdapter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -234,7 +231,8 @@ class FMIAdapter:
             InitializationFailed: the FMU refuses a start value, or does not start.
         """
         self._demand("initialization", "exit_initialization_mode")
-        self._clock = clock_from(self._arguments.time(time))
+        start = self._arguments.time(time)
+        self._clock = NanosecondsClock(start.nanoseconds) if isinstance(start, Nanoseconds) else SecondsClock(start)
         early = {name: {self._on_fmu_clock(t): v for t, v in own.items()} for name, own in self._early_inputs.items()}
         self._enter()
         with self._fmu_called():
@@ -270,7 +268,7 @@ class FMIAdapter:
             3.0 20.0
         """
         self._demand(None, "set_input_value")
-        converted = self._arguments.value(self._arguments.input(name), value)
+        converted = self._arguments.value(self._arguments.find(name, self._arguments.inputs, "an input"), value)
         instant = self._arguments.time(time)
         if self._mode == "initialization":
             self._early_inputs.setdefault(name, {})[instant] = converted
@@ -345,7 +343,7 @@ class FMIAdapter:
             CallRefused: the adapter is closed, or there is no such output.
             FmuError: the FMU refuses it; only `close` is allowed now.
         """
-        self._arguments.output(name)
+        self._arguments.find(name, self._arguments.outputs, "an output")
         return self.get_value(name)
 
     def get_value(self, name: str) -> Any:  # noqa: ANN401 what type it is, the FMU says
@@ -356,7 +354,7 @@ class FMIAdapter:
             FmuError: the FMU refuses it; only `close` is allowed now.
         """
         self._demand(None, "get_value")
-        self._arguments.any(name)
+        self._arguments.find(name, self._arguments.all, "a variable")
         self._enter()
         with self._fmu_called():
             return self._instance.get_values([name])[0]

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import CallRefused
-from ..text import listed, nearest
+from ..text import did_you_mean, listed
 from ..variables.model_description import Causality, ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
 from .times import Instant, RosStamp, RosTime, Time, instant_of
@@ -23,12 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class Arguments:
-    """The variables of one FMU by their use; a wrong argument raises `CallRefused`.
-
-    Args:
-        instance: instance name, for messages.
-        description: the model description.
-    """
+    """The variables of one FMU by their use; a wrong argument raises `CallRefused`."""
 
     def __init__(self, instance: str, description: ModelDescription) -> None:
         self.instance = instance
@@ -40,28 +35,16 @@ class Arguments:
         self._tunable = {v.name: v for v in self.parameters.values() if v.variability == "tunable"}
         self._settable = {v.name: v for v in description.variables if v.settable_before_start}
 
-    def any(self, name: str) -> Variable:
-        """The variable called ``name``."""
-        return self._find(name, self.all, "a variable")
-
-    def input(self, name: str) -> Variable:
-        """The input called ``name``."""
-        return self._find(name, self.inputs, "an input")
-
-    def output(self, name: str) -> Variable:
-        """The output called ``name``."""
-        return self._find(name, self.outputs, "an output")
-
     def tunable(self, name: str) -> Variable:
         """The tunable parameter called ``name``."""
-        return self._find(name, self._tunable, "a tunable parameter")
+        return self.find(name, self._tunable, "a tunable parameter")
 
     def settable(self, name: str) -> Variable:
         """The variable called ``name``, which can be set before the start."""
         known = self.all.get(name)
         if known is not None and known.may_take_start_value:
             return known  # FMI forbids some of these, but some FMUs accept them
-        return self._find(name, self._settable, "settable before the start")
+        return self.find(name, self._settable, "settable before the start")
 
     def value(self, variable: Variable, value: Value) -> Value:
         """``value`` as a value of the variable's type and within its range."""
@@ -121,7 +104,8 @@ class Arguments:
     def _having(self, causality: Causality) -> dict[str, Variable]:
         return {variable.name: variable for variable in self._description.with_causality(causality)}
 
-    def _find(self, name: str, allowed: Mapping[str, Variable], role: str) -> Variable:
+    def find(self, name: str, allowed: Mapping[str, Variable], role: str) -> Variable:
+        """The variable called ``name`` among those of a role, which an error names."""
         if name in allowed:
             return allowed[name]
         expected = f"Possible here: {listed(tuple(allowed))}."
@@ -129,10 +113,9 @@ class Arguments:
         if known is not None:
             kind = f"{known.variability} {known.causality}"
             raise self.refusal(f"this {kind} is not {role}.", expected, name)
-        near = nearest(str(name), allowed)
         if (clock := self._description.clock(str(name))) is not None:
             raise self.refusal(f"{clock}.")
-        raise self.refusal(f"there is no variable '{name}'.", f"Did you mean '{near}'?" if near else expected)
+        raise self.refusal(f"there is no variable '{name}'.", did_you_mean(str(name), allowed, expected))
 
 
 def _plain(value: object) -> object:

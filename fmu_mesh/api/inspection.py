@@ -21,7 +21,7 @@ from ..instances.registry import KINDS, describe
 from ..pictures.tables import html_table, pairs
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package
-from ..text import counted, listed, matching, nearest, nearest_file, short_number, shown
+from ..text import counted, did_you_mean, listed, matching, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 
 __all__ = ["SHOWN_VARIABLES", "Inspection", "inspect", "with_way_out"]
@@ -79,13 +79,10 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
     description: ModelDescription
 
     def page(self, width: int = _WIDTH, variables: Sequence[str] = (), *, everything: bool = False) -> str:
-        """The page in lines of at most ``width`` columns, unless a name is longer.
+        """The page in lines of at most ``width`` columns, unless a name is longer; ``everything``: of all variables.
 
-        Args:
-            width: in columns.
-            variables: names, or patterns of names (`*`: any characters; `?`: one; `re:...`: a regular expression); if
-                given, only these variables are shown.
-            everything: whether all variables are listed.
+        ``variables`` are names, or patterns (`*`: any characters; `?`: one; `re:...`: a regular expression): only these
+        are shown.
 
         Raises:
             UnknownName: there is no such variable; suggests the nearest one.
@@ -95,9 +92,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
             if (clock := self.description.clock(pattern)) is not None:
                 raise UnknownName(f"{clock}.", hint="The page without `--variables` lists the clocks.")
             if not matching(pattern, names):
-                near = nearest(pattern, names)
-                hint = f"Did you mean '{near}'?" if near else None
-                raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=hint)
+                raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=did_you_mean(pattern, names))
         return page(_page(self, width, variables, everything=everything))
 
     def __str__(self) -> str:
@@ -216,18 +211,11 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         for causality, title in _CAUSALITIES
         if (count := len(description.with_causality(causality)))
     ]
-    times = [
-        f"{what} {short_number(value)} s"
-        for what, value in (
-            ("start", experiment.start_time),
-            ("stop", experiment.stop_time),
-            ("step", experiment.step_size),
-        )
-        if value is not None
-    ]
+    of_time = ("start", experiment.start_time), ("stop", experiment.stop_time), ("step", experiment.step_size)
+    times = [f"{what} {short_number(value)} s" for what, value in of_time if value is not None]
     states = [f"{description.continuous_states} continuous"] if description.continuous_states else []
     if indicators := description.event_indicators:
-        states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
+        states.append(counted(indicators, "event indicator"))
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
     platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"

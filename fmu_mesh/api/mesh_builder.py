@@ -19,10 +19,12 @@ from ..config.mesh import LimitsConfig
 from ..config.plain_values import plain
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
+from ..files import write_whole
 from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
+from ..run.overriding import memory_file, memory_of
 from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
@@ -33,14 +35,14 @@ from .mesh_editing import (
     check_part,
     connections_of,
     ends_of,
+    rebased,
     said_by,
     sections_of,
     unknown,
     with_connections,
+    with_record,
     without_instance,
 )
-from .plan_options import memory_file, memory_of, with_record
-from .rebasing import rebased
 
 if TYPE_CHECKING:
     from ..errors import Finding
@@ -327,10 +329,8 @@ class Mesh:
         )
         there = connections_of(self._plain)
         if source is target is None or len(connections_of(left)) == len(there):
-            wanted, names = (
-                f"{source or '*'} -> {target or '*'}",
-                [" -> ".join(map(str, ends_of(one))) for one in there],
-            )
+            wanted = f"{source or '*'} -> {target or '*'}"
+            names = [" -> ".join(map(str, ends_of(one))) for one in there]
             raise unknown(f"mesh '{self.name}' has no connection '{wanted}'", wanted, names)
         self._plain = left
 
@@ -432,10 +432,7 @@ class Mesh:
             ConfigurationError: the file cannot be written, or too much of the configuration is wrong to know its paths.
         """
         path = Path(path)
-        try:
-            path.write_text(self.to_yaml(path.parent), encoding="utf-8")
-        except OSError as error:
-            raise ConfigurationError(f"'{path}' cannot be written: {error.strerror}") from error
+        write_whole(path, self.to_yaml(path.parent))
 
     @checked
     def to_ssp(self, path: str | Path, *, version: Literal["1.0", "2.0"] | None = None) -> tuple[Finding, ...]:
@@ -621,7 +618,8 @@ class Mesh:
         """
         from .repeated_mesh import RepeatedMesh  # noqa: PLC0415  only this needs it
 
-        return RepeatedMesh(self, reset=reset, on_hang=on_hang)
+        mesh = self.from_configuration(self._plain, keeps_code=True)
+        return RepeatedMesh(repr(self), mesh.plan, reset=reset, on_hang=on_hang)
 
     @property
     def _shown_file(self) -> Path:

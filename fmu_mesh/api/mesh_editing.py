@@ -1,4 +1,4 @@
-"""Changes of a configuration by the calls of a program: what is wrong is refused, and findings name the call.
+"""Changes of a configuration: by the calls of a program, which findings name, and for a file in another folder.
 
 Owns no values: a `Mesh` asks these functions before and after it changes its own. What needs the models, such as
 whether a variable exists, is checked by `Mesh.check`.
@@ -6,27 +6,32 @@ whether a variable exists, is checked by `Mesh.check`.
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeGuard, TypeVar
 
 from msgspec.structs import replace
 
 from ..config.findings import ValueOrigin
+from ..config.instance_sections import InstanceSection, key_of, keys_of
 from ..config.loading import PlainConfig
+from ..config.plain_values import plain as plain_value
 from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..instances.configuration import examine_data
-from ..text import listed, nearest, shown
+from ..text import did_you_mean, listed, shown
 
 __all__ = [
     "check_part",
     "connections_of",
     "ends_of",
+    "rebased",
     "said_by",
     "sections_of",
     "unknown",
     "with_connections",
+    "with_record",
     "without_instance",
 ]
 
@@ -44,11 +49,8 @@ _REST: Final[dict[str, Any]] = {
 def check_part(call: str, part: Mapping[str, Any], paths: Sequence[str], inside: str = "") -> None:
     """Check the structure of a part of a configuration, before it becomes one.
 
-    Args:
-        call: the call that gives it.
-        part: sections by name.
-        paths: what the call gives; findings about anything else in these sections are not its own.
-        inside: the start of these paths, which the call says already.
+    ``paths`` are what the call gives: findings about anything else in these sections are not its own. ``inside`` is the
+    start of these paths, which the call says already.
 
     Raises:
         CallRefused: there is a finding.
@@ -102,6 +104,23 @@ def without_instance(plain: PlainConfig, name: str) -> PlainConfig:
     return _without_places(plain, gone)._replace(data=data)
 
 
+def with_record(section: Any, variables: Sequence[str], keys: Mapping[str, Any], *, also: bool) -> Any:  # noqa: ANN401  as a file has it
+    """The section `record`, a mapping or a list of mappings, with another first file; or with one more (``also``).
+
+    Without ``variables``, the file gets all outputs. A key that is None leaves what the section says.
+    """
+    given = {"from" if key == "start" else key: plain_value(value) for key, value in keys.items() if value is not None}
+    given["variables"] = list(variables) or None
+    sections = section if isinstance(section, list) else [section]
+    if also:  # a file that is there already gets another section
+        return [
+            *(one for one in sections if not (isinstance(one, dict) and one.get("file") == given.get("file"))),
+            given,
+        ]
+    changed = {**(sections[0] if sections and isinstance(sections[0], dict) else {}), **given}
+    return [changed, *sections[1:]] if isinstance(section, list) else changed
+
+
 def _without_places(plain: PlainConfig, paths: Sequence[str]) -> PlainConfig:
     lines, origins = plain.lines, plain.origins
     for path in paths:
@@ -126,22 +145,14 @@ def _is_of(variable: object, name: str) -> bool:
 
 
 def sections_of(plain: PlainConfig) -> dict[str, Any]:
-    """The sections of a configuration.
-
-    Raises:
-        ConfigurationError: it has none.
-    """
+    """The sections of a configuration, which is an error without any."""
     if not isinstance(plain.data, dict):
         raise ConfigurationError(f"'{plain.file}' has {shown(plain.data)} where a configuration should be")
     return plain.data
 
 
 def connections_of(plain: PlainConfig) -> list[Any]:
-    """The connections of a configuration.
-
-    Raises:
-        ConfigurationError: the section is no list.
-    """
+    """The connections of a configuration; anything but a list is an error."""
     own = sections_of(plain).get("connections") or []
     if not isinstance(own, list):
         raise ConfigurationError(f"'connections' of '{plain.file}' is {shown(own)}, where a list should be")
@@ -158,9 +169,74 @@ def ends_of(connection: Any) -> tuple[Any, Any]:  # noqa: ANN401  as a file has 
 
 def unknown(what: str, name: str, there: Sequence[str]) -> UnknownName:
     """The error for a name that is not there; suggests the nearest one."""
-    near = nearest(name, there)
-    return UnknownName(what, hint=f"Did you mean '{near}'?" if near else f"There are: {listed(there)}.")
+    return UnknownName(what, hint=did_you_mean(name, there, f"There are: {listed(there)}."))
 
 
 def _is_inside(path: str, outer: str) -> bool:
     return path.startswith(outer) and path[len(outer) : len(outer) + 1] in ("", ".", "[")
+
+
+# --- for a file in another folder
+
+
+def rebased(configuration: PlainConfig, folder: Path) -> dict[str, Any]:
+    """The values of a configuration as a file in ``folder`` has them.
+
+    Example:
+        >>> from fmu_mesh.config.loading import read_file
+        >>> rebased(read_file(Path("configs/pendulum_delay.yaml")), Path())["instances"]["pendulum"]["fmu"]
+        'fmus/DampedPendulum.fmu'
+    """
+    data: dict[str, Any] = plain_value(configuration.data)
+    old, new = (os.path.realpath(path) for path in (configuration.file.absolute().parent, folder))
+    if old == new:
+        return data
+
+    def moved(path: str) -> str:
+        # The last part is not resolved: a link says which file is meant.
+        parent, name = os.path.split(path)
+        return Path(os.path.relpath(os.path.realpath(os.path.join(old, parent)), new), name).as_posix()  # noqa: PTH118 text
+
+    for name, section in examine_data(configuration)[0].config.instances.items():
+        _move_files(data["instances"][name], section, moved, Path(old))
+    for mapping, key in _places(data):
+        if _is_relative(mapping.get(key)):
+            mapping[key] = moved(mapping[key])
+    return data
+
+
+def _move_files(written: dict[str, Any], section: InstanceSection, moved: Callable[[str], str], folder: Path) -> None:
+    """Move the paths of one instance: its model, and the other files that its section names."""
+    key, path = key_of(section), section.path
+    if _is_relative(path) and str(written.get(key, "")).startswith(path):  # behind it may be the name of a class
+        written[key] = moved(path) + str(written[key])[len(path) :]
+    located = section.located(folder)
+    for other in keys_of(type(section)):
+        value = written.get(other)
+        if getattr(located, other) != getattr(section, other) and _is_relative(value) and "/" in value:
+            written[other] = moved(value)
+
+
+def _places(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
+    """Where other sections may have paths: a mapping, and the key in it whose value is a path."""
+    records = data.get("record", {})
+    for record in records if isinstance(records, list) else [records]:
+        yield from _in(record, "file")
+    yield data, "scenario"
+    scenario = data.get("scenario")
+    for values in (scenario.get("values") or {}).values() if isinstance(scenario, dict) else ():
+        yield from _in(values, "file")
+    yield from _in(data.get("zenoh"), "config")
+    ros = data.get("ros")
+    messages = ros.get("messages") if isinstance(ros, dict) else None
+    if isinstance(messages, dict):
+        yield from ((messages, name) for name in messages)
+
+
+def _in(section: object, key: str) -> Iterator[tuple[dict[str, Any], str]]:
+    if isinstance(section, dict):
+        yield section, key
+
+
+def _is_relative(path: object) -> TypeGuard[str]:
+    return isinstance(path, str) and path != "" and not path.startswith("~") and not Path(path).is_absolute()

@@ -16,11 +16,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
 
 from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
@@ -32,10 +30,10 @@ from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..system.start_values import why_not_settable
-from ..text import listed, nearest, option_text, shown
+from ..text import did_you_mean, listed, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
-from ..variables.value_types import DTYPES, Value
+from ..variables.value_types import DTYPES
 
 __all__ = ["System", "SystemState"]
 
@@ -99,9 +97,7 @@ class System:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -347,8 +343,8 @@ class System:
     def _getter(self, name: str) -> Callable[[int], Any]:
         instance, variable = self._found(name, elements=True)
         plain = self._local.getter(instance, name.removeprefix(f"{instance}."))
-        is_array = variable.shape and name == f"{instance}.{variable.name}"
-        read = partial(_as_array, plain, DTYPES[variable.type]) if is_array else plain
+        is_array, dtype = variable.shape and name == f"{instance}.{variable.name}", DTYPES[variable.type]
+        read = (lambda point: np.array(plain(point), dtype)) if is_array else plain
         self._getters[name] = read
         return read
 
@@ -357,8 +353,7 @@ class System:
         instances = self._run.plan.system.instances
         instance, _, rest = str(name).partition(".")
         if instance not in instances:
-            near = nearest(instance, instances)
-            hint = f"Did you mean '{near}'?" if near else f"There are {listed(list(instances))}."
+            hint = did_you_mean(instance, instances, f"There are {listed(list(instances))}.")
             raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)
@@ -402,9 +397,7 @@ class SystemState:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -423,10 +416,6 @@ class SystemState:
 def _opened(run: RunPlan, folder: Path, name: str) -> Guarded:
     opening = opening_of(run.plan, name, folder, _forward, run.showing)
     return Guarded(name, lambda: open_instance(opening), Unwatched(), run.plan.system.config.timeouts)
-
-
-def _as_array(read: Callable[[int], Value], dtype: DTypeLike, point: int) -> NDArray[Any]:
-    return np.array(read(point), dtype)
 
 
 def _forward(message: LogMessage) -> None:

@@ -8,8 +8,7 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from msgspec.structs import replace
@@ -22,16 +21,13 @@ from ..results.record_files import open_result
 from ..results.recording import Columns
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
+from ..run.overriding import memory_of
 from ..run.repeated import RepeatedRuns
 from ..run.run_plan import RunPlan
 from ..variables.value_types import DTYPES
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
-from .plan_options import memory_of
 from .result import Result, types_of
 from .run_thread import check_memory
-
-if TYPE_CHECKING:
-    from .mesh_builder import Mesh
 
 __all__ = ["RepeatedMesh"]
 
@@ -55,7 +51,8 @@ class RepeatedMesh:
         True
 
     Args:
-        mesh: the mesh.
+        mesh: the mesh in words.
+        plan: plans a run of it, as `Mesh.plan`.
         reset: reset the instances of FMUs between two runs, and do not make new ones.
         on_hang: called on another thread if an FMU does not return in time.
         before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
@@ -64,13 +61,14 @@ class RepeatedMesh:
 
     def __init__(
         self,
-        mesh: Mesh,
+        mesh: str,
+        plan: Callable[..., RunPlan],
         *,
         reset: bool,
         on_hang: Callable[[FmuError], None],
         before_close: Callable[[Result | BaseException], None] | None = None,
     ) -> None:
-        self._mesh = mesh.from_configuration(mesh.configuration, keeps_code=True)
+        self._mesh, self._plan = mesh, plan
         self._thread = threading.get_ident()
         self._before_close = before_close
         self._rows: _CollectedRows | None = None
@@ -82,13 +80,11 @@ class RepeatedMesh:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
-        return f"<RepeatedMesh of {self._mesh!r}>"
+        return f"<RepeatedMesh of {self._mesh}>"
 
     @takes(PlanOptions)
     def run(self, options: PlanOptions) -> Result:
@@ -109,7 +105,7 @@ class RepeatedMesh:
             raise CallRefused(f"run is not possible, because {why}.")
         if options.output is None and options.record is None:
             options = replace(options, record="memory")
-        plan = self._mesh.plan(**options.given())
+        plan = self._plan(**options.given())
         check_memory(plan, sys.maxsize, to_its_end=True)
         self._rows = rows = _CollectedRows(plan)
         runs = self._runs(plan.mesh)
@@ -143,11 +139,7 @@ class RepeatedMesh:
 
 
 class _CollectedRows:
-    """The rows of a run in memory, and in its result file if it has one; see `ResultFile`.
-
-    Args:
-        plan: the plan of the run.
-    """
+    """The rows of a run in memory, and in its result file if it has one; see `ResultFile`."""
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
@@ -186,7 +178,6 @@ class _CollectedRows:
             self._file.close()
 
     def result(self, outcome: Outcome) -> Result:
-        """What was recorded."""
         system, file = self._plan.plan.system, self._file.path if self._file is not None else None
         types = types_of(system) or {}
         parts = zip(*self._blocks, strict=True) if self._blocks else [[np.zeros(0, DTYPES[t])] for t in types.values()]

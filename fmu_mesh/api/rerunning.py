@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,30 +17,22 @@ import msgspec
 from .. import __version__
 from ..config.call_options import takes
 from ..config.loading import PlainConfig
-from ..errors import CallRefused, ConfigurationError, Finding, FmuMeshError, MeshLost
+from ..errors import ConfigurationError, Finding, FmuMeshError
 from ..run.allowed_code import check_owner
 from ..run.options import RerunOptions, StartOptions
 from ..run.run_plan import RunPlan
 from ..system.run_metadata import RunMetadata, machine, machine_difference, scenario_files
 from ..text import listed
-from ..variables.value_types import PlainValue
-from ..wire.client.mesh_client import MeshClient
-from ..wire.client.readings import Target
-from ..wire.client.waiting import go_on, paused_at, rest, wait_until_at
 from ..wire.messages import SetValue
-from ..wire.views import Command
 from .mesh_builder import Mesh
 from .result import Result
 from .run_handle import Run
 
-__all__ = ["PlannedRerun", "planned_rerun", "replay", "rerun"]
+__all__ = ["PlannedRerun", "planned_rerun", "rerun"]
 
 log = logging.getLogger("fmu_mesh.run")
 
 _SET = "set"
-_STEP_S = 60.0
-"""How long in s an instance may stay at one point before it has come to the next value."""
-
 _ALONE: Mapping[str, Any] = {"zenoh": {"mode": "peer", "listen": [], "connect": [], "config": None}, "ros": None}
 """What a rerun has of its own: nobody else reaches it or sends anything to it."""
 
@@ -123,7 +114,7 @@ def rerun(result: str | Path, options: RerunOptions) -> Result:
 
 @takes(RerunOptions)
 def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
-    """Plan a rerun; the arguments and errors are those of `rerun`.
+    """Plan a rerun; the errors are those of `rerun`.
 
     Args:
         result: the result file.
@@ -160,40 +151,6 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     return PlannedRerun(plan, values, last_point, first)
 
 
-def replay(client: MeshClient, values: Sequence[SetValue], last_point: int | None) -> None:
-    """Set all values, and let the mesh run on, or to ``last_point``, where it pauses.
-
-    Raises:
-        CallRefused: a value was refused.
-        MeshLost: the mesh has ended, or another program controls it too.
-        DeadlineExceeded: an instance does not come to the point of a value.
-    """
-    hold = paused_at(client, Command("pause"))
-    targets: dict[str, Target] = {}
-    for point, together in groupby(sorted(values, key=lambda value: value.point), key=lambda value: value.point):
-        hold = go_on(client, hold, point)
-        for value in together:
-            name = f"{value.instance}.{value.variable}"
-            if hold != point:
-                raise MeshLost(f"the mesh is at point {hold}, and '{name}' was set at point {point}.")
-            if name not in targets:
-                targets[name] = client.target(name)
-            wait_until_at(client, value.instance, point, _STEP_S)
-            _set(client, targets[name], value)
-    if last_point is None:
-        client.command(Command("resume"))
-        return
-    rest(client, Command("step", last_point - hold) if last_point > hold else Command("pause"))
-
-
-def _set(client: MeshClient, target: Target, value: SetValue) -> None:
-    plain: PlainValue = value.value
-    try:
-        client.set(target, plain, value.time)
-    except ConfigurationError as error:
-        raise CallRefused(error.message, instance=value.instance, variable=value.variable, hint=error.hint) from error
-
-
 def _metadata_of(path: Path, result: Result) -> tuple[RunMetadata, list[SetValue]]:
     entries = dict(result.metadata)
     values = entries.pop(_SET, [])
@@ -216,11 +173,7 @@ def _last_point(metadata: RunMetadata, result: Result) -> int | None:
 
 
 def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:
-    """Check that the models and the files of the scenario are those of the first run.
-
-    Raises:
-        ConfigurationError: some are not; has a finding for each.
-    """
+    """Check that models and files of the scenario are those of the first run: a finding for each that is not."""
     findings = []
     for name, own in metadata.models.items():
         now = plan.contents.get(name, "")

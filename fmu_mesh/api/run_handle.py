@@ -7,16 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from ..config.call_options import checked, takes
-from ..errors import (
-    CallRefused,
-    ConfigurationError,
-    FmuMeshError,
-    MeshLost,
-)
+from ..errors import CallRefused, ConfigurationError, FmuMeshError, MeshLost, from_report
 from ..installing import importing
 from ..pictures.notebook_progress import ShownProgress, awaited, progress_of
 from ..ros.bags.play_options import PlayOptions
@@ -24,7 +18,7 @@ from ..run.options import StartOptions
 from ..text import shown
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
-from ..wire.client.waiting import rest, wait_for, wait_for_start
+from ..wire.client.waiting import replay, rest, wait_for, wait_for_start
 from ..wire.views import (
     Command,
     CommandAnswer,
@@ -37,7 +31,6 @@ from ..wire.views import (
     SetAnswer,
     VariableView,
 )
-from .run_ways import TIMEOUT_S, ended_by_keyboard, follow, reach
 from .samples import Sample, Watch, sample_of, target_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
@@ -52,7 +45,11 @@ if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or star
 
 __all__ = ["TIMEOUT_S", "Run"]
 
+TIMEOUT_S = 5.0
+"""Default deadline of a question in s."""
+
 _WAIT_S = 60.0
+_FOREVER_S = 1e9
 
 
 class Run:
@@ -112,9 +109,7 @@ class Run:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -350,8 +345,6 @@ class Run:
             CallRefused: a variable cannot be set, or takes no such value.
             MeshLost: the mesh has ended, or another program controls it too.
         """
-        from .rerunning import replay  # noqa: PLC0415  not for those who only look
-
         replay(self._running(), values, last_point)
         if last_point is not None:
             self.stop()
@@ -460,7 +453,7 @@ class Run:
         except KeyboardInterrupt:
             if self._own is None:
                 raise
-            raise ended_by_keyboard(self._own) from None
+            raise self._own.end_by_keyboard() from None
 
     async def wait_async(self) -> Result:
         """As `wait`, without blocking the event loop of asyncio; a cancelled wait leaves the run as it is.
@@ -495,7 +488,7 @@ class Run:
             if self._ended is None:
                 future: Future[Result] = Future()
                 self._ended, client = future, self._client()
-                threading.Thread(target=follow, args=(client, future), name="end", daemon=True).start()
+                threading.Thread(target=_follow, args=(client, future), name="end", daemon=True).start()
             return self._ended
 
     def _client(self) -> MeshClient:
@@ -513,7 +506,7 @@ class Run:
                 self._own.over()
             if self._found is None:
                 assert self._own is not None  # otherwise it was found by whoever made this
-                self._found = reach(self._own, self.name, self._way)
+                self._found = self._own.reach(self._way, TIMEOUT_S)
             return self._found
 
     def _running(self) -> MeshClient:
@@ -532,3 +525,20 @@ class Run:
     def _steered(self) -> MeshClient:
         """As `_running` for a run that was started here; a mesh that was found takes commands when it takes them."""
         return self._client() if self._own is None else self._running()
+
+
+def _follow(client: MeshClient, future: Future[Result]) -> None:
+    """Follow a mesh that somebody else has started to its end."""
+    from .result import Result  # noqa: PLC0415  not for those who only look
+
+    try:
+        file, last = client.info().result_file, None
+        with client.statuses(_FOREVER_S) as statuses:
+            for status in statuses:
+                last = status
+        if last is not None and last.error is not None:
+            future.set_exception(from_report(last.error))
+        else:
+            future.set_result(Result(client.keys.mesh, file=Path(file) if file is not None else None))
+    except BaseException as error:  # noqa: BLE001 whoever waits gets it
+        future.set_exception(error)

@@ -10,13 +10,22 @@ import logging
 import sys
 import threading
 from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from ..errors import CallRefused, ConfigurationError, FmuMeshError, Interrupted, MeshLost
+from ..errors import (
+    CallRefused,
+    ConfigurationError,
+    DeadlineExceeded,
+    FmuMeshError,
+    Interrupted,
+    KeyboardInterrupted,
+    MeshLost,
+)
 from ..printing import paragraph
 from ..results.arrays_file import bytes_of_a_row
 from ..results.formats import read_result
@@ -24,10 +33,13 @@ from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
 from ..run.launcher import Launcher
 from ..run.options import StartOptions
 from ..run.outcome import Outcome
+from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
+from ..wire.client.mesh_client import MeshClient
+from ..wire.keys import Keys
+from ..wire.session import Wiring, close_session, open_session
 from ..wire.views import MeshStatus
-from .plan_options import memory_of
 from .result import Result, result_of, types_of
 
 if TYPE_CHECKING:
@@ -39,15 +51,12 @@ log = logging.getLogger("fmu_mesh.run")
 
 _WARNED_AT = 0.8
 _JOIN_S = 10.0
+_TRY_S = 0.25
 _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.WARNING}
 
 
 class RunThread:
-    """Runs a plan on a thread of its own, which starts at once.
-
-    Args:
-        plan: the plan of the run.
-        settings: how it runs.
+    """Runs a plan, as its settings say, on a thread of its own, which starts at once.
 
     Attributes:
         plan: the plan of the run.
@@ -96,9 +105,7 @@ class RunThread:
     def interrupt(self) -> None:
         """End the run; a second call does not wait for its processes."""
         with self._changing:
-            self._failure = self._failure or Interrupted("interrupted")
-            if self._runner is not None:
-                self._runner.interrupt()
+            self._fail(Interrupted("interrupted"))
 
     def over(self) -> bool:
         """False while it goes on.
@@ -110,6 +117,56 @@ class RunThread:
             return False
         hint = "Its values are in `run.wait()`." if self.future.exception() is None else "`run.wait()` raises why."
         raise MeshLost(f"the run of mesh '{self.plan.mesh}' has ended", hint=hint)
+
+    def reach(self, way: ExitStack, timeout_s: float) -> MeshClient:
+        """The mesh of this run, once it can be reached.
+
+        Args:
+            way: closes what this opens.
+            timeout_s: deadline of every question of the client.
+
+        Raises:
+            CallRefused: the run is in this process.
+            DeadlineExceeded: it has not started in time.
+            MeshLost: it has ended.
+        """
+        self.over()
+        name, config = self.plan.mesh, self.plan.loaded.config
+        if self.in_process:
+            hint = "Start it with processes=True, or step it by hand with `Mesh.open`."
+            raise CallRefused(f"the run of mesh '{name}' is in this process, where nobody can reach it", hint=hint)
+        if not self.reached.wait(config.timeouts.start):
+            raise DeadlineExceeded(f"mesh '{name}' cannot be reached within {config.timeouts.start:g} s")
+        patience_s = _TRY_S  # Zenoh tries for all of it, also if the mesh ends meanwhile
+        while True:
+            self.over()
+            try:
+                session = open_session(Wiring(mode="client", connect=self.endpoints[:1], patience_s=patience_s))
+            except ConfigurationError as error:
+                patience_s *= 2
+                if patience_s > timeout_s:
+                    raise DeadlineExceeded(f"mesh '{name}' does not answer at {self.endpoints[0]}") from error
+            else:
+                way.callback(close_session, session)
+                keys = Keys(config.zenoh.key_prefix, name)
+                return MeshClient(session, keys, self.endpoints[:1], timeout_s, self.over)
+
+    def end_by_keyboard(self) -> FmuMeshError:
+        """End the run on Ctrl-C, and return its error; a second Ctrl-C does not wait for its processes."""
+        while True:
+            self.interrupt()
+            try:
+                result = self.future.result()
+            except KeyboardInterrupt as error:
+                if self.future.done() and self.future.exception() is error:
+                    return error if isinstance(error, FmuMeshError) else Interrupted("interrupted")
+            except Interrupted as error:
+                named = KeyboardInterrupted(error.message, point=error.point, time=error.time, hint=error.hint)
+                return named.with_result(error.result)
+            except FmuMeshError as error:
+                return error
+            else:
+                return KeyboardInterrupted("interrupted").with_result(result)
 
     def join(self) -> None:
         """Wait until the thread has ended, for some seconds at most."""
@@ -132,11 +189,7 @@ class RunThread:
         _active.discard(self)
 
     def _run(self) -> Result:
-        """Run it, and again if it may be restarted.
-
-        Raises:
-            FmuMeshError: it ended early; has the result.
-        """
+        """Run it, and again if it may be restarted."""
         plan, most = self.plan, self._settings.restarts
         while True:
             try:
@@ -165,14 +218,11 @@ class RunThread:
         Raises:
             BaseException: why the run has ended otherwise; one of ours has the result.
         """
-        result = self._result(self._last_outcome())
+        result = self._result(self._runner.outcome if self._runner is not None else None)
         cause = error if self._failure is None or isinstance(self._failure, Interrupted) else self._failure
         if self._stopped and isinstance(cause, Interrupted):
             return result
         raise cause.with_result(result) if isinstance(cause, FmuMeshError) else cause
-
-    def _last_outcome(self) -> Outcome | None:
-        return self._runner.outcome if self._runner is not None else None
 
     def _take(self, event: Event) -> None:
         match event:
@@ -242,11 +292,6 @@ def _end_all() -> None:
 
 
 def _make_folder(folder: Path, plan: RunPlan) -> None:
-    """Make the folder for results that stay in memory.
-
-    Raises:
-        CallRefused: a run of the same plan has not ended.
-    """
     try:
         folder.mkdir(mode=0o700)
     except FileExistsError as error:
@@ -283,7 +328,6 @@ def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:
 
 
 def _log(event: Event) -> None:
-    """Log an event that the program does not ask for."""
     match event:
         case Log(line):
             level = _LEVELS.get(line.status, logging.ERROR)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from ..errors import ConfigurationError, UnknownName
@@ -43,12 +42,7 @@ class Sample(NamedTuple):
 
 
 class Watch(Iterator[Sample]):
-    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed.
-
-    Args:
-        client: the way into the mesh.
-        targets: the variables.
-    """
+    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed."""
 
     def __init__(self, client: MeshClient, targets: Sequence[Target]) -> None:
         self._targets = {target.key: target for target in targets}
@@ -59,9 +53,7 @@ class Watch(Iterator[Sample]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __next__(self) -> Sample:

@@ -18,13 +18,13 @@ from msgspec.structs import replace
 from ..config.call_options import takes
 from ..config.plain_values import plain
 from ..errors import CallRefused, ConfigurationError
+from ..run.options import SimulateOptions
 from ..simtime import steps_between
 from ..system.series_files import SeriesRefused, columns_of
 from ..text import shown
 from ..variables.model_description import ModelDescription
 from .mesh_builder import Mesh
 from .result import Result
-from .simulate_options import SimulateOptions
 
 __all__ = ["as_given", "experiment_of", "simulate"]
 
@@ -79,12 +79,7 @@ def as_given(error: ConfigurationError, front: str) -> ConfigurationError:
 
 
 def experiment_of(fmu: str | Path, options: SimulateOptions) -> tuple[Mesh, dict[str, Any]]:
-    """A mesh of one FMU for one experiment, and the options of its run.
-
-    Raises:
-        CallRefused: an option is wrong.
-        LoadFailed: it is no FMU that can run here; says why.
-    """
+    """A mesh of one FMU for one experiment, and the options of its run."""
     given = options.given()
     section = {key: given.pop(key) for key in ("kind", "tolerance", "solver") if key in given}
     simulation = partial(_times_of, options)

@@ -8,27 +8,32 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Mapping
-from typing import Any, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NoReturn, Protocol
 
 from ..config.base import ENDPOINT_PATTERN
 from ..errors import ConfigurationError
 from ..text import listed, nearest
 
 __all__ = [
+    "PACKAGE",
+    "QUIET",
+    "SSD",
+    "ArgumentPart",
     "CommandParser",
     "Parsers",
     "Runs",
-    "add_json",
-    "add_package",
-    "add_quiet",
-    "add_reaching",
-    "add_ssd",
+    "argument",
     "count",
     "endpoint",
+    "group",
+    "json_switch",
     "number",
     "port_number",
     "positive_seconds",
+    "reaching",
+    "switch",
     "tolerance",
     "whole",
 ]
@@ -47,11 +52,7 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE  # by default argparse takes -1e-3 and -inf for options
 
     def error(self, message: str) -> NoReturn:
-        """Raise one sentence about the error.
-
-        Raises:
-            ConfigurationError: always.
-        """
+        """Raise one sentence about the error."""
         name, _, what = message.removeprefix("argument ").partition(": ")
         hint = None
         if name == "the following arguments are required":
@@ -87,76 +88,69 @@ class CommandParser(argparse.ArgumentParser):
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
-Parsers = Mapping[str, Callable[[CommandParser], None]]
-"""What a module of arguments offers: for each command the function that adds them."""
+class ArgumentPart(Protocol):
+    """Adds an argument, or several, to a command or to a group of its arguments."""
+
+    def __call__(self, parser: argparse._ActionsContainer, /) -> object:
+        """Add them."""
+
+
 Runs = Mapping[str, Callable[[argparse.Namespace], int]]
 """What a module of commands offers: for each command the function that runs it and returns the exit code."""
+Parsers = Mapping[str, Sequence[ArgumentPart]]
+"""What a module of arguments offers: for each command its arguments, in the order of the help."""
 
 
-def add_json(parser: argparse.ArgumentParser, text: str = "JSON, one object per line") -> None:
-    """Add `--json`."""
-    parser.add_argument("--json", action="store_true", help=text)
+def argument(name: str, metavar: str, text: str, **details: Any) -> ArgumentPart:  # noqa: ANN401 the arguments of argparse
+    """An argument with a value: its name, what stands for the value in the help, and the help."""
+    return lambda parser: parser.add_argument(name, metavar=metavar, help=text, **details)
 
 
-def add_quiet(parser: argparse.ArgumentParser) -> None:
-    """Add `-q`."""
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+def switch(*names: str, text: str) -> ArgumentPart:
+    """A flag without a value."""
+    return lambda parser: parser.add_argument(*names, action="store_true", help=text)
 
 
-def add_reaching(parser: argparse.ArgumentParser, timeout_s: float = _TIMEOUT_S) -> None:
-    """Add the flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
-    parser.add_argument(
-        "--connect",
-        type=endpoint,
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
+def group(title: str, *parts: ArgumentPart) -> ArgumentPart:
+    """Arguments with a title in the help."""
+
+    def add(parser: argparse._ActionsContainer) -> None:
+        own = parser.add_argument_group(title)
+        for part in parts:
+            part(own)
+
+    return add
+
+
+def json_switch(text: str = "JSON, one object per line") -> ArgumentPart:
+    """`--json`."""
+    return switch("--json", text=text)
+
+
+def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ArgumentPart]:
+    """The flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
+    where = "Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host"
+    return (
+        argument("--connect", "ENDPOINT", where, type=endpoint, action="append", default=[]),
+        argument(
+            "--timeout", "S", f"deadline of every query in s ({timeout_s:g})", type=positive_seconds, default=timeout_s
+        ),
     )
-    parser.add_argument(
-        "--timeout",
-        type=positive_seconds,
-        default=timeout_s,
-        metavar="S",
-        help=f"deadline of every query in s ({timeout_s:g})",
-    )
 
 
-def add_package(parser: argparse.ArgumentParser) -> None:
-    """Add what chooses a variant of a package: `--ssd` and `--ssv`."""
-    add_ssd(parser)
-    text = "values of an SSV file, which replace those of a package: a file in it, or another one; repeatable"
-    parser.add_argument("--ssv", action="append", default=[], metavar="FILE.ssv", help=text)
-
-
-def add_ssd(parser: argparse.ArgumentParser) -> None:
-    """Add `--ssd`."""
-    text = "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
-    parser.add_argument("--ssd", metavar="NAME", help=text)
-
-
-def number(text: str) -> float:
-    """A finite number."""
-    value = _read(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+def _finite(text: str, *, least: float = -math.inf, above: float = -math.inf, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
+    if not (math.isfinite(value) and value >= least and value > above):
+        raise argparse.ArgumentTypeError(f"{text} is not {what}")
     return value
 
 
-def positive_seconds(text: str) -> float:
-    """A time in s above 0."""
-    value = _read(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
-    return value
-
-
-def tolerance(text: str) -> float:
-    """A finite number of 0 or more."""
-    value = _read(text)
-    if not (math.isfinite(value) and value >= 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number of 0 or more")
-    return value
+number = partial(_finite, what="a finite number")
+positive_seconds = partial(_finite, above=0.0, what="a time above 0")
+tolerance = partial(_finite, least=0.0, what="a number of 0 or more")
 
 
 def count(text: str) -> int:
@@ -189,8 +183,18 @@ def whole(text: str) -> int:
         return 0
 
 
-def _read(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
+QUIET = switch("-q", "--quiet", text="print errors only")
+SSD = argument(
+    "--ssd", "NAME", "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
+)
+PACKAGE = (
+    SSD,
+    argument(
+        "--ssv",
+        "FILE.ssv",
+        "values of an SSV file, which replace those of a package: a file in it, or another one; repeatable",
+        action="append",
+        default=[],
+    ),
+)
+"""What chooses a variant of a package."""

@@ -91,7 +91,6 @@ class _Offer(BaseCompleter):
         parser: argparse.ArgumentParser,  # noqa: ARG002 argcomplete passes it
         parsed_args: argparse.Namespace,
     ) -> Iterable[str]:
-        """As argcomplete calls it."""
         try:
             return [name for name in _offered(prefix, action, parsed_args) if name.isprintable()]
         except Exception:  # noqa: BLE001 whatever is wrong with a file, a shell shows no error while somebody types
@@ -139,10 +138,6 @@ def _keys(prefix: str, _given: argparse.Namespace) -> list[str]:
     return _with_end(_in_parts(_KEYS, prefix), "=")
 
 
-def _varied(prefix: str, given: argparse.Namespace) -> list[str]:
-    return [*_settable(prefix, given), *_keys(prefix, given)]
-
-
 def _reduced(prefix: str, given: argparse.Namespace) -> list[str]:
     from ..sweeps.reductions import FUNCTIONS  # noqa: PLC0415 slow, and only this needs it
 
@@ -160,7 +155,6 @@ def _samplers(_prefix: str, _given: argparse.Namespace) -> list[str]:
 
 
 def _columns(prefix: str, given: argparse.Namespace) -> list[str]:
-    """The variables of a result file, or of a sweep."""
     from ..api.result import Result  # noqa: PLC0415 as above
     from ..sweeps.sweep_folder import is_sweep  # noqa: PLC0415 as above
     from ..sweeps.sweep_result import SweepResult  # noqa: PLC0415 as above
@@ -170,7 +164,6 @@ def _columns(prefix: str, given: argparse.Namespace) -> list[str]:
 
 
 def _descriptions_in(_prefix: str, given: argparse.Namespace) -> Iterable[str]:
-    """The descriptions of the package that an argument names."""
     path = next((path for name in _PACKAGES if (path := getattr(given, name, None)) is not None), None)
     if path is None or (named := named_package(Path(path))) is None:
         return ()
@@ -224,7 +217,7 @@ _BY_NAME: Final[_Offers] = {
     "node": lambda _, given: readable_configuration(given.config, given.ssd).config.instances,
     "start_values": _settable,
     "config_values": _keys,
-    "vary": _varied,
+    "vary": lambda prefix, given: [*_settable(prefix, given), *_keys(prefix, given)],
     "reduce": _reduced,
     "sampler": _samplers,
     "mesh": _meshes,

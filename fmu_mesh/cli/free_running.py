@@ -9,10 +9,10 @@ import argparse
 import re
 
 from ..api.mesh_builder import Mesh
-from ..api.simulate_options import SimulateOptions
 from ..api.simulating import as_given, experiment_of
 from ..config.base import NAME_PATTERN
 from ..errors import CallRefused, ConfigurationError, LoadFailed
+from ..run.options import SimulateOptions
 from .arguments import Runs
 from .output.reports import RunReporter
 from .output.terminal import teller
@@ -51,7 +51,6 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _mesh(arguments: argparse.Namespace) -> Mesh:
-    """The mesh of this one FMU."""
     simulation = {"stop_time": None, **SIMULATION}
     if arguments.step_size is not None:
         simulation["step_size"] = arguments.step_size

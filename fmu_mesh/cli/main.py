@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import ConfigurationError, FmuMeshError
 from ..printing import guard_streams
 from ..run.limits import needed_mib
-from ..text import nearest
+from ..text import did_you_mean
 from .arguments import CommandParser, Runs
 
 __all__ = ["COMMANDS", "command_parser", "main"]
@@ -51,17 +51,17 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
     "get": ("mesh", "looking", "show current values"),
     "set": ("mesh", "looking", "set an unconnected input or a tunable parameter"),
     "watch": ("mesh", "looking", "show every value of variables until the mesh ends"),
-    "logs": ("mesh", "logs", "show the log messages of a mesh"),
+    "logs": ("mesh", "steering", "show the log messages of a mesh"),
     "wait": ("mesh", "steering", "wait until a mesh is running, or in another state"),
     "pause": ("mesh", "steering", "pause a mesh at a point"),
     "resume": ("mesh", "steering", "resume a paused mesh"),
     "step": ("mesh", "steering", "run a mesh for some points and pause it again"),
     "stop": ("mesh", "steering", "end the run of a mesh"),
-    "rerun": ("run", "rerun_command", "run again what a result file has recorded"),
-    "play": ("mesh", "play", "play a recorded bag into the inputs of a mesh"),
+    "rerun": ("run", "running", "run again what a result file has recorded"),
+    "play": ("mesh", "steering", "play a recorded bag into the inputs of a mesh"),
     "plot": ("file", "plotting", "plot result files"),
-    "compare": ("file", "comparing", "compare two result files"),
-    "recover": ("file", "recover", "finish the result file of a run that was killed"),
+    "compare": ("file", "plotting", "compare two result files"),
+    "recover": ("file", "plotting", "finish the result file of a run that was killed"),
     "node": ("run", "running", "start one node manually"),
     "master": ("run", "running", "start the master and the recorder manually"),
     "gateway": ("run", "running", "start the gateway to ROS manually"),
@@ -113,11 +113,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
-    """The command and its arguments; None, after the help, without a command.
-
-    Raises:
-        ConfigurationError: there is no such command, or an argument is wrong.
-    """
+    """The command and its arguments; None, after the help, without a command."""
     name = next((argument for argument in given if not argument.startswith("-")), None)
     if name is not None and given[0] == name and name not in COMMANDS:
         raise _unknown(name)
@@ -136,20 +132,14 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
 def _unknown(name: str) -> ConfigurationError:
     """The error for a first argument that is not a command, such as a file."""
     suffix = PurePath(name).suffix
-    near = nearest(name, COMMANDS)
+    hint = did_you_mean(name, COMMANDS, "`fmu-mesh --help` lists them.")
     if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
         hint = f"Did you mean `fmu-mesh {'simulate' if suffix == '.fmu' else 'launch'} {name}`?"
-    else:
-        hint = f"Did you mean '{near}'?" if near is not None else "`fmu-mesh --help` lists them."
     return ConfigurationError(f"there is no command '{name}'.", hint=hint)
 
 
 def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, Mapping[str, CommandParser]]:
-    """The parser, and the parsers of all commands by name.
-
-    Args:
-        needed: the commands whose arguments are needed.
-    """
+    """The parser, and those of all commands by name; those of commands that are not ``needed`` have no arguments."""
     parser = CommandParser(
         prog="fmu-mesh",
         description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",
@@ -162,5 +152,6 @@ def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, M
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
         if name in needed:
-            import_module(f".{kind}_arguments", __package__).PARSERS[name](command)
+            for add in import_module(f".{kind}_arguments", __package__).PARSERS[name]:
+                add(command)
     return parser, commands.choices

@@ -76,12 +76,8 @@ def _new(arguments: argparse.Namespace) -> int:
     models = _models(paths, file.absolute().parent, quiet=arguments.quiet)
     text = configuration_for(models, mesh=_name(file.absolute().parent.name, ()), file=file, schema=schema.name)
     plan = planned(read_text(text, file), PlanOptions()).plan
-    try:
-        for path, content in ((file, text), (schema, schema_text(installed_config()))):
-            with files.replaced(path) as draft:
-                draft.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"'{file}' cannot be written: {error.strerror}") from error
+    files.write_whole(file, text)
+    files.write_whole(schema, schema_text(installed_config()))
     print(f"{short_path(file)}: {len(plan.system.instances)} instances, {len(plan.connections)} connections")
     print(f"schema for editors: {short_path(schema)}")
     for model in models:
@@ -140,14 +136,7 @@ def _name(text: str, taken: Iterable[str]) -> str:
 
 
 def configuration_for(models: Sequence[Model], *, mesh: str, file: Path, schema: str) -> str:
-    """The text of a configuration.
-
-    Args:
-        models: the FMUs; those that cannot run here become comments.
-        mesh: the name of the mesh.
-        file: where the text is going to be.
-        schema: the file of the JSON Schema beside it.
-    """
+    """The text of a configuration, which is going to be ``file``; FMUs that cannot run here become comments."""
     step, grid = _simulation(models)
     lines = [
         f"# yaml-language-server: $schema={schema}",
@@ -257,7 +246,6 @@ def _fits(source: str, target: str, descriptions: Mapping[str, ModelDescription]
 
 
 def _about(variable: Variable) -> str:
-    """Unit and description as a comment."""
     words = " ".join((variable.description or "").split())
     text = ", ".join(filter(None, (variable.unit, words)))
     return f"  # {textwrap.shorten(text, _COMMENT, placeholder=' ...')}" if text else ""

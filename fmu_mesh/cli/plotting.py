@@ -1,4 +1,4 @@
-"""`plot`: draws a result file or a sweep; and the option `--plot` of the commands that run a mesh."""
+"""`plot`, `compare` and `recover`: result files; and the option `--plot` of the commands that run a mesh."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..api.plan_options import memory_of
+from msgspec.structs import asdict
+
 from ..api.result import Result
 from ..errors import ConfigurationError, FmuMeshError
 from ..installing import require
 from ..pictures.drawing import draw
-from ..results.formats import require_readable
+from ..results.formats import recover, require_readable
+from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..text import listed
 from .arguments import Runs
+from .output.json_output import print_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,6 +28,9 @@ if TYPE_CHECKING:
     from ..sweeps.sweep_result import SweepResult
 
 __all__ = ["RUNS", "check_plot", "plot_results", "plotted_where_it_ends"]
+
+_DIFFERENT = 1
+"""The exit code for results that differ."""
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -54,11 +60,6 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def _of_files(arguments: argparse.Namespace) -> Figure:
-    """A picture of one or several result files.
-
-    Raises:
-        ConfigurationError: a file cannot be read or has no such variable, or options cannot be combined.
-    """
     result, *others = (Result(path.stem, file=path) for path in arguments.results)
     if arguments.difference and (not others or arguments.x is not None):
         hint = "Name two result files." if not others else "Leave --x out."
@@ -73,12 +74,7 @@ def _of_files(arguments: argparse.Namespace) -> Figure:
 
 
 def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure, str]:
-    """A picture of a sweep, and what it shows.
-
-    Raises:
-        ConfigurationError: it is not said which variable, or two options cannot be combined.
-        CallRefused: there is no such column or parameter.
-    """
+    """A picture of a sweep, and what it shows."""
     variables: Sequence[str] = arguments.variables or ()
     if arguments.heat_map is not None:
         if variables or arguments.colour:
@@ -93,10 +89,6 @@ def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure
 
 def check_plot(plot: Path, plan: RunPlan) -> None:
     """Check before a run that its result can be plotted at its end.
-
-    Args:
-        plot: the file of the picture.
-        plan: the plan of the run.
 
     Raises:
         ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
@@ -114,11 +106,7 @@ def check_plot(plot: Path, plan: RunPlan) -> None:
 
 
 def plot_results(result: Path | Result, plot: Path, plan: Plan) -> None:
-    """Draw the result of a run, or its file, with one axes for each unit of its plan.
-
-    Raises:
-        ConfigurationError: the result cannot be read, or the plot cannot be written.
-    """
+    """Draw the result of a run, or its file, with one axes for each unit of its plan."""
     if isinstance(result, Path):
         result = Result(plan.system.config.mesh, file=result, system=plan.system)
     draw(result.plot(), plot)
@@ -148,4 +136,28 @@ def _state_of(result: str | None) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-RUNS: Runs = {"plot": _plot}
+def _compare(arguments: argparse.Namespace) -> int:
+    if arguments.plot is not None:
+        require("matplotlib", "plots")
+    first, second = (Result(path.stem, file=path) for path in (arguments.first, arguments.second))
+    comparison = first.compare(second, rtol=arguments.rtol, atol=arguments.atol, variables=tuple(arguments.variables))
+    code = 0 if comparison.equal else _DIFFERENT
+    if arguments.json:
+        fields = {name: value for name, value in asdict(comparison).items() if name != "drawn"}
+        print_json({"equal": comparison.equal, "exit_code": code, **fields})
+    else:
+        print(comparison.text)
+    if arguments.plot is not None:
+        draw(comparison.plot(), arguments.plot)
+        if not arguments.json:
+            print(f"plot: {arguments.plot}")
+    return code
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    rows = recover(arguments.results)
+    print(f"{arguments.results}: {rows} rows")
+    return 0
+
+
+RUNS: Runs = {"plot": _plot, "compare": _compare, "recover": _recover}

@@ -21,7 +21,7 @@ from ..sweeps.variants import Values, read_values
 from ..text import short_path, shown
 from .arguments import Runs
 from .output.json_output import Failure, failure_of, print_json
-from .output.progress import SweepProgressLine
+from .output.progress import ProgressLine, sweep_parts
 from .output.terminal import error_console, say, stdout_as_stderr
 from .run_arguments import HERE
 from .run_options import given_options, mesh_of
@@ -86,11 +86,6 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 
 def _planned(arguments: argparse.Namespace) -> PlannedSweep:
-    """Plan the sweep, or what is missing of one.
-
-    Raises:
-        ConfigurationError: something is wrong with it, or two arguments cannot be combined.
-    """
     given = given_options(arguments, SweepOptions)
     if is_sweep(arguments.config):
         if given.keys() - _OF_FOLDER or any(getattr(arguments, name) for name in ("ssd", "ssv", "vary")):
@@ -138,11 +133,13 @@ def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:
         if arguments.no_wait:
             say(f"`{sweep.again}` follows it, and `scancel {job.id}` ends it")
             return
-    line = SweepProgressLine(sweep.mesh, error_console, show=not (arguments.no_progress or arguments.quiet))
+    console = error_console if not (arguments.no_progress or arguments.quiet) else None
+    line = ProgressLine(sweep.mesh, sweep.progress.total, sweep_parts, console)
     line.start()
     try:
         while True:
-            line.update(sweep.progress)
+            progress = sweep.progress
+            line.update(progress.done, progress)
             try:
                 sweep.wait(_REDRAW_S)
             except DeadlineExceeded:
@@ -174,7 +171,6 @@ def _report(sweep: Sweep | None, error: FmuMeshError | None) -> SweepReport:
 
 
 def _show(sweep: Sweep) -> None:
-    """Print the first failures, the table, and how fast it was."""
     failed, progress = sweep.result.failed, sweep.progress
     warned = [row for row in sweep.result if row.message and not row.exit_code]
     for rows, what in ((failed, "failed"), (warned, "warns")):

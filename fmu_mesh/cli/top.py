@@ -11,7 +11,6 @@ import shutil
 import sys
 import threading
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -20,7 +19,7 @@ from .. import printing
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost
-from ..pictures.tables import shortened, table, width_of
+from ..pictures.tables import shortened, table, wrapped
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs
 from .output.json_output import print_json
@@ -63,17 +62,9 @@ class _Courses:
 
     A thread asks for the values, because `top` has to show the state of a mesh whose values do not come.
 
-    Args:
-        run: the mesh.
-        names: the variables; none: nothing is asked for.
-        interval_s: time between two looks at the mesh in s.
-
     Attributes:
         per_look: number of values in the time between two looks.
         interval_s: time between two values in s.
-
-    Raises:
-        UnknownName: there is no such variable.
     """
 
     def __init__(self, run: Run, names: Sequence[str], interval_s: float) -> None:
@@ -92,9 +83,7 @@ class _Courses:
             self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         if self._names and self._thread.ident is not None:
             self._thread.join()
@@ -160,13 +149,7 @@ def _follow(run: Run, courses: _Courses, *, as_json: bool) -> int:
 
 
 def page(look: Look, before: Look | None = None, *, width: int | None = None) -> list[str]:
-    """The lines of one look.
-
-    Args:
-        look: the status of the mesh and of its instances.
-        before: that of the last look, for rates; None at the first one.
-        width: largest width in columns; None: no limit.
-    """
+    """The lines of one look, in at most ``width`` columns; rates are those since the look ``before``."""
     status, instances = look
     step_size = status.real_time_factor / status.points_per_second if status.points_per_second else 0.0
     head = [
@@ -184,19 +167,7 @@ def page(look: Look, before: Look | None = None, *, width: int | None = None) ->
     if width is None:
         return [", ".join(head), "", *table(rows, heading=_HEADING)]
     head[0] = f"{shortened(status.mesh, width // 2)}: {status.state}"
-    return [*_lines(head, width), "", *_fitted(rows, width)]
-
-
-def _lines(parts: Sequence[str], width: int) -> list[str]:
-    """Parts with commas between them, in as many lines as needed."""
-    lines = [parts[0]]
-    for part in parts[1:]:
-        if len(lines[-1]) + len(part) + 3 > width:
-            lines[-1] += ","
-            lines.append(part)
-        else:
-            lines[-1] += f", {part}"
-    return lines
+    return [*wrapped(head, width), "", *_fitted(rows, width)]
 
 
 def _fitted(rows: list[list[str]], width: int) -> list[str]:
@@ -206,8 +177,8 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
     longest = max(len(row[0]) for row in (heading, *rows))
 
     def room() -> int:
-        """Columns for the name and the activity."""
-        return width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4  # two gaps
+        others = table([row[1:-1] for row in rows], heading=heading[1:-1])
+        return width - max(map(len, others), default=0) - 4  # two gaps
 
     for name in _DISPENSABLE:
         if room() >= min(longest, _LEAST_NAME if name == "state" else _GOOD_NAME) + _LEAST_ACTIVITY:
@@ -222,18 +193,14 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
 
 
 def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -> list[str]:
-    if before is None or before.running_time >= own.running_time or before.point > own.point:  # it was restarted
-        before = InstanceStatus(own.instance, "", "", 0, 0.0, 0.0, 0.0)
-    wall_s = own.running_time - before.running_time
-    rate = (own.point - before.point) / wall_s if wall_s > 0.0 else 0.0
-    waited = (own.wait_time - before.wait_time) / wall_s if wall_s > 0.0 else 0.0
+    rate, _, waited = own.rates_since(before)
     return [
         own.instance,
         own.state,
         str(own.point),
         seconds(own.time),
         f"{1e6 * own.step_time:.3g} us",
-        f"{100.0 * min(waited, 1.0):.0f} %",
+        f"{100.0 * waited:.0f} %",
         f"{rate:.0f}",
         f"{rate * step_size:.3g}",
         str(own.restarts),

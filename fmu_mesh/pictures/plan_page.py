@@ -8,7 +8,6 @@ from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
-from ..system.initialization_plan import Loop
 from ..system.plan import Plan
 from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
@@ -26,12 +25,7 @@ _PROBLEM_CHARACTERS = 200
 
 
 def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
-    """The plan as lines of text, the same on every terminal and in every pipe.
-
-    Args:
-        plan: what would run.
-        loaded: its configuration, which says where start values come from.
-    """
+    """The plan as lines of text, the same everywhere; ``loaded`` says where start values come from."""
     sections = [
         ("", _head(plan)),
         ("Instances", _instances(plan)),
@@ -96,7 +90,6 @@ def _model(plan: Plan, instance: SystemInstance) -> str:
 
 
 def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
-    """Each start value with its unit, and where it was written."""
     rows = [
         [
             f"{instance.name}.{name}",
@@ -148,7 +141,6 @@ def _free_inputs(plan: Plan) -> list[str]:
 
 
 def _scenario(plan: Plan) -> list[str]:
-    """What the scenario sets, and when."""
     rows = []
     for name, instance in plan.system.instances.items():
         for own in instance.scenario:
@@ -231,14 +223,13 @@ def _initialization(plan: Plan) -> list[str]:
         if level in loops:
             last = loops[level].last
             until = f"levels {level} to {last} are" if last > level else f"level {level} is"
-            lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(_assumed(plan, loops[level]))}"]
+            assumed = (
+                f"{t.target}.{t.input} = {shown(t.start)}"
+                f"{_unit(plan.system.instances[t.target].description.variable_of(t.input))}"
+                for t in loops[level].tears
+            )
+            lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(assumed)}"]
     return lines
-
-
-def _assumed(plan: Plan, loop: Loop) -> list[str]:
-    """The torn inputs of a loop, each with the value that is assumed at first."""
-    described = {tear: plan.system.instances[tear.target].description.variable_of(tear.input) for tear in loop.tears}
-    return [f"{t.target}.{t.input} = {shown(t.start)}{_unit(variable)}" for t, variable in described.items()]
 
 
 def _recorded(plan: Plan) -> list[str]:

@@ -5,7 +5,6 @@ Owns how curves of results look. What belongs together is said by whoever calls.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,6 +24,8 @@ from .drawing import (
     limited,
     reduced,
     short,
+    silently,
+    style_axes,
 )
 
 if TYPE_CHECKING:
@@ -151,25 +152,15 @@ def _factor(text: str) -> str:
 def figure_of(results: Sequence[Curves], picture: PictureOptions) -> Figure:
     """The matplotlib figure: one axes below the other, each as high as its legend.
 
-    Args:
-        results: what is drawn of each result. A variable has one colour, and of several results each one kind of line.
-        picture: the rest.
-
-    Raises:
-        CallRefused: the horizontal axis has texts.
-        ConfigurationError: matplotlib is not installed.
+    A variable has one colour, and of several results each one kind of line.
     """
     figure = empty_figure()
-    # A character that is not in the font is drawn as a box, without a word.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silently():
         _Drawer(figure, results, picture).draw()
     return figure
 
 
 class _Drawer:
-    """Draws one picture."""
-
     def __init__(self, figure: Figure, results: Sequence[Curves], picture: PictureOptions) -> None:
         self._figure, self._results, self._picture = figure, results, picture
         self._names = [
@@ -182,7 +173,6 @@ class _Drawer:
             raise CallRefused(f"'{x}' has texts, which are no horizontal axis", variable=x)
 
     def draw(self) -> None:
-        """Lay out the axes and draw into them."""
         panels = self._panels()
         least = _AXES_INCHES[1] * min(1.0, _FEW_AXES / len(panels))
         several = len(self._results) if len(self._results) > 1 else 0
@@ -262,15 +252,12 @@ class _Drawer:
                     marker="o" if len(data[0]) == 1 else None,  # a line of one point is invisible
                 )
                 first.setdefault(name, line)
-        axes.set_ylabel(short(panel.label), parse_math=False)
-        axes.grid(visible=True, alpha=0.35)
-        axes.margins(x=0.01)
+        is_empty = not any(len(result.times) for result in self._results)
+        style_axes(axes, panel.label, is_empty=is_empty)
         if panel.label == FLAGS:
             axes.set_yticks([0, 1])
             axes.set_ylim(-0.1, 1.1)
-        if not any(len(result.times) for result in self._results):
-            axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
-        elif not panel.is_difference:
+        if not is_empty and not panel.is_difference:
             self._annotate(axes, panel, height)
         return [first[name] for name in panel.names if name in first]
 
@@ -348,12 +335,7 @@ class _Drawer:
 
 
 class _Room:
-    """Where a text beside a point covers few lines; all lengths are in points, from the lower left corner of the axes.
-
-    Args:
-        axes: the axes, with all lines.
-        width: about their width in inches; ``height`` likewise.
-    """
+    """Where a text beside a point covers few lines; lengths are in points, from the lower left corner of the axes."""
 
     def __init__(self, axes: Axes, width: float, height: float) -> None:
         self._limits = axes.get_xlim(), axes.get_ylim()
@@ -385,12 +367,8 @@ class _Room:
 
     def _cost(self, rectangle: tuple[float, float, float, float]) -> int:
         """How much a text covers there; the first and so nearest place of several with the same cost is taken."""
-        left, low, right, high = (
-            rectangle[0] - _FRAME,
-            rectangle[1] - _FRAME,
-            rectangle[2] + _FRAME,
-            rectangle[3] + _FRAME,
-        )
+        left, low = rectangle[0] - _FRAME, rectangle[1] - _FRAME
+        right, high = rectangle[2] + _FRAME, rectangle[3] + _FRAME
         is_outside = left < 0.0 or low < 0.0 or right > self._size[0] or high > self._size[1]
         cost = 10_000 * is_outside
         cost += 1_000 * sum(

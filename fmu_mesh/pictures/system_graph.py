@@ -20,7 +20,7 @@ from ..text import counted
 from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
 from .graph_layout import INITIAL, going_back
 from .graph_pictures import figure_of_drawing, svg_of_drawing
-from .tables import html_table, shortened, table
+from .tables import html_table, shortened, table, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,8 +136,9 @@ class SystemGraph(msgspec.Struct, frozen=True):
                 lines.append(f"group {shortened(group, _COLUMNS - 30)}, one process")
             for node in nodes:
                 lines += self._lines_of(node, indent)
-        if self.cycles:
-            lines += ["", *_wrapped([("cycle", cycle) for cycle in self.cycles])]
+        lines += [""] if self.cycles else []
+        for cycle in self.cycles:
+            lines += wrapped([shortened(name, _NAME) for name in cycle], _COLUMNS, "cycle  ")
         return page(line.rstrip() for line in lines)
 
     def __repr__(self) -> str:
@@ -158,17 +159,12 @@ class SystemGraph(msgspec.Struct, frozen=True):
 
     def _lines_of(self, node: GraphNode, indent: int) -> list[str]:
         heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), node.live]
-        rows = [
-            (
-                variable.source,
-                f"{edge.target}.{variable.target}",
-                shortened(variable.unit_text, 14),
-                _remark(edge, variable),
-            )
-            for edge in self.edges
-            if edge.source == node.instance
-            for variable in edge.variables
-        ]
+        rows = []
+        for edge in self.edges:
+            delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
+            for own in edge.variables if edge.source == node.instance else ():
+                remark = ", ".join(filter(None, [delay, "map" if own.map else ""]))
+                rows.append((own.source, f"{edge.target}.{own.target}", shortened(own.unit_text, 14), remark))
         first = shortened(" " * indent + "  ".join(filter(None, heading)), _COLUMNS)
         return [first, *_fitted(rows, indent + 2)]
 
@@ -253,51 +249,16 @@ def graph_of(
 def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus | None) -> GraphNode:
     if status is None:
         return replace(node, state=None, point=None, points_per_second=None, wait=None)
-    start: tuple[int, float, float] = (0, 0.0, 0.0)
-    if before is not None and before.running_time < status.running_time and before.point <= status.point:
-        start = before.point, before.running_time, before.wait_time
-    wall_s = status.running_time - start[1]
-    return replace(
-        node,
-        state=status.state,
-        point=status.point,
-        points_per_second=(status.point - start[0]) / wall_s if wall_s > 0.0 else 0.0,
-        wait=min((status.wait_time - start[2]) / wall_s, 1.0) if wall_s > 0.0 else 0.0,
-    )
-
-
-def _remark(edge: GraphEdge, variable: GraphVariable) -> str:
-    delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
-    return ", ".join(filter(None, [delay, "map" if variable.map else ""]))
+    rate, _, wait = status.rates_since(before)
+    return replace(node, state=status.state, point=status.point, points_per_second=rate, wait=wait)
 
 
 def _fitted(rows: Sequence[tuple[str, str, str, str]], indent: int) -> list[str]:
     """A table of connections in 80 columns: both ends, unit and remark; long names without their middle."""
-    others = max((len(row[2]) for row in rows), default=0) + max((len(row[3]) for row in rows), default=0) + 4
-    room = _COLUMNS - indent - others - len(" -> ")
-    for_source = min(
-        max((len(row[0]) for row in rows), default=0), max(room // 2, room - max(map(_end_of, rows), default=0))
-    )
+    source, target, *others = (max((len(row[column]) for row in rows), default=0) for column in range(4))
+    room = _COLUMNS - indent - sum(others) - 4 - len(" -> ")
+    for_source = min(source, max(room // 2, room - target))
     ends = [
         f"{shortened(row[0], for_source)} -> {shortened(row[1], room - min(len(row[0]), for_source))}" for row in rows
     ]
     return table([(end, *row[2:]) for end, row in zip(ends, rows, strict=True)], indent=indent)
-
-
-def _end_of(row: tuple[str, str, str, str]) -> int:
-    return len(row[1])
-
-
-def _wrapped(lists: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """Names in lines of at most 80 columns, each list with its title."""
-    lines = []
-    for title, names in lists:
-        line = f"{title} "
-        for number, name in enumerate(names):
-            text = f" {shortened(name, _NAME)}" + ("," if number < len(names) - 1 else "")
-            if len(line) + len(text) > _COLUMNS:
-                lines.append(line)
-                line = " " * (len(title) + 1)
-            line += text
-        lines.append(line)
-    return lines

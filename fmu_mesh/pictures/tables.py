@@ -8,7 +8,7 @@ from itertools import islice
 
 from ..text import counted, printable
 
-__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "width_of"]
+__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "wrapped"]
 
 _GAP = "  "
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -26,11 +26,6 @@ def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None
     return [" " * indent + _GAP.join(row[column].ljust(widths[column]) for column in shown).rstrip() for row in cells]
 
 
-def width_of(rows: Iterable[Sequence[str]], heading: Sequence[str]) -> int:
-    """The width of a table in columns of a terminal."""
-    return max(map(len, table(rows, heading=heading)), default=0)
-
-
 def shortened(name: str, width: int) -> str:
     """A name in at most ``width`` columns, without its middle: names differ mostly at their ends."""
     name = printable(name)
@@ -38,6 +33,18 @@ def shortened(name: str, width: int) -> str:
         return name
     kept = max(width - len(_ELLIPSIS), 0)
     return f"{name[: kept - kept // 2]}{_ELLIPSIS}{name[len(name) - kept // 2 :]}"
+
+
+def wrapped(parts: Sequence[str], width: int, front: str = "") -> list[str]:
+    """Parts with commas between them after a front, in lines of at most ``width`` columns, unless a part is longer."""
+    lines = [front + parts[0]]
+    for part in parts[1:]:
+        lines[-1] += ","
+        if len(lines[-1]) + len(f" {part},") > width:
+            lines.append(" " * len(front) + part)
+        else:
+            lines[-1] += f" {part}"
+    return lines
 
 
 def pairs(items: Iterable[tuple[str, str]], *, indent: int = 0) -> list[str]:

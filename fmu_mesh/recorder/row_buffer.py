@@ -87,9 +87,7 @@ class RowBuffer:
 
     def close(self) -> None:
         """Write what is left and close the files (see `RecordFiles.close`)."""
-        if self._writing.acquire(
-            timeout=_OTHER_WRITER_S
-        ):  # else another thread writes to a disk that does not answer
+        if self._writing.acquire(timeout=_OTHER_WRITER_S):  # else another thread writes to a disk that does not answer
             with ExitStack() as stack:
                 stack.callback(self._writing.release)
                 stack.callback(self._files.close)

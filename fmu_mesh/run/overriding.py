@@ -1,6 +1,6 @@
 """The configuration of a run: the values of a file with those that options replace.
 
-Owns the place in the configuration of each option, and how a finding names the option.
+Owns the place in the configuration of each option, how a finding names the option, and where results in memory are.
 """
 
 from __future__ import annotations
@@ -15,9 +15,13 @@ from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
 from ..system.records import IN_MEMORY
 from ..text import listed, nearest, option_text
+from ..wire.runtime import run_name, runtime_folder
 from .options import PlanOptions
+from .run_plan import RunPlan
 
-__all__ = ["with_options"]
+__all__ = ["memory_file", "memory_of", "with_options"]
+
+_MEMORY = "memory."
 
 
 def with_options(plain: PlainConfig, options: PlanOptions) -> PlainConfig:
@@ -112,3 +116,18 @@ def _with_record(records: list[Plain], key: str, value: Plain) -> list[Plain]:
     """
     others = records[1:] if isinstance(value, str) and not value.endswith(IN_MEMORY) else []
     return [_replaced(records[0] if records else None, (key,), value), *others]
+
+
+def memory_file() -> Path:
+    """The file for results that stay in memory; the run makes its folder, and removes it.
+
+    If this process is killed, the next run of this user removes them.
+    """
+    return runtime_folder() / f"{_MEMORY}{run_name()}" / f"rows{IN_MEMORY}"
+
+
+def memory_of(plan: RunPlan) -> Path | None:
+    """The file for results that stay in memory; None if they go where the configuration says."""
+    file = Path(plan.plan.system.result_file or "")
+    own = file.suffix == IN_MEMORY and file.parent.name.startswith(_MEMORY) and file.parent.parent == runtime_folder()
+    return file if own else None

@@ -28,11 +28,9 @@ T = TypeVar("T")
 
 @contextmanager
 def dask_executor(address: str | None, workers: int | None = None) -> Iterator[Executor]:
-    """The executor of a Dask cluster, until the end of the block.
+    """The executor of a Dask cluster, until the end of the block: that at ``address``, or one of this host.
 
-    Args:
-        address: of the scheduler, such as tcp://192.168.1.2:8786; None: a cluster of processes of this host.
-        workers: number of these processes; None: one for each processor.
+    It has that many ``workers``; by default one for each processor.
 
     Raises:
         LibraryMissing: Dask is not installed.
@@ -79,7 +77,6 @@ class _DaskExecutor(Executor):
         self._under_way: dict[Future[Any], Any] = {}  # Dask forgets a job whose future is gone
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:  # noqa: ANN401  those of any function
-        """Run a job on any worker."""
         future: Future[T] = Future()
         self._under_way[future] = job = self._client.submit(fn, *args, pure=False, **kwargs)
         job.add_done_callback(partial(self._settle, future))

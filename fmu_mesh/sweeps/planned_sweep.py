@@ -24,11 +24,11 @@ from ..run.allowed_code import check_owner
 from ..run.one_process import apart
 from ..run.options import VariantOptions
 from ..run.run_plan import RunPlan
-from ..text import listed, nearest
+from ..text import did_you_mean, listed, nearest
 from .reductions import check_reductions, read_reduction
 from .sweep_folder import SweepFolder, Wanted, identity_of, is_sweep
 from .sweep_options import Own, SweepOptions
-from .variant_run import OwnReductions, Row, SweepTask, encoded_task, options_of_variant
+from .variant_run import Common, OwnReductions, Row, SweepTask, curves_of, options_of_variant
 from .variants import Parameters, variants_of
 
 __all__ = ["Own", "PlannedSweep", "SweepOptions", "continued_sweep", "planned_sweep"]
@@ -36,6 +36,11 @@ __all__ = ["Own", "PlannedSweep", "SweepOptions", "continued_sweep", "planned_sw
 log = logging.getLogger("fmu_mesh.run")
 
 _OPTION = re.compile(r"`(start_values|config_values)=\{'([^']+)': ")
+
+_DEPRECATED = (
+    "the option that runs each variant in processes goes in two versions: leave it out; variants whose instances may "
+    "not share a process get processes without it"
+)
 
 _OF_EACH_RUN = [name for name in VariantOptions.__struct_fields__ if name != "on_notice"]
 
@@ -106,6 +111,8 @@ def planned_sweep(
         most_instances=dict(options.max_instances),
     )
     tell = options.on_notice or log.info
+    if options.processes:
+        tell(f"warning: {_DEPRECATED}")
     try:
         plan = _any_plan(own, base, wanted, tell)
     except ConfigurationError as error:
@@ -129,12 +136,7 @@ def planned_sweep(
 def continued_sweep(
     folder: Path, *, allow_code: bool = False, on_notice: Callable[[str], None] = log.info
 ) -> PlannedSweep:
-    """Plan what is missing of the sweep in a folder.
-
-    Args:
-        folder: the folder.
-        allow_code: run the Python code that it names; also, run it although another user owns it.
-        on_notice: as in `SweepOptions`.
+    """Plan what is missing of the sweep in a folder; ``allow_code`` also runs it if another user owns it.
 
     Raises:
         ConfigurationError: there is no sweep in the folder, another user has made it, or its mesh cannot run any more.
@@ -152,21 +154,13 @@ def continued_sweep(
 def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, functions: OwnReductions) -> PlannedSweep:
     wanted = replace(wanted, identities=_identities(mesh, plan, wanted))
     columns = (*wanted.reductions, *functions)
-    task = SweepTask(
-        version=wanted.version,
-        data=wanted.data,
-        file=Path(wanted.file),
-        foreign=mesh.configuration.foreign,
-        options=wanted.options,
-        reductions=wanted.reductions,
-        curves=folder.curves if wanted.curves else None,
-        processes=wanted.processes,
-        reset=wanted.reset,
-    )
+    common = {name: getattr(wanted, name) for name in Common.__struct_fields__}
+    curves = folder.curves if wanted.curves else None
+    task = SweepTask(**common, folder=curves, foreign=mesh.configuration.foreign)
 
     def is_kept(row: Row) -> bool:
         """What failed may be right now, unless an FMU failed: that would fail again."""
-        has_curves = not wanted.curves or folder.curves_of(row.id).is_file()
+        has_curves = not wanted.curves or curves_of(folder.curves, row.id).is_file()
         is_whole = row.exit_code == 0 and has_curves and set(columns) <= {*row.values}
         return is_whole or row.exit_code == FmuError.exit_code
 
@@ -176,14 +170,13 @@ def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, fun
         plan=plan,
         columns=columns,
         functions=functions,
-        task=encoded_task(task),
+        task=msgspec.msgpack.encode(task, enc_hook=str),
         at_once=_at_once(plan, wanted.most_instances),
         found={identity: row for identity, row in folder.rows().items() if is_kept(row)},
     )
 
 
 def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
-    """Check that each parameter names a start value or a key of the configuration."""
     sections = [field.encode_name for field in msgspec.structs.fields(Config)]
     for name in names:
         first, dot, rest = name.partition(".")
@@ -197,17 +190,7 @@ def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
 
 
 def _any_plan(mesh: Mesh, base: Mapping[str, Any], wanted: Wanted, tell: Callable[[str], None] = log.info) -> RunPlan:
-    """The plan of the first variant, or of the last one: one of them may have values that are refused.
-
-    Args:
-        mesh: the mesh.
-        base: the options of each run.
-        wanted: what was asked.
-        tell: called with each warning, and before something that takes long, such as compiling an FMU.
-
-    Raises:
-        ConfigurationError: neither can run; that of the first.
-    """
+    """The plan of the first variant, or of the last one: one of them may have values that are refused."""
     first: ConfigurationError | None = None
     for number in (0, len(wanted.variants) - 1):
         options = options_of_variant(base, mesh.instances, wanted.parameters(number))
@@ -238,17 +221,14 @@ def _identities(mesh: Mesh, plan: RunPlan, wanted: Wanted) -> tuple[str, ...]:
     """The id of each variant; where a parameter changes which models there are, their files are looked at, too."""
     contents: dict[tuple[Any, ...], Mapping[str, str]] = {}
     identities = []
-    for number, values in enumerate(wanted.variants):
+    of_models = [name for name in wanted.names if name.startswith("instances.") and "instances" not in mesh.instances]
+    for number in range(len(wanted.variants)):
         parameters = wanted.parameters(number)
-        models = tuple(str(value) for name, value in zip(wanted.names, values, strict=True) if _names_model(mesh, name))
+        models = tuple(str(parameters[name]) for name in of_models)
         if models not in contents:
             contents[models] = _contents(mesh, wanted, parameters) if models else plan.contents
         identities.append(identity_of(wanted, parameters, contents[models]))
     return tuple(identities)
-
-
-def _names_model(mesh: Mesh, name: str) -> bool:
-    return name.startswith("instances.") and "instances" not in mesh.instances
 
 
 def _contents(mesh: Mesh, wanted: Wanted, parameters: Parameters) -> Mapping[str, str]:
@@ -259,18 +239,13 @@ def _contents(mesh: Mesh, wanted: Wanted, parameters: Parameters) -> Mapping[str
 
 
 def _at_once(plan: RunPlan, most_instances: Mapping[str, int]) -> int | None:
-    """How many variants may be under way.
-
-    Raises:
-        ConfigurationError: no instance has such a model, or one variant needs more instances of it.
-    """
+    """How many variants may be under way; refuses a limit for no model, or one that a single variant exceeds."""
     limits = []
     models = [Path(own.fmu).name for own in plan.plan.system.instances.values() if own.fmu]
     for name, most in most_instances.items():
         needed = models.count(name)
         if not needed:
-            near = nearest(name, models)
-            hint = f"Did you mean '{near}'?" if near else f"There are {listed(sorted({*models}))}."
+            hint = did_you_mean(name, models, f"There are {listed(sorted({*models}))}.")
             raise ConfigurationError(f"no instance has the model '{name}'", hint=hint)
         if most < needed:
             text = f"one run needs {needed} instances of '{name}', and {most} may exist at a time"
@@ -290,7 +265,6 @@ def _usual_folder(mesh: Mesh, base: Mapping[str, Any]) -> Path:
 
 
 def _units(plan: RunPlan, names: Sequence[str]) -> dict[str, str | None]:
-    """The units of what is recorded, and of the parameters that are start values."""
     units = Result(plan.mesh, system=plan.plan.system).units
     for name in names:
         instance, _, variable = name.partition(".")
@@ -301,11 +275,7 @@ def _units(plan: RunPlan, names: Sequence[str]) -> dict[str, str | None]:
 
 
 def _column(function: Own) -> str:
-    """The name of the column of a function of the user.
-
-    Raises:
-        ConfigurationError: workers could not import it.
-    """
+    """The name of the column of a function of the user, which workers can import."""
     name = getattr(function, "__qualname__", "")
     if not name or "<" in name:
         found = f"the reduction '{name or type(function).__name__}' cannot be imported by the workers"

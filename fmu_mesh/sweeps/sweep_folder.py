@@ -26,8 +26,8 @@ from typing import Any, Final
 import msgspec
 
 from ..errors import ConfigurationError
-from ..files import decoded_json, is_file, replaced
-from .variant_run import Cell, Row, curves_of, path_of
+from ..files import decoded_json, is_file, replaced, write_whole
+from .variant_run import Cell, Common, Row, path_of
 from .variants import Parameters
 
 __all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
@@ -38,42 +38,28 @@ _TABLE: Final = "table.csv"
 _CURVES: Final = "runs"
 
 
-class Wanted(msgspec.Struct, frozen=True):
+class Wanted(Common, frozen=True, kw_only=True):
     """What was asked: `sweep.json`.
 
     Attributes:
-        version: version of fmu_mesh.
         mesh: name of the mesh.
-        file: file of the configuration, absolute.
-        data: the values of the configuration.
-        options: the options of each run that have another value than their default.
         names: names of the parameters.
         variants: for each variant the values of the parameters, in this order.
         recorded: names of the recorded variables.
-        reductions: columns that are calculated from the curves.
         identities: the id of each variant.
         units: unit of each recorded variable and of each parameter; None without one.
         curves: whether the curves of each run are kept.
-        processes: whether each run starts processes.
-        reset: whether instances are reset between two runs.
         most_instances: by the name of a model file, how many instances there may be at a time.
     """
 
-    version: str
     mesh: str
-    file: str
-    data: Any
-    options: dict[str, Any]
     names: tuple[str, ...]
     variants: tuple[tuple[Any, ...], ...]
     recorded: tuple[str, ...] = ()
-    reductions: tuple[str, ...] = ()
-    units: dict[str, str | None] = {}
+    units: dict[str, str | None] = msgspec.field(default_factory=dict)
     identities: tuple[str, ...] = ()
     curves: bool = True
-    processes: bool = False
-    reset: bool = False
-    most_instances: dict[str, int] = {}
+    most_instances: dict[str, int] = msgspec.field(default_factory=dict)
 
     def parameters(self, number: int) -> Parameters:
         """The parameters of a variant."""
@@ -81,53 +67,31 @@ class Wanted(msgspec.Struct, frozen=True):
 
 
 class SweepFolder:
-    """One folder; see above.
+    """One folder, which may not exist yet; see above.
 
-    Args:
-        path: the folder; it may not exist yet.
+    Attributes:
+        table: the file of the table.
+        curves: the folder of the curves.
+        wanted_file: the file that says what was asked.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-
-    @property
-    def table(self) -> Path:
-        """The file of the table."""
-        return self.path / _TABLE
-
-    @property
-    def curves(self) -> Path:
-        """The folder of the curves."""
-        return self.path / _CURVES
-
-    def curves_of(self, identity: str) -> Path:
-        """The file with the curves of a run."""
-        return curves_of(self.curves, identity)
-
-    @property
-    def wanted_file(self) -> Path:
-        """The file that says what was asked."""
-        return self.path / _WANTED
+        self.table = path / _TABLE
+        self.curves = path / _CURVES
+        self.wanted_file = path / _WANTED
 
     def begin(self, wanted: Wanted) -> None:
-        """Make the folder, and write down what is asked.
-
-        Raises:
-            ConfigurationError: it cannot be written.
-        """
+        """Make the folder, and write down what is asked."""
         try:
             (self.curves if wanted.curves else self.path).mkdir(parents=True, exist_ok=True)
-            with replaced(self.path / _WANTED) as draft:
+            with replaced(self.wanted_file) as draft:
                 draft.write_bytes(msgspec.json.format(msgspec.json.encode(wanted, enc_hook=str)))
         except OSError as error:
             raise self._unwritable(error) from error
 
     def clear(self) -> None:
-        """Remove what a sweep has written, and nothing else.
-
-        Raises:
-            ConfigurationError: another process adds rows, or a file cannot be removed.
-        """
+        """Remove what a sweep has written, and nothing else."""
         rows = [*self.path.glob(f"{_ROWS}*.jsonl")]
         for file in rows:
             RowFile(file).close()
@@ -144,7 +108,7 @@ class SweepFolder:
         Raises:
             ConfigurationError: there is no sweep in this folder, or another version has written it.
         """
-        file = self.path / _WANTED
+        file = self.wanted_file
         try:
             return decoded_json(file.read_bytes(), Wanted, path_of)
         except OSError as error:
@@ -162,11 +126,7 @@ class SweepFolder:
 
     @contextmanager
     def writing(self, part: int | None = None) -> Iterator[RowFile]:
-        """In the block, rows can be added; one process at a time may do so for each part.
-
-        Raises:
-            ConfigurationError: another process does so, or the file cannot be written.
-        """
+        """In the block, rows can be added; one process at a time may do so for each part."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -182,16 +142,7 @@ class SweepFolder:
         return ConfigurationError(f"the folder '{self.path}' cannot be written: {error.strerror}")
 
     def write_table(self, wanted: Wanted, rows: Sequence[Row | None], columns: Sequence[str]) -> None:
-        """Write the table; a variant without a row is left out.
-
-        Args:
-            wanted: what was asked.
-            rows: the row of each variant.
-            columns: what is calculated from the curves.
-
-        Raises:
-            ConfigurationError: it cannot be written.
-        """
+        """Write the table; a variant without a row is left out."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["variant", *wanted.names, "exit_code", "message", *columns, "id", "seconds", "worker"])
@@ -199,19 +150,11 @@ class SweepFolder:
             if row is not None:
                 cells = cells_of(wanted, number, row, columns) | {"seconds": f"{row.seconds:.4f}"}
                 writer.writerow(map(_cell, cells.values()))
-        try:
-            with replaced(self.table) as draft:
-                draft.write_text(text.getvalue(), encoding="utf-8")
-        except OSError as error:
-            raise ConfigurationError(f"the table '{self.table}' cannot be written: {error.strerror}") from error
+        write_whole(self.table, text.getvalue(), "the table ")
 
 
 class RowFile:
-    """A file to which rows are added.
-
-    Args:
-        path: the file.
-    """
+    """A file to which rows are added."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -232,11 +175,7 @@ class RowFile:
             self._write(b"\n")
 
     def add(self, row: Row) -> None:
-        """Add a row.
-
-        Raises:
-            ConfigurationError: the file cannot be written.
-        """
+        """Add a row."""
         self._write(json.dumps(msgspec.to_builtins(row)).encode() + b"\n")
 
     def close(self) -> None:
@@ -275,13 +214,7 @@ def is_sweep(path: Path) -> bool:
 
 
 def identity_of(wanted: Wanted, parameters: Parameters, contents: Mapping[str, str]) -> str:
-    """The id of a variant: the same configuration, options, parameters and models have the same one.
-
-    Args:
-        wanted: what was asked.
-        parameters: those of the variant.
-        contents: SHA-256 of the model of each instance.
-    """
+    """The id of a variant: the same configuration, options, parameters and SHA-256 of models have the same one."""
     options = {name: value for name, value in wanted.options.items() if name != "allow_code"}  # not what is calculated
     asked = [wanted.data, options, sorted(parameters.items()), sorted(contents.items())]
     return hashlib.sha256(msgspec.json.encode(asked, enc_hook=str)).hexdigest()[:16]

@@ -24,7 +24,6 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
 from ..api.mesh_builder import Mesh
@@ -56,12 +55,7 @@ _GUARD: Final = 'Write `if __name__ == "__main__":` before what your program doe
 
 
 class SweepPart(NamedTuple):
-    """One of several parts of a sweep, such as a task of an array of jobs.
-
-    Attributes:
-        number: from 1 on.
-        of: how many there are.
-    """
+    """One of several parts of a sweep, numbered from 1 on, such as a task of an array of jobs."""
 
     number: int
     of: int
@@ -98,10 +92,6 @@ class Sweep(ABC):
         ...     result = running.wait()
         ...     running.progress.done, running.progress.total, len(result)
         (4, 4, 4)
-
-    Args:
-        planned: the sweep.
-        part: which part of the variants runs here; None: all.
     """
 
     def __init__(self, planned: PlannedSweep, part: SweepPart | None = None) -> None:
@@ -123,9 +113,7 @@ class Sweep(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -253,14 +241,7 @@ class Sweep(ABC):
 
 
 class ExecutorSweep(Sweep):
-    """A sweep whose variants run on an executor.
-
-    Args:
-        planned: the sweep.
-        executor: where variants run; it is not shut down here. None: processes of this host.
-        workers: number of these processes; None: one for each processor.
-        part: which part of the variants runs here; None: all.
-    """
+    """A sweep whose variants run on an executor, which is not shut down here, or in as many processes of this host."""
 
     def __init__(
         self,
@@ -272,9 +253,10 @@ class ExecutorSweep(Sweep):
     ) -> None:
         super().__init__(planned, part)
         self._executor = executor
-        self._workers = max(
-            1, min(workers or usual_workers(planned), len(self._waiting), planned.at_once or len(self._waiting))
-        )
+        if not workers:  # one for each processor that this process may use; fewer where a run has several processes
+            processes = len(planned.plan.plan.nodes) + 1 if planned.wanted.processes else 1
+            workers = len(os.sched_getaffinity(0)) // processes
+        self._workers = max(1, min(workers, len(self._waiting), planned.at_once or len(self._waiting)))
         self._tries: Counter[int] = Counter()
         self._ended: SimpleQueue[Future[Row]] = SimpleQueue()
         self._thread.start()
@@ -338,11 +320,7 @@ class ExecutorSweep(Sweep):
         return future
 
     def _row_of(self, future: Future[Row], number: int) -> Row | None:
-        """The row of a variant that has ended; None if it runs again, because its worker was lost.
-
-        Raises:
-            MeshLost: the executor runs nothing any more.
-        """
+        """The row of a variant that has ended; None if it runs again, because its worker was lost."""
         try:
             return future.result()
         except Exception as error:  # noqa: BLE001  `run_variant` itself raises nothing
@@ -401,9 +379,3 @@ def sweep(
         raise CallRefused(text, hint=_GUARD)
     planned = planned_sweep(mesh, vary, **options.given())
     return ExecutorSweep(planned, executor=options.executor, workers=options.workers)
-
-
-def usual_workers(planned: PlannedSweep) -> int:
-    """One worker for each processor that this process may use; fewer where a run has several processes."""
-    processors = len(os.sched_getaffinity(0))
-    return processors // (len(planned.plan.plan.nodes) + 1) if planned.wanted.processes else processors

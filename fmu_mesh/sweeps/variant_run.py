@@ -27,13 +27,12 @@ from ..api.mesh_builder import Mesh
 from ..api.repeated_mesh import RepeatedMesh
 from ..api.result import Result
 from ..config.loading import PlainConfig
-from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, NotInOneProcess, from_report
 from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
 
-__all__ = ["Row", "SweepTask", "curves_of", "encoded_task", "options_of_variant", "path_of", "run_variant"]
+__all__ = ["Common", "Row", "SweepTask", "curves_of", "options_of_variant", "path_of", "run_variant"]
 
 _GROWTH_BYTES = 256 * 2**20
 
@@ -44,29 +43,37 @@ OwnReductions = Mapping[str, Callable[[Result], object]]
 """Functions of the user by the name of their column."""
 
 
-class SweepTask(msgspec.Struct, frozen=True):
+class Common(msgspec.Struct, frozen=True, kw_only=True):
     """What all variants of a sweep have in common.
 
     Attributes:
         version: that of fmu_mesh, which all workers must have.
+        file: the file of the configuration, absolute.
         data: the values of the configuration.
-        file: the file of the configuration.
-        foreign: as in `PlainConfig`.
-        options: the options of each run.
-        reductions: what is calculated from the curves of each run.
-        curves: the folder for the curves of each run; None: they are not kept.
+        options: the options of each run that have another value than their default.
+        reductions: columns that are calculated from the curves of each run.
         processes: whether each run starts processes, as `launch` does.
         reset: whether instances are reset between two runs, and not made anew.
     """
 
     version: str
+    file: str
     data: Any
-    file: Path
     options: dict[str, Any]
     reductions: tuple[str, ...] = ()
-    curves: Path | None = None
     processes: bool = False
     reset: bool = False
+
+
+class SweepTask(Common, frozen=True, kw_only=True):
+    """What every worker gets.
+
+    Attributes:
+        folder: for the curves of each run; None: they are not kept.
+        foreign: as in `PlainConfig`.
+    """
+
+    folder: Path | None = None
     foreign: str = ""
 
 
@@ -95,19 +102,8 @@ class Row(msgspec.Struct, frozen=True):
     machine: str = ""
 
 
-def encoded_task(task: SweepTask) -> bytes:
-    """A task for `run_variant`."""
-    return msgspec.msgpack.encode(task, enc_hook=str)
-
-
 def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:
-    """The options of the run of one variant.
-
-    Args:
-        options: those of each run.
-        instances: names of the instances of the mesh.
-        parameters: `instance.variable` is a start value, and any other name a key of the configuration.
-    """
+    """The options of a variant: `instance.variable` is a start value, any other name a key of the configuration."""
     start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
     keys = {name: value for name, value in parameters.items() if name not in start}
     own = {"start_values": start, "config_values": keys}
@@ -116,12 +112,6 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
 
 def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
     """Run one variant. Called in a worker, by whichever executor.
-
-    Args:
-        task: what `encoded_task` returned.
-        functions: reductions that are functions of the user.
-        identity: `Row.id`.
-        parameters: the parameters of this variant.
 
     Returns:
         The row; also of a run that failed.
@@ -157,7 +147,6 @@ class _Mine(threading.local):
         self._loaded: _Loaded | None = None
 
     def loaded_for(self, task: bytes) -> _Loaded:
-        """The models of a task."""
         if self._loaded is None or self._loaded.task != task or self._loaded.stuck:
             self._loaded = _Loaded(task)
         return self._loaded
@@ -173,8 +162,10 @@ class _Loaded:
         self.task = task
         self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
         self._reductions = [read_reduction(text) for text in self._task.reductions]
-        data, file, foreign = _with_one_record(self._task.data), self._task.file, self._task.foreign
-        self._mesh = Mesh.from_configuration(PlainConfig(data, file, foreign=foreign))
+        data = self._task.data
+        if isinstance(data, dict) and isinstance(records := data.get("record"), list):
+            data = {**data, "record": records[:1]}  # variants must not write into the same files
+        self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self.hung = _Hung()
         self._bytes = 0
@@ -196,17 +187,12 @@ class _Loaded:
         return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
 
     def run(self, identity: str, parameters: Parameters) -> Result:
-        """Run a variant.
-
-        Raises:
-            FmuMeshError: it failed.
-        """
         task = self._task
         if task.version != __version__:
             raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
         options = options_of_variant(task.options, self._mesh.instances, parameters)
-        if task.curves is not None:
-            options["output"] = curves_of(task.curves, identity)
+        if task.folder is not None:
+            options["output"] = curves_of(task.folder, identity)
         else:
             options["record"] = "memory"
         if not task.processes:
@@ -217,11 +203,7 @@ class _Loaded:
         return self._mesh.run(**options)
 
     def values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
-        """What the row of a variant has of its result.
-
-        Raises:
-            FmuMeshError: a reduction failed.
-        """
+        """What the row of a variant has of its result."""
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
         for name, function in functions.items():
             try:
@@ -253,7 +235,6 @@ class _Hung:
         self._end: Result | BaseException | None = None
 
     def begin(self, ended: Future[Result]) -> None:
-        """A run begins."""
         self.ended, self._end = ended, None
 
     def over(self, end: Result | BaseException) -> None:
@@ -273,7 +254,8 @@ class _Hung:
 
 def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
-    with RepeatedMesh(mesh, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
+    own = mesh.from_configuration(mesh.configuration, keeps_code=True)
+    with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
             hung.begin(job.ended)
             try:
@@ -288,13 +270,6 @@ def curves_of(folder: Path, identity: str) -> Path:
     return folder / f"{identity}.csv"
 
 
-def _with_one_record(data: Plain) -> Plain:
-    """A configuration that records the first section only: variants must not write into the same files."""
-    if not isinstance(data, dict) or not isinstance(records := data.get("record"), list):
-        return data
-    return {**data, "record": records[:1]}
-
-
 def path_of(type_: type, value: object) -> object:
     """The `dec_hook` of msgspec for what holds a path, which is written as text."""
     if type_ is Path:
@@ -303,11 +278,7 @@ def path_of(type_: type, value: object) -> object:
 
 
 def _cell(value: object) -> Cell:
-    """A value of a function of the user as the table has it.
-
-    Raises:
-        TypeError: it is no single value.
-    """
+    """A value of a function of the user as the table has it."""
     plain = value.item() if isinstance(value, np.generic | np.ndarray) else value
     if isinstance(plain, bytes):
         return base64.b64encode(plain).decode()

@@ -249,7 +249,7 @@ def _listed_values(values: Values) -> Sequence[PlainValue] | None:
 # --- samplers
 
 
-def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
+def _shares(sampler: str, dimensions: int, seed: object) -> NDArray[np.float64]:
     """Numbers from 0 to 1, shape `(count, dimensions)`."""
     found = _SAMPLER.fullmatch(sampler)
     name, count = (found[1], int(found[2])) if found is not None else (sampler.partition(":")[0], 0)
@@ -263,19 +263,15 @@ def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
         below = 1 << (count.bit_length() - 1)
         hint = f"Choose {below} or {2 * below}, or halton:{count}."
         raise ConfigurationError(f"'{sampler}': a Sobol sequence is balanced only for a power of 2.", hint=hint)
-    generator = _generator(seed)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ConfigurationError(f"the seed {shown(seed)} is no whole number of at least 0.")
+    generator = np.random.default_rng(seed)
     if name == "random":
         return generator.random((count, dimensions))
     with importing("scipy", f"samplers other than random:{count}"):
         from scipy.stats import qmc  # noqa: PLC0415  an extra, and slow to import
     shares: NDArray[np.float64] = getattr(qmc, SAMPLERS[name])(dimensions, seed=generator).random(count)
     return shares
-
-
-def _generator(seed: object) -> np.random.Generator:
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigurationError(f"the seed {shown(seed)} is no whole number of at least 0.")
-    return np.random.default_rng(seed)
 
 
 def _scaled(span: Range, shares: NDArray[np.float64]) -> NDArray[np.float64]:

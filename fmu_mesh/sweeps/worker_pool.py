@@ -41,9 +41,7 @@ T = TypeVar("T")
 class WorkerLost(MeshLost):
     """The process that was running a variant has ended: it was killed, or an FMU crashed it.
 
-    Args:
-        message: how it ended.
-        began: whether it was ready to run anything.
+    ``began`` says whether it was ready to run anything.
     """
 
     def __init__(self, message: str, *, began: bool) -> None:
@@ -56,9 +54,6 @@ class WorkerPool(Executor):
 
     A job whose process is lost raises `WorkerLost`; jobs that waited for that process run in its successor. `submit`
     may be called on one thread at a time.
-
-    Args:
-        workers: how many processes.
     """
 
     def __init__(self, workers: int) -> None:
@@ -134,7 +129,6 @@ class _Worker:
         return started[-1].pid if started else None
 
     def submit(self, function: Callable[[], T]) -> Future[T]:
-        """Add a job."""
         job = _Job(function, Future())
         with self._changing:
             self.jobs.append(job)
@@ -142,7 +136,6 @@ class _Worker:
         return job.future
 
     def replace(self) -> None:
-        """End the process."""
         with self._changing:
             if self._closed:
                 return
@@ -155,7 +148,6 @@ class _Worker:
         old.shutdown(wait=False, cancel_futures=True)
 
     def shutdown(self, *, wait: bool, now: bool) -> None:
-        """End the process."""
         with self._changing:
             self._closed = True
             jobs = list(self.jobs) if now else []
@@ -222,7 +214,6 @@ class _Context(ForkServerContext):
         return self.started[-1]
 
     def kill(self) -> None:
-        """Kill the process."""
         for process in self.started:
             with suppress(ValueError):  # it is closed
                 process.kill()

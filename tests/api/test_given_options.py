@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 import fmu_mesh
-from fmu_mesh.api.simulate_options import SimulateOptions
 from fmu_mesh.config.call_options import CallOptions, option_fields
-from fmu_mesh.run.options import OpenOptions, PlanOptions, RunOptions
+from fmu_mesh.run.options import OpenOptions, PlanOptions, RunOptions, SimulateOptions
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 from tests.helpers import FMUS, write_config
 

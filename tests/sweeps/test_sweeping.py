@@ -20,6 +20,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
+from fmu_mesh.sweeps.variant_run import curves_of
 from fmu_mesh.sweeps.worker_pool import WorkerLost, WorkerPool
 from fmus.build import build
 from tests.fmus.helpers import NO_COMPILER
@@ -96,14 +97,19 @@ def test_models_that_a_thread_has_loaded_go_with_the_thread(config: Path, tmp_pa
 
 def test_a_sweep_in_processes_has_the_rows_of_one_in_one_process(config: Path, tmp_path: Path) -> None:
     found = {}
+    told: list[str] = []
     for processes in (False, True):
-        with fmu_mesh.sweep(
-            config, {"pendulum.d": [0.1, 0.4]}, processes=processes, folder=tmp_path / f"{processes}"
-        ) as running:
+        options: dict[str, Any] = {
+            "processes": processes,
+            "folder": tmp_path / f"{processes}",
+            "on_notice": told.append,
+        }
+        with fmu_mesh.sweep(config, {"pendulum.d": [0.1, 0.4]}, **options) as running:
             found[processes] = running.wait(DEADLINE_S)
 
     assert contents(found[True]) == contents(found[False])
     assert [row.values for row in found[True]] == [row.values for row in found[False]]
+    assert sum("goes in two versions: leave it out" in text for text in told) == 1
 
 
 def test_rows_and_progress_are_there_while_the_sweep_goes_on(faulty: Path, tmp_path: Path) -> None:
@@ -263,7 +269,7 @@ def test_resume_runs_what_is_missing_and_the_table_is_the_same(config: Path, tmp
     (folder.path / "rows.jsonl").write_bytes(torn)  # killed while it wrote the sixth row
     identities = SweepFolder(folder.path).wanted().identities
     lost = next(identity for identity in identities if identity in torn.decode())
-    folder.curves_of(lost).unlink()
+    curves_of(folder.curves, lost).unlink()
 
     with fmu_mesh.sweep(config, VARY, reduce=REDUCE, folder=folder.path, resume=True) as running:
         result = running.wait(DEADLINE_S)

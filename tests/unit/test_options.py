@@ -254,7 +254,6 @@ def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
 
 
 SPELLS_FLAGS = {
-    "api/simulate_options.py": "as run/options.py, for `simulate`",
     "run/options.py": "it says how the command line spells them",
     "sweeps/slurm.py": "options of sbatch",
     "sweeps/slurm_sweep.py": "a command that the tasks of a job run",
@@ -298,6 +297,6 @@ def test_the_options_of_a_bag_are_checked_before_it_is_played() -> None:
     run = cast("Run", None)  # not reached
 
     with pytest.raises(CallRefused, match="Did you mean `topics`"):
-        Run.play(run, "bag.mcap", topic=["/a=b.c"])  # type: ignore[call-arg]  # what is to be refused
+        Run.play(run, "bag.mcap", topic=["/a=b.c"])  # type: ignore[call-arg]  # as above
     with pytest.raises(CallRefused, match="`stamps='sent'`: expected 'header', 'log'"):
         Run.play(run, "bag.mcap", stamps="sent")  # type: ignore[arg-type]  # as above

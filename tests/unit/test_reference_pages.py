@@ -10,12 +10,11 @@ from types import ModuleType
 
 import pytest
 
-from fmu_mesh.api.simulate_options import SimulateOptions
 from fmu_mesh.cli.main import COMMANDS
 from fmu_mesh.config.call_options import CallOptions, option_fields
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import check
-from fmu_mesh.run.options import RunOptions
+from fmu_mesh.run.options import RunOptions, SimulateOptions
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 ROOT = Path(__file__).resolve().parents[2]

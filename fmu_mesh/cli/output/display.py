@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cached_property
-from types import TracebackType
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
-from ...errors import FmuMeshError, from_report
+from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
 from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
@@ -19,7 +18,7 @@ from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
-from .progress import RunProgressLine
+from .progress import ProgressLine, progress_parts
 from .terminal import error_console, say
 
 if TYPE_CHECKING:
@@ -39,20 +38,18 @@ _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red"
 
 
 class Display:
-    """Shows the events of a run on standard error.
+    """Shows the events of a run on standard error; if it is quiet, only errors, and what processes of the run write.
 
-    Args:
-        plan: the plan of the run.
-        show_progress: whether to draw the progress line, if standard error is a terminal.
-        quiet: show nothing but errors, and what processes of the run write themselves.
-        waits_for_nodes: whether the address is shown only when all instances answer. Nodes that are started manually
-            need it earlier.
+    ``waits_for_nodes`` shows the address only when all instances answer: nodes that are started manually need it
+    earlier.
     """
 
     def __init__(self, plan: Plan, *, show_progress: bool, quiet: bool = False, waits_for_nodes: bool = True) -> None:
         self._plan = plan
         self._quiet = quiet
-        self._progress = RunProgressLine(plan, lambda: self._console, show=show_progress and not quiet)
+        last = plan.grid.last_point if plan.grid.stop_time is not None else None
+        console = (lambda: self._console) if show_progress and not quiet else None
+        self._progress = ProgressLine(plan.system.config.mesh, last, partial(progress_parts, plan.grid), console)
         self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()
@@ -67,9 +64,7 @@ class Display:
         self._progress.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._progress.stop()
         self._over = True  # what an FMU of this process says now is said in its last functions
         self.flush(str(error or ""))
@@ -92,8 +87,8 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
-            case OutputLine(process, text):
-                self._output(process, text)
+            case OutputLine(process, text) if text:
+                self._print(printable(text.expandtabs()), front=f"{process} | ")
             case Restarted(error, number, most):
                 again = f"The run starts again from its first point (restart {number} of {most})."
                 say(str(from_report(error).instead_of_hint(again)))
@@ -120,13 +115,9 @@ class Display:
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
         if outcome.ended_by is not None and not self._quiet:
-            self.ended(from_report(outcome.ended_by))
+            self._print(str(from_report(outcome.ended_by)))
         for warning in outcome.warnings if outcome.state == "failed" else ():
             say(f"warning: {warning}")
-
-    def ended(self, early: FmuMeshError) -> None:
-        """Show why a run ended before its last point without a failure."""
-        self._print(str(early))
 
     def log(self, line: LogLine) -> None:
         """Show one log message of an FMU. After five times, the same text is only counted.
@@ -167,11 +158,6 @@ class Display:
         where = f"{line.instance} at point {line.point}"
         self._print(f"{where}: {paragraph(line.message)}", style)
 
-    def _output(self, name: str, text: str) -> None:
-        """Show a line of the output of a process."""
-        if text:
-            self._print(printable(text.expandtabs()), front=f"{name} | ")
-
     def _print(self, text: str, style: str = "", *, front: str = "") -> None:
         """Print printable text, after a dim ``front``; nobody needs it so much that a full disk ends the run."""
         from rich.text import Text  # noqa: PLC0415 as `_console`
@@ -180,7 +166,7 @@ class Display:
             self._console.print(Text.assemble((front, "dim"), (text, style)), soft_wrap=True)
 
     def _status(self, status: MeshStatus) -> None:
-        self._progress.status(status)
+        self._progress.update(status.point, status)
         if status.state in ("running", "paused", "stopping", "done"):
             self._show_address()
         if status.state == "paused":

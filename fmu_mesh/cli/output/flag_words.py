@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
-from ...api.simulate_options import SimulateOptions
 from ...config.call_options import option_fields
-from ...run.options import RunOptions
+from ...run.options import RunOptions, SimulateOptions
 from ...sweeps.sweep_options import SweepOptions
 
 __all__ = ["in_flags"]
@@ -45,5 +44,4 @@ def _flag(name: str, value: str | None) -> str:
 
 
 def _value(text: str) -> str:
-    """A value as the command line takes it."""
     return text.strip("[]'").replace("', '", ", ").removesuffix(".0")

@@ -7,21 +7,23 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack, redirect_stdout
-from types import TracebackType
 from typing import Literal, Self
 
 import msgspec
 from msgspec.structs import replace
 
-from ...api.plan_options import memory_of
 from ...errors import ErrorReport, FmuMeshError
 from ...run.events import Event, Restarted
 from ...run.outcome import Outcome
+from ...run.overriding import memory_of
 from ...run.run_plan import RunPlan
 from .json_output import Failure, failure_of, print_json
 from .terminal import stdout_as_stderr
 
 __all__ = ["RunReport", "RunReporter"]
+
+
+_AS_THE_OUTCOME = ("point", "time", "seconds", "rows", "file", "ended_by", "warnings")
 
 
 class ReportedFile(msgspec.Struct, frozen=True):
@@ -66,11 +68,7 @@ class RunReport(msgspec.Struct, frozen=True):
 
 
 class RunReporter:
-    """Prints a `RunReport` at the end of the block; in the block, standard output goes to standard error.
-
-    Args:
-        wanted: whether to do so; otherwise nothing happens.
-    """
+    """If ``wanted``, prints a `RunReport` at the end of the block; in it, standard output goes to standard error."""
 
     def __init__(self, *, wanted: bool) -> None:
         self._wanted = wanted
@@ -85,9 +83,7 @@ class RunReporter:
             self._stack.enter_context(redirect_stdout(sys.stderr))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._stack.close()
         if self._wanted:
             print_json(self._report(error))
@@ -116,14 +112,8 @@ class RunReporter:
             mesh=self._run.mesh if self._run is not None else None,
             state="failed" if failure is not None else outcome.state,
             exit_code=failure.exit_code if failure is not None else 0,
-            point=outcome.point,
-            time=outcome.time,
-            seconds=outcome.seconds,
-            rows=outcome.rows,
-            file=outcome.file,
             restarts=self._restarts,
             error=failure,
-            ended_by=outcome.ended_by,
             files=tuple(ReportedFile(*own) for own in outcome.files),
-            warnings=outcome.warnings,
+            **{name: getattr(outcome, name) for name in _AS_THE_OUTCOME},
         )

@@ -54,16 +54,12 @@ class Histories:
         return list(self._newest.values())
 
     def lines(self, width: int | None = None, signs: str = BLOCKS) -> list[str]:
-        """A line for each variable.
-
-        Args:
-            width: largest width in columns; None: no limit, and a sparkline of at most 40 values.
-            signs: what a sparkline is drawn with, from the least to the greatest.
-        """
-        rows = [
-            (name, _range(self._values[name]), f"{_text(sample.value)} {sample.unit or ''}".rstrip())
-            for name, sample in self._newest.items()
-        ]
+        """A line for each variable, in at most ``width`` columns; without a width, of at most 40 values."""
+        rows = []
+        for name, sample in self._newest.items():
+            finite = [value for value in self._values[name] if math.isfinite(value)]
+            range_ = f"{min(finite):.4g}..{max(finite):.4g}" if finite else ""
+            rows.append((name, range_, f"{_text(sample.value)} {sample.unit or ''}".rstrip()))
         if not rows:
             return []
         names, ranges, values = (max(len(row[column]) for row in rows) for column in range(3))
@@ -90,10 +86,6 @@ def sparkline(values: Sequence[float], signs: str = BLOCKS) -> str:
     Example:
         >>> sparkline([0.0, 1.0, 2.0, 3.0, 2.0])
         '▁▃▆█▆'
-
-    Args:
-        values: the oldest first.
-        signs: from the least to the greatest.
     """
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
@@ -114,12 +106,6 @@ def sparkline_signs(encoding: str | None) -> str:
     except (UnicodeEncodeError, LookupError):
         return PLAIN
     return BLOCKS
-
-
-def _range(values: Iterable[float]) -> str:
-    """Such as `-1.2..3.4`; empty without a finite value."""
-    finite = [value for value in values if math.isfinite(value)]
-    return f"{min(finite):.4g}..{max(finite):.4g}" if finite else ""
 
 
 def _text(value: Any) -> str:  # noqa: ANN401  the value of any variable

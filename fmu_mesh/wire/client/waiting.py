@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
+from itertools import groupby
 from typing import Final
 
 from msgspec.structs import replace
 
-from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
+from ...errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
+from ..messages import SetValue
 from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .reaching import Meshes
+from .readings import Target
 
-__all__ = ["appearance", "go_on", "paused_at", "rest", "wait_for", "wait_for_start", "wait_until_at"]
+__all__ = ["appearance", "go_on", "paused_at", "replay", "rest", "wait_for", "wait_for_start", "wait_until_at"]
 
 _START_S: Final = 120.0
 
@@ -32,6 +36,8 @@ _RANKS: Final[dict[MeshState, int]] = {
 }
 _GOES_AND_RESTS: Final = 2
 """Running and paused have the same rank: a mesh can change from each of them to the other."""
+# How long an instance may stay at one point before it has come to the next value of a replay.
+_NEXT_VALUE_S: Final = 60.0
 
 
 def rest(client: MeshClient, command: Command) -> CommandAnswer:
@@ -172,3 +178,34 @@ def _ended(status: MeshStatus, what: str) -> FmuMeshError:
 
 def _gone(mesh: str, what: str) -> MeshLost:
     return MeshLost(f"mesh '{mesh}' is gone, and does not {what} any more")
+
+
+def replay(client: MeshClient, values: Sequence[SetValue], last_point: int | None) -> None:
+    """Set all values, and let the mesh run on, or to ``last_point``, where it pauses.
+
+    Raises:
+        CallRefused: a value was refused.
+        MeshLost: the mesh has ended, or another program controls it too.
+        DeadlineExceeded: an instance does not come to the point of a value.
+    """
+    hold = paused_at(client, Command("pause"))
+    targets: dict[str, Target] = {}
+    for point, together in groupby(sorted(values, key=lambda value: value.point), key=lambda value: value.point):
+        hold = go_on(client, hold, point)
+        for value in together:
+            name = f"{value.instance}.{value.variable}"
+            if hold != point:
+                raise MeshLost(f"the mesh is at point {hold}, and '{name}' was set at point {point}.")
+            if name not in targets:
+                targets[name] = client.target(name)
+            wait_until_at(client, value.instance, point, _NEXT_VALUE_S)
+            try:
+                client.set(targets[name], value.value, value.time)
+            except ConfigurationError as error:
+                raise CallRefused(
+                    error.message, instance=value.instance, variable=value.variable, hint=error.hint
+                ) from error
+    if last_point is None:
+        client.command(Command("resume"))
+        return
+    rest(client, Command("step", last_point - hold) if last_point > hold else Command("pause"))
