@@ -5,10 +5,27 @@ then forks a process for each request of its launcher. It loads no model. A fork
 shares the memory of all imported modules with the others.
 
 Launcher and server share a pair of sockets. A request has the arguments of `fmu_mesh.run.__main__`, and two descriptors
-for standard output and standard error. The server answers with the process id, and later with the exit code. It leaves
-an ended process as a zombie until the launcher knows the code, so that no other process can get its id before. When the
+for standard output and standard error. The server answers with the process id, and later with the exit code. When the
 launcher sends no more requests, the server ends after its last process.
 """
+
+# Who meets here (ADR 71). In the launcher: the thread of `Launcher.run`, which asks for processes, the thread "fork
+# server" of `ForkServer`, which takes what the server answers, and for each process the thread of `Child` that waits
+# for its end. `Forked` is what they share: each field is written by one of them, and the end is an `Event`. In the
+# server: one thread, because only the thread that forks is there in the new process, and every lock that another one
+# held would stay locked.
+#
+# Signals. SIGCHLD, SIGTERM and SIGINT of the server only write a byte into a pipe (the wakeup descriptor): the loop
+# reads it between two requests, so no handler ever runs in the middle of a fork. They are blocked around `os.fork`: a
+# signal for the server must not run its handler in the new process. The kernel signals the death of the launcher's
+# thread to the server, and the death of the server to all it has forked.
+#
+# What may go wrong. The server is killed: nobody can tell exit codes any more, so each `Forked` becomes an orphan, and
+# the code says that another process is missing. The server is stopped: it tells nothing, so `Forked.poll` asks the
+# kernel as well; and where the launcher is killed then, SIGTERM would wait in the server for ever. So the server has
+# SIGKILL for that until it forks, and afterwards a process whose standard input has ended wakes it
+# (`fmu_mesh.run.process`). A process ends: it stays a zombie until the launcher knows its code, or another process
+# could get its id, and a signal that was meant for it.
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from ..wire.runtime import remove_stale_folders, run_folder, run_name
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, Log, Status
 from .local import LocalMesh
-from .outcome import Outcome
+from .outcome import Outcome, outcome_at
 from .run_plan import RunPlan
 
 __all__ = ["InProcessRun"]
@@ -70,7 +70,9 @@ class InProcessRun:
         self._over.wait()
         if self._error is not None:
             if isinstance(self._error, FmuMeshError):
-                self.outcome = self._failed(self._error)
+                mesh = self._mesh
+                point, files, warnings = (mesh.point, mesh.files, mesh.warnings) if mesh is not None else (0, (), ())
+                self.outcome = outcome_at(self._run.plan, point, files, self._error, warnings=warnings)
                 self._on_event(self.outcome)
             raise self._error
         assert self.outcome is not None
@@ -146,14 +148,6 @@ class InProcessRun:
         if self._folder is not None:
             remove_tree(self._folder)
         self._over.set()
-
-    def _failed(self, error: FmuMeshError) -> Outcome:
-        plan, mesh = self._run.plan, self._mesh
-        point, files = (mesh.point, mesh.files) if mesh is not None else (0, ())
-        file, rows = plan.system.result_file, files[0][1] if files else 0
-        warnings = mesh.warnings if mesh is not None else ()
-        time_s, report = plan.grid.time(point), error.report()
-        return Outcome("failed", point, time_s, 0.0, rows, file, report, files=files, warnings=warnings)
 
     def _log(self, message: LogMessage) -> None:
         point = self._mesh.point if self._mesh is not None else 0

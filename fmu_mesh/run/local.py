@@ -30,7 +30,7 @@ from ..system.layout import Layout
 from ..system.plan import Plan
 from .local_system import LocalSystem, opening_of
 from .one_process import OneProcess
-from .outcome import Outcome
+from .outcome import Outcome, outcome_at
 from .results import open_results, what_is_kept
 
 __all__ = ["LocalMesh"]
@@ -139,18 +139,8 @@ class LocalMesh:
         finally:
             if closes:
                 self.close()
-        ended_by = self._ended_by.report() if self._ended_by is not None else None
-        return Outcome(
-            state="done",
-            point=self.point,
-            time=self._plan.grid.time(self.point),
-            seconds=self._seconds,
-            rows=self.files[0][1] if self.files else 0,
-            file=self._plan.system.result_file,
-            ended_by=ended_by,
-            files=self.files,
-            warnings=self.warnings,
-        )
+        end, files, warnings = self._ended_by, self.files, self.warnings
+        return outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
 
     def close(self) -> None:
         """Close the instances and remove their files. May be called twice."""

@@ -13,7 +13,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
+from msgspec.structs import replace
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
@@ -30,7 +30,7 @@ from ..wire.session import RouterLink, close_session, is_socket, open_session, o
 from ..wire.views import LogLine, MeshStatus
 from .child import is_other_python
 from .events import Event, Log, Reachable, Status
-from .outcome import Outcome
+from .outcome import Outcome, outcome_at
 from .process import RunProcess
 from .results import open_results
 from .run_plan import MANUAL, NodeRun, RunPlan
@@ -75,7 +75,7 @@ class _NodeProcess:
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
         publishes = f"{Keys(plan.key_prefix, plan.mesh).root}/**"
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
-        own = msgspec.structs.replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
+        own = replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
         session = open_session(own)
         process.stack.callback(close_session, session)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
@@ -175,7 +175,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             process.stack.callback(master.close)
             master.claim()
         except FmuMeshError as error:  # before the first point, such as at a port that is in use
-            emit(Outcome("failed", 0, plan.grid.time(0), 0.0, 0, plan.system.result_file, error.report()))
+            emit(outcome_at(plan, 0, error=error))
             raise
         endpoints, file = settings.endpoints, settings.config_file
         if not process.is_child:
@@ -229,22 +229,17 @@ def _settings(run: RunPlan, process: RunProcess, own: tuple[str, ...]) -> Master
 def _outcome_of(
     run: RunPlan, master: Master, recorder: Recorder | None, error: FmuMeshError | None, signal: str | None
 ) -> Outcome:
-    status = master.last_status()
-    files = recorder.files if recorder is not None else ()
-    return Outcome(
-        state="done" if error is None else "failed",
-        point=status.point,
-        time=status.time,
+    files, warnings = (recorder.files, recorder.warnings) if recorder is not None else ((), ())
+    outcome = outcome_at(
+        run.plan,
+        master.last_status().point,
+        files,
+        error,
+        master.ended_by if error is None else None,
         seconds=master.seconds,
-        rows=files[0][1] if files else 0,
-        file=run.plan.system.result_file,
-        error=error.report() if error is not None else None,
-        ended_by=master.ended_by.report() if master.ended_by is not None and error is None else None,
-        profile=master.profile(),
-        signal=signal,
-        files=files,
-        warnings=(*(recorder.warnings if recorder is not None else ()), *master.warnings),
+        warnings=(*warnings, *master.warnings),
     )
+    return replace(outcome, profile=master.profile(), signal=signal)
 
 
 class _Emitter:
