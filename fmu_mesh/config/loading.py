@@ -99,10 +99,6 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         """An empty collection of findings about this file."""
         return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
 
-    def locate(self, path: str) -> int | None:
-        """The line of ``path``, or of the innermost part of the file around it that has one."""
-        return self.origin(path).line
-
     def origin(self, path: str) -> ValueOrigin:
         """Where the value at ``path`` comes from: a file and a line of it, or an option."""
         return located(path, str(self.file), self.lines, self.overrides, self.origins)

@@ -45,7 +45,7 @@ class LocalMesh:
     """Runs a plan in this process, as fast as its real-time factor allows.
 
     ```python
-    outcome = LocalMesh(prepare(Path("configs/pendulum_delay.yaml"))).run()
+    outcome = LocalMesh(fmu_mesh.load("configs/pendulum_delay.yaml").plan().plan).run()
     print(outcome.point, outcome.file)
     ```
 

@@ -22,8 +22,7 @@ from ..instances.configuration import examine_data
 from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, claims, content, describe, expected_model
-from ..ssp.configuration_files import read_configuration
-from ..system.plan import Plan, make_plan
+from ..system.plan import make_plan
 from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
 from ..system.scenario import Scenario
@@ -35,7 +34,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "plan_run", "planned", "prepare"]
+__all__ = ["KnownModels", "planned"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -101,33 +100,6 @@ class KnownModels:
         if len(self._models) > _MOST_KNOWN:
             del self._models[next(iter(self._models))]
         return found
-
-
-def prepare(
-    path: Path,
-    options: PlanOptions = PlanOptions(),  # noqa: B008 a frozen Struct
-    tell: Callable[[str], None] = lambda _text: None,
-) -> Plan:
-    """As `plan_run`, for callers that need only the plan of the mesh."""
-    return plan_run(path, options, tell).plan
-
-
-def plan_run(
-    path: Path,
-    options: PlanOptions = PlanOptions(),  # noqa: B008 a frozen Struct
-    tell: Callable[[str], None] = lambda _text: None,
-) -> RunPlan:
-    """Read, check and plan the configuration at ``path``.
-
-    Args:
-        path: the YAML file, or a package of SSP.
-        options: what replaces values of the file.
-        tell: called before something that takes long, such as compiling an FMU.
-
-    Raises:
-        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
-    """
-    return planned(read_configuration(path), options, tell)
 
 
 def planned(

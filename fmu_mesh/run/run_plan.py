@@ -73,7 +73,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that follows from a configuration and the options of one run.
 
     ```python
-    run = plan_run(Path("configs/pendulum_delay.yaml"), PlanOptions(window=64))
+    run = fmu_mesh.load("configs/pendulum_delay.yaml").plan(window=64)
     file = run.write(folder)
     read_node(file, "pendulum").plan.window  # in another process
     ```

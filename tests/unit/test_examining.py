@@ -10,8 +10,8 @@ import yaml
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
 from fmu_mesh.instances.fmi import read_description, sha256_of
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.packing import repacked
+from tests.planning import prepare
 
 
 def with_document_type(declaration: str, inside: str) -> Callable[[str], str]:

@@ -19,9 +19,9 @@ from fmu_mesh.errors import ConfigurationError, LoadFailed
 from fmu_mesh.instances.fmi import Terms, content_of, open_instance, read_description, sha256_of, size_of
 from fmu_mesh.instances.fmi.archive.archive import opened
 from fmu_mesh.instances.fmi.archive.sources import extract
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.helpers import FMUS
 from tests.fmus.packing import without_binaries
+from tests.planning import prepare
 from tests.unit.test_archive import HOSTILE
 
 GAIN = FMUS / "Gain.fmu"

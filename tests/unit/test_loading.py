@@ -11,7 +11,8 @@ from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig, read_file
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH, Plain
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.instances.configuration import examine_data, parse
+from fmu_mesh.instances.configuration import examine_data
+from tests.planning import parse
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
@@ -460,9 +461,9 @@ def test_a_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
 
 def test_places_without_a_line_have_that_of_the_place_around_them() -> None:
     loaded = parse(GOOD, Path("mesh.yaml"))
-    assert loaded.locate("connections[0].to") == 7
-    assert loaded.locate("instances.pendulum.start_values.body[1].x") == 4
-    assert loaded.locate("zenoh.mode") == 1
+    assert loaded.origin("connections[0].to").line == 7
+    assert loaded.origin("instances.pendulum.start_values.body[1].x").line == 4
+    assert loaded.origin("zenoh.mode").line == 1
     assert loaded.finding("connections[1].to", "a", "b") == Finding("mesh.yaml", "connections[1].to", "a", "b", None, 8)
 
 

@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from fmu_mesh.errors import ConfigurationError, LoadFailed
 from fmu_mesh.instances.fmi import Terms, open_instance, read_description, sha256_of
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import plan_run
 from fmu_mesh.run.run_plan import RunPlan, read_node, read_run
 from tests.helpers import FMUS
+from tests.planning import plan_run
 
 CONFIGS = FMUS.parent / "configs"
 
