@@ -14,54 +14,19 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from ..errors import Interrupted
 from ..wire.runtime import is_stopped
-from .threads import ONE_THREAD
+from .fork_server import Forked
 
-__all__ = [
-    "Child",
-    "Process",
-    "executed",
-    "how_it_ended",
-    "is_other_python",
-    "own_command",
-    "own_environment",
-]
+__all__ = ["Child", "Process", "how_it_ended", "is_other_python"]
+
+Process = subprocess.Popen[bytes] | Forked
+"""A process that was started by exec, or by the fork server. It leads a process group of the number of its `pid`."""
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
-
-
-def own_command(*arguments: str, interpreter: str | None = None) -> list[str]:
-    """The program of the processes of a run (`fmu_mesh.run.__main__`) with these arguments.
-
-    It runs in this Python, or in ``interpreter``. With -P, Python does not look for modules in the current folder.
-    Otherwise a `random.py` of the user would be imported instead of that of the standard library.
-    """
-    return [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments]
-
-
-def own_environment() -> dict[str, str]:
-    """The environment of the processes of a run."""
-    # Without the last one, setproctitle would overwrite what `/proc/PID/environ` shows.
-    return os.environ | ONE_THREAD | {"SPT_NOENV": "1"}
-
-
-def executed(*arguments: str, interpreter: str | None = None) -> subprocess.Popen[bytes]:
-    """Start a process of a run by exec, with the arguments of `own_command`.
-
-    It has a session of its own, so that Ctrl-C reaches only the launcher.
-    """
-    return subprocess.Popen(
-        own_command(*arguments, interpreter=interpreter),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        env=own_environment(),
-    )
 
 
 def is_other_python(interpreter: str) -> bool:
@@ -71,42 +36,6 @@ def is_other_python(interpreter: str) -> bool:
     """
     own, other = Path(sys.executable), Path(interpreter)
     return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())
-
-
-class Process(Protocol):
-    """A process that was started by exec (`subprocess.Popen`) or by the fork server (`Forked`)."""
-
-    @property
-    def pid(self) -> int | None:
-        """Its process id; None before it has started. It leads a process group of this number."""
-        ...
-
-    @property
-    def stdin(self) -> IO[bytes] | None:
-        """The writing end of its standard input, if it has one of its own."""
-        ...
-
-    @property
-    def stdout(self) -> IO[bytes] | None:
-        """The reading end of its standard output, which is a pipe."""
-        ...
-
-    @property
-    def stderr(self) -> IO[bytes] | None:
-        """The same of its standard error."""
-        ...
-
-    def poll(self) -> int | None:
-        """None if it has not ended."""
-        ...
-
-    def wait(self) -> int:
-        """Wait for its end; returns its exit code."""
-        ...
-
-    def send_signal(self, number: int, /) -> None:
-        """Send a signal if it still runs."""
-        ...
 
 
 class Child:

@@ -38,8 +38,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from types import FrameType
 from typing import IO, Final
 
@@ -47,9 +48,9 @@ import msgspec
 
 from ..errors import ConfigurationError, Interrupted, MeshLost
 from ..wire.runtime import is_alive
-from .child import own_command, own_environment
+from .threads import ONE_THREAD
 
-__all__ = ["ForkServer", "Forked", "fork_server", "serve", "started_ahead"]
+__all__ = ["ForkServer", "Forked", "executed", "fork_server", "serve", "started_ahead"]
 
 Job = Callable[[], None]
 """What a process does, from its start to its end."""
@@ -79,6 +80,25 @@ class _News(msgspec.Struct, frozen=True):
     code: int | None = None
 
 
+def executed(*arguments: str, interpreter: str | None = None, pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
+    """Start the program `fmu_mesh.run.__main__` by exec, with these arguments, in this Python or in ``interpreter``.
+
+    It has a session of its own, so that Ctrl-C reaches only the launcher.
+    """
+    return subprocess.Popen(
+        # With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
+        # imported instead of that of the standard library.
+        [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        pass_fds=pass_fds,
+        # Without the last one, setproctitle would overwrite what `/proc/PID/environ` shows.
+        env=os.environ | ONE_THREAD | {"SPT_NOENV": "1"},
+    )
+
+
 class ForkServer:
     """The fork server as its launcher sees it. It starts at once.
 
@@ -91,15 +111,7 @@ class ForkServer:
     def __init__(self) -> None:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            self.process = subprocess.Popen(
-                own_command("forks", str(theirs.fileno()), _ROOM),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,
-                pass_fds=(theirs.fileno(),),
-                env=own_environment(),
-            )
+            self.process = executed("forks", str(theirs.fileno()), _ROOM, pass_fds=(theirs.fileno(),))
         self._forked: list[Forked] = []
         self._reader = threading.Thread(target=self._read, name="fork server", daemon=True)
         self._reader.start()
@@ -225,13 +237,11 @@ class Forked:
         return self._code if self._code is not None else MeshLost.exit_code
 
 
-def serve(control: int, job: Callable[..., Job]) -> Job | None:
+def serve(control: int) -> Job | None:
     """Be the fork server. Returns in each forked process, with its job; in the server at its end, with None.
 
     Args:
         control: the descriptor of the server's end of the pair of sockets.
-        job: returns the job of a request from its arguments. It is called in the server: what it opens or reads, all
-            processes have that are forked later.
 
     Raises:
         ConfigurationError: the system starts no more processes.
@@ -239,18 +249,24 @@ def serve(control: int, job: Callable[..., Job]) -> Job | None:
     """
     from ..instances.registry import preload  # noqa: PLC0415 only the server needs it
     from ..system.run_metadata import versions  # noqa: PLC0415 as above
-    from . import roles  # noqa: F401, PLC0415 as above
+    from .roles import job_of  # noqa: PLC0415 as above
 
     preload()
     versions()
     gc.collect()
     gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
     gc.enable()
-    return _Server(control, job).run()
+    return _Server(control, partial(job_of, forks=True)).run()
 
 
 class _Server:
-    """The fork server itself."""
+    """The fork server itself.
+
+    Args:
+        control: see `serve`.
+        job: returns the job of a request from its arguments. It is called in the server: what it opens or reads, all
+            processes have that are forked later.
+    """
 
     def __init__(self, control: int, job: Callable[..., Job]) -> None:
         os.set_inheritable(control, False)  # noqa: FBT003 it takes no keyword

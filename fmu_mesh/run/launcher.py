@@ -36,9 +36,9 @@ from ..errors import Interrupted, MeshLost
 from ..files import remove_tree
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
-from .child import Child, Process, executed, is_other_python
+from .child import Child, Process, is_other_python
 from .events import Event, OutputLine, Reachable, decode_event
-from .fork_server import ForkServer, fork_server
+from .fork_server import ForkServer, executed, fork_server
 from .launcher_states import (
     GATEWAY,
     SERVER,

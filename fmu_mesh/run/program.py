@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
-from ..printing import OutputFailed, guard_streams, paragraph
+from ..printing import OutputFailed, paragraph
 from .limits import address_space_problem, out_of_memory
 
 __all__ = ["exit_code_of"]
@@ -22,7 +22,6 @@ def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = F
         needed_mib: the address space that the command needs, in MiB.
         debug: raise an error instead of writing it.
     """
-    guard_streams()
     code = 0
     try:
         code = _code_of(command, needed_mib, debug=debug)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from msgspec.structs import replace
+from setproctitle import setproctitle
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
@@ -29,16 +30,56 @@ from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .child import is_other_python
-from .events import Event, Log, Reachable, Status
+from .events import Event, EventWriter, Log, Reachable, Status
 from .outcome import Outcome, outcome_at
 from .process import RunProcess
 from .results import open_results
-from .run_plan import MANUAL, NodeRun, RunPlan
+from .run_plan import MANUAL, NodeRun, RunPlan, read_node, read_run
 from .wiring import patient, wiring
 
-__all__ = ["prepare_node", "run_master", "run_node"]
+__all__ = ["job_of", "run_master", "run_node"]
 
 log = logging.getLogger(__name__)
+
+
+def job_of(role: str, plan: str, node: str = "", *, forks: bool = False) -> Callable[[], None]:
+    """What a process does that the launcher starts: as a `node`, as the `master`, or as the `gateway`.
+
+    Args:
+        role: one of the three.
+        plan: the file of the run plan.
+        node: name of the node.
+        forks: whether the process is forked from this one. Then what several nodes need is done here, once, such as
+            extracting the FMU of all.
+    """
+    file = Path(plan)
+    if role == "node":
+        run = read_node(file, node)
+        for item in run.plan.instances if forks else ():
+            with suppress(FmuMeshError):  # the node says it
+                prepare(_opening(run, item.name, run_folder(run.plan.mesh, run.run)))
+
+        def be_node() -> None:
+            setproctitle(f"fmu-mesh node {node}")
+            run_node(run)
+
+        return be_node
+
+    def be_other() -> None:
+        run = read_run(file)
+        setproctitle(f"fmu-mesh {role} {run.mesh}")
+        if role == "gateway":
+            from .gateway_role import run_gateway  # noqa: PLC0415  most runs have none
+
+            run_gateway(run, EventWriter())
+            return
+        try:
+            run_master(run, EventWriter())
+        except FmuMeshError as error:
+            error.already_reported()  # the launcher has the event and shows it
+            raise
+
+    return be_other
 
 
 def run_node(run: NodeRun) -> None:
@@ -146,14 +187,6 @@ def _opening(
         log=log,
         showing=run.showing,
     )
-
-
-def prepare_node(run: NodeRun) -> None:
-    """Before the process of a node is forked: do once what several nodes need, such as extracting the FMU of all."""
-    folder = run_folder(run.plan.mesh, run.run)
-    for item in run.plan.instances:
-        with suppress(FmuMeshError):  # the node says it
-            prepare(_opening(run, item.name, folder))
 
 
 def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
