@@ -70,13 +70,9 @@ class Child:
         output, errors = self._process.stdout, self._process.stderr
         assert output is not None
         assert errors is not None
-        read = self._read_beginning if limited else self._read
-        readers = [
-            threading.Thread(target=read, args=(output, on_line), daemon=True),
-            threading.Thread(target=read, args=(errors, lambda line: on_error_line(self.name, line)), daemon=True),
-        ]
-        waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
-        self._threads = [*readers, waiter]
+        pipes = ((output, on_line), (errors, partial(on_error_line, self.name)))
+        readers = [threading.Thread(target=self._read, args=(*pipe, limited), daemon=True) for pipe in pipes]
+        self._threads = [*readers, threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)]
         for thread in self._threads:
             thread.start()
 
@@ -115,20 +111,13 @@ class Child:
             os.killpg(pid, number)
             self._left_others = True
 
-    # Each reader closes its pipe, because a process that was left behind may keep the other end open.
-
-    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        with pipe:
-            for line in pipe:
-                self._post(partial(on_line, line))
-
-    def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        """Read everything, so that the process never blocks, but pass on only `_SHOWN_LINES` lines."""
+    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None], limited: bool) -> None:  # noqa: FBT001  for a thread
+        """Read everything, so that the process never blocks; if ``limited``, pass on only `_SHOWN_LINES` lines."""
         count = 0
-        with pipe:
-            while line := pipe.readline(_LINE_BYTES):
+        with pipe:  # a process that was left behind may keep the other end open
+            while line := pipe.readline(_LINE_BYTES if limited else -1):
                 count += 1
-                if count <= _SHOWN_LINES:
+                if not limited or count <= _SHOWN_LINES:
                     self._post(partial(on_line, line))
                 elif count == _SHOWN_LINES + 1:
                     self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))

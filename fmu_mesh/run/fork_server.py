@@ -41,7 +41,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from types import FrameType
 from typing import IO, Final
 
 import msgspec
@@ -285,7 +284,9 @@ class _Server:
 
     def run(self) -> Job | None:
         """Serve; see `serve`."""
-        self._before = {number: signal.signal(number, _ignore) for number in _SIGNALS}
+        from .process import only_wake  # noqa: PLC0415 the launcher does without it
+
+        self._before = {number: signal.signal(number, only_wake) for number in _SIGNALS}
         signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
         while self._accepting or self._numbers:
             requests: list[int | socket.socket] = [self._control] if self._accepting else []
@@ -380,7 +381,3 @@ class _Server:
     def _tell(self, news: _News) -> None:
         with suppress(OSError):  # the launcher is gone
             self._control.send(msgspec.msgpack.encode(news))
-
-
-def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """The number of the signal is in the pipe."""

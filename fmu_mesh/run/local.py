@@ -134,7 +134,7 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            error.with_hint(self._kept())
+            error.with_hint(what_is_kept(self.files))
             raise
         finally:
             if closes:
@@ -145,9 +145,6 @@ class LocalMesh:
     def close(self) -> None:
         """Close the instances and remove their files. May be called twice."""
         self._stack.close()
-
-    def _kept(self) -> str | None:
-        return what_is_kept(self.files)
 
     def _run(self) -> None:
         plan, system = self._plan, self._system
@@ -184,7 +181,7 @@ class LocalMesh:
         if self._begun:
             error.at(self._system.begun_at, self._plan.grid.time(self._system.begun_at))
         self._save_from_outside()
-        self._on_hang(error.with_hint(self._kept()))
+        self._on_hang(error.with_hint(what_is_kept(self.files)))
 
     def _save_from_outside(self) -> None:
         with suppress(FmuMeshError):  # the process ends now for another reason

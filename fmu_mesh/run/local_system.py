@@ -25,7 +25,7 @@ from ..rings.value_change import ValueChange
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
 from ..system.coupling_rule import CouplingRule
-from ..system.initialization_plan import Loop, Tear
+from ..system.initialization_plan import Loop
 from ..system.layout import Layout
 from ..system.plan import InstancePlan, Plan
 from ..system.schedule import Course
@@ -218,14 +218,15 @@ class LocalSystem:
             for name, variable in loop.outputs:
                 members[name].set_initial_inputs(known, point.assumed)
                 known[(name, variable)] = members[name].instance.get_values([variable])[0]
-            consistent = point.update([self._brought(tear, known) for tear in loop.tears])
+            brought = []
+            for tear in loop.tears:
+                ends = tear.target, tear.input
+                c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == ends)
+                value = _at(known[c.source_instance, c.source.name], c.source_index)
+                brought.append(ValueChange.of_tear(tear).of(value, InitializationFailed))
+            consistent = point.update(brought)
         for name, variable in point.assumed:
             members[name].settled.add(variable)
-
-    def _brought(self, tear: Tear, known: dict[tuple[str, str], Value]) -> Value:
-        c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
-        value = _at(known[c.source_instance, c.source.name], c.source_index)
-        return ValueChange.of_tear(tear).of(value, InitializationFailed)
 
 
 class _SavedMember(NamedTuple):

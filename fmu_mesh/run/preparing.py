@@ -120,7 +120,9 @@ def planned(
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded, findings = examine_data(with_options(values, options), dict(options.start_values or {}))
-    loaded = _located(loaded)
+    folder = loaded.file.absolute().parent  # paths become absolute where a section names other files than its model
+    located = {name: section.located(folder) for name, section in loaded.config.instances.items()}
+    loaded = replace(loaded, config=replace(loaded.config, instances=located))
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
     check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
     obstacles = loaded.findings()
@@ -137,7 +139,7 @@ def planned(
 
         resolve(loaded, descriptions, findings)
     scenario = _scenario(loaded, descriptions, findings)
-    sections = loaded.config.instances
+    sections = located
 
     def claimed(name: str) -> Claims:
         own = placed(sections[name])
@@ -215,7 +217,11 @@ def _descriptions(
         found = cache[model]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            findings.append(loaded.finding(place, text, _expected(section, path), _similar(path)))
+            expected = expected_model(section)
+            if not _leads_somewhere(path) and _leads_somewhere(Path(section.path)):
+                expected += "; paths are relative to the configuration file"
+            near = None if files.exists(path) else nearest_file(path)
+            findings.append(loaded.finding(place, text, expected, near))
             continue
         descriptions[name] = found
         if loaded.config.is_strict(section):
@@ -224,24 +230,6 @@ def _descriptions(
     return descriptions, findings
 
 
-def _located(loaded: LoadedConfig) -> LoadedConfig:
-    """The configuration with absolute paths where a section names other files than its model."""
-    folder = loaded.file.absolute().parent
-    sections = {name: section.located(folder) for name, section in loaded.config.instances.items()}
-    return replace(loaded, config=replace(loaded.config, instances=sections))
-
-
-def _expected(section: InstanceSection, path: Path) -> str:
-    """In words, what the file of a model should be, where the one at ``path`` is not."""
-    elsewhere = not _leads_somewhere(path) and _leads_somewhere(Path(section.path))
-    return expected_model(section) + ("; paths are relative to the configuration file" if elsewhere else "")
-
-
 def _leads_somewhere(path: Path) -> bool:
     """Whether there is something at the path, or an archive that it leads into."""
     return files.exists(path) or files.archive_on_the_way(path) is not None
-
-
-def _similar(path: Path) -> str | None:
-    """The nearest existing file name, if there is no such file."""
-    return None if files.exists(path) else nearest_file(path)

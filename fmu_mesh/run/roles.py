@@ -9,7 +9,7 @@ import logging
 import os
 import shlex
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -203,7 +203,15 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
             session = open_session(own)
             process.stack.callback(close_session, session)
-            settings = _settings(run, process, own_endpoints(session, own) if zenoh.mode == "peer" else ())
+            ends = own_endpoints(session, own) if zenoh.mode == "peer" else ()
+            ends = ends or tuple(config.zenoh.connect)  # a client is reached through its router
+            settings = MasterSettings(
+                endpoints=tuple(sorted(ends, key=is_socket, reverse=True)),
+                config_file=str(run.loaded.file),
+                launch=process.launch,
+                profile=run.profile,
+                paused=run.paused,
+            )
             master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))
             process.stack.callback(master.close)
             master.claim()
@@ -218,14 +226,9 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         recorder = failure = None
         try:
             if RECORDER in plan.nodes:
-                results = open_results(
-                    run.loaded,
-                    plan.system,
-                    process.folder if process.is_child else None,
-                    digest=plan.digest,
-                    contents=run.contents,
-                )
-                with Recorder(
+                folder = process.folder if process.is_child else None
+                results = open_results(run.loaded, plan.system, folder, digest=plan.digest, contents=run.contents)
+                recorder = Recorder(
                     plan.nodes[RECORDER],
                     session,
                     results,
@@ -233,9 +236,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     growth=GrowthWatch(plan),
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
-                ) as recorder:
-                    master.run()
-            else:
+                )
+            with recorder or nullcontext():
                 master.run()
         except FmuMeshError as error:
             failure = error
@@ -245,18 +247,6 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             raise failure
         master.wait_for_followers()
         return outcome
-
-
-def _settings(run: RunPlan, process: RunProcess, own: tuple[str, ...]) -> MasterSettings:
-    """The settings of a master whose session listens at ``own``; a client is reached through its router."""
-    endpoints = own or tuple(run.loaded.config.zenoh.connect)
-    return MasterSettings(
-        endpoints=tuple(sorted(endpoints, key=is_socket, reverse=True)),
-        config_file=str(run.loaded.file),
-        launch=process.launch,
-        profile=run.profile,
-        paused=run.paused,
-    )
 
 
 def _outcome_of(
