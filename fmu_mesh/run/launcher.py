@@ -32,6 +32,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..awake import AwakeClock
+from ..config.deadlines import Deadlines
 from ..errors import Interrupted, MeshLost
 from ..files import remove_tree
 from ..system.plan import MASTER, RECORDER
@@ -89,9 +90,9 @@ class Launcher:
         self._state = LaunchState(
             LaunchTerms(
                 {n: [item.name for item in node.instances] for n, node in plan.nodes.items() if n != RECORDER},
+                Deadlines.of(config.timeouts),
                 has_gateway=config.ros is not None and config.ros.profile != "rclpy",
                 start_time=plan.grid.start_time,
-                timeouts=config.timeouts,
             )
         )
 

@@ -32,7 +32,6 @@ from enum import IntEnum
 from msgspec import Struct
 
 from ..config.deadlines import Deadlines
-from ..config.mesh import TimeoutsConfig
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
 from ..wire.runtime import STOPPED
 from ..wire.views import GOING_ON, MeshStatus
@@ -135,10 +134,9 @@ class LaunchTerms(Struct, frozen=True):
     """
 
     nodes: Mapping[str, Sequence[str]]
+    deadlines: Deadlines
     has_gateway: bool = False
     start_time: float = 0.0
-    timeouts: TimeoutsConfig = TimeoutsConfig()
-    deadlines: Deadlines = Deadlines()
 
 
 class _Phase(IntEnum):
@@ -240,7 +238,7 @@ class LaunchState:
         limits, outcome = self._terms.deadlines, self.outcome
         patience_s = limits.leave if outcome is not None else limits.leave_lost
         if outcome is not None and outcome.error is None:  # the gateway may still have samples for ROS
-            patience_s = self._terms.timeouts.stop
+            patience_s = limits.finish
         self._phase, self._until = _Phase.LEAVING, now + patience_s
         return (FinishServer(), Look())
 
@@ -283,7 +281,7 @@ class LaunchState:
             met = {THE_MASTER: self._status is not None, GATEWAY: self._gateway_ready}
             self._stopped_since = {n: self._stopped_since.get(n, now) for n in stopped if not met.get(n)}
             for name, since in self._stopped_since.items():
-                if now - since > self._terms.timeouts.link:
+                if now - since > self._terms.deadlines.link:
                     self._how[name] = STOPPED
                     self._lost.append(_Loss(name, -signal.SIGSTOP, now))
 
@@ -313,11 +311,11 @@ class LaunchState:
 
     def _is_decided(self, now: float, *, quiet: bool) -> bool:
         """Whether there is an outcome, or a reason not to wait for one."""
-        limits, timeouts = self._terms.deadlines, self._terms.timeouts
+        limits = self._terms.deadlines
         silent_s = now - self._heard if quiet else 0.0
         has_master = THE_MASTER in self._running
         if self.outcome is not None:
-            return not has_master or silent_s > timeouts.stop
+            return not has_master or silent_s > limits.finish
         if self._lost:
             if any(loss.name == THE_MASTER or loss.code == -signal.SIGSTOP for loss in self._lost):
                 return True
@@ -329,7 +327,7 @@ class LaunchState:
             return True
         if silent_s > limits.report and not has_master:
             return True  # a fork server that is stopped does not tell this
-        return silent_s > (limits.silence + timeouts.step if self._status is not None else timeouts.start)
+        return silent_s > (limits.no_event if self._status is not None else limits.start)
 
     def _end_on(self, now: float, *, quiet: bool) -> Sequence[Action]:
         """Go through the phases of the end: wait, SIGTERM, wait, SIGKILL, and the same for the fork server."""
@@ -367,7 +365,7 @@ class LaunchState:
             return None
         error = from_report(outcome.error)
         if isinstance(error, DeadlineExceeded) and self._terms.has_gateway and not self._gateway_ready:
-            error = DeadlineExceeded(f"{GATEWAY} was not ready within {self._terms.timeouts.start:g} s")
+            error = DeadlineExceeded(f"{GATEWAY} was not ready within {self._terms.deadlines.start:g} s")
         elif isinstance(error, MeshLost) and error.instance is not None:
             error.saying(self.with_how(error.message))
         elif isinstance(error, Interrupted) and self._interrupted_at is not None:

@@ -34,8 +34,7 @@ from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.wire.runtime import STOPPED
 from fmu_mesh.wire.views import MeshState, MeshStatus
 
-LIMITS = Deadlines()
-TIMEOUTS = TimeoutsConfig(start=60.0, step=5.0, link=30.0, stop=10.0)
+LIMITS = Deadlines.of(TimeoutsConfig(start=60.0, step=5.0, link=30.0, stop=10.0))
 DONE = Outcome("done", 100, 1.0, 0.5, 101, "pair.csv")
 
 
@@ -44,7 +43,7 @@ class Launch:
 
     def __init__(self, *, gateway: bool = False) -> None:
         nodes = {"pendulum": ["pendulum"], "both": ["delay", "gain"]}
-        self.state = LaunchState(LaunchTerms(nodes, has_gateway=gateway, timeouts=TIMEOUTS))
+        self.state = LaunchState(LaunchTerms(nodes, LIMITS, has_gateway=gateway))
         self.now = 0.0
         self.running: set[str] = set()
         self.stopped: set[str] = set()
@@ -78,7 +77,7 @@ class Launch:
         """Let the time pass until the end, which has to come; returns what was done for it."""
         self.done.clear()
         self._do(self.state.end(self.now))
-        self.passes(2 * TIMEOUTS.stop)
+        self.passes(2 * LIMITS.finish)
         assert self.state.is_over
         return [action for action in self.done if action != Look()]
 
@@ -220,7 +219,7 @@ def test_a_node_lost_while_the_mesh_stops_is_left_to_the_master(launch: Launch) 
 
 
 def test_a_silent_master_is_lost_after_the_deadline_of_a_step(launch: Launch) -> None:
-    launch.passes(LIMITS.silence + TIMEOUTS.step)
+    launch.passes(LIMITS.no_event)
     assert not launch.state.is_ending
 
     launch.passes(2 * LIMITS.look)
@@ -230,7 +229,7 @@ def test_a_silent_master_is_lost_after_the_deadline_of_a_step(launch: Launch) ->
 
 
 def test_silence_does_not_count_while_events_wait_to_be_handled(launch: Launch) -> None:
-    launch.passes(10 * (LIMITS.silence + TIMEOUTS.step), quiet=False)
+    launch.passes(10 * LIMITS.no_event, quiet=False)
 
     assert not launch.state.is_ending
 
@@ -238,7 +237,7 @@ def test_silence_does_not_count_while_events_wait_to_be_handled(launch: Launch) 
 def test_a_master_that_never_reports_is_lost_at_the_start_deadline() -> None:
     launch = Launch()
 
-    launch.passes(TIMEOUTS.start)
+    launch.passes(LIMITS.start)
     assert not launch.state.is_ending
     launch.passes(LIMITS.look)
 
@@ -258,7 +257,7 @@ def test_a_process_that_is_stopped_before_the_run_is_named(name: str) -> None:
     launch = Launch()
     launch.stopped.add(name)
 
-    launch.passes(TIMEOUTS.link + 3 * LIMITS.look)
+    launch.passes(LIMITS.link + 3 * LIMITS.look)
 
     assert launch.state.is_ending
     assert launch.raised().message.endswith(f"was lost: its process {STOPPED}")
