@@ -177,7 +177,8 @@ class LocalMesh:
         self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types, self._growth)
         self._stack.callback(system.close)
         try:
-            system.start(partial(self._guarded, folder=self._folder, watch=watch))
+            timeouts = plan.system.config.timeouts
+            system.start(lambda name: Guarded(name, partial(self._open, name), watch, timeouts))
             started = time.perf_counter()
             self._begun = True
             try:
@@ -188,13 +189,11 @@ class LocalMesh:
         finally:
             self._save()
 
-    def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
-        return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)
-
-    def _open(self, name: str, folder: Path) -> Instance:
+    def _open(self, name: str) -> Instance:
         if self._open_instance is not None:
             return self._open_instance(name)
-        return open_instance(opening_of(self._plan, name, folder, self._log, self._showing))
+        assert self._folder is not None
+        return open_instance(opening_of(self._plan, name, self._folder, self._log, self._showing))
 
     def _take_hang(self, error: FmuError) -> None:
         """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""

@@ -34,7 +34,7 @@ from .events import Event, EventWriter, Log, Reachable, Status
 from .outcome import Outcome, outcome_at
 from .process import RunProcess
 from .results import open_results
-from .run_plan import MANUAL, NodeRun, RunPlan, read_node, read_run
+from .run_plan import MANUAL, NodeRun, RunPlan, opening_in, read_node, read_run
 from .wiring import patient, wiring
 
 __all__ = ["job_of", "run_master", "run_node"]
@@ -174,19 +174,9 @@ def _opening(
     run: NodeRun, name: str, folder: Path, log: Callable[[LogMessage], None] = lambda _message: None
 ) -> Opening[Any]:
     """How an instance is opened in this process, in the folder of the run."""
-    item, model = run.plan.instance(name), run.models[name]
-    return Opening(
-        name=name,
-        path=Path(item.fmu),
-        section=item.section,
-        description=model.description,
-        folder=fmu_folder(folder),
-        content=model.content,
-        limits=run.plan.limits,
-        linear_inputs=item.linear_inputs,
-        log=log,
-        showing=run.showing,
-    )
+    model = run.models[name]
+    opening = opening_in(run.plan, name, model.description, fmu_folder(folder), log)
+    return replace(opening, content=model.content, showing=run.showing)
 
 
 def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:

@@ -6,7 +6,7 @@ Owns the file through which they get it. Each process decodes only the parts of 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from ..config.loading import LoadedConfig
 from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError
-from ..instances.contract import Showing
+from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
 from ..simtime import ENDLESS
 from ..system.layout import row_bytes
@@ -25,7 +25,7 @@ from ..text import counted, listed, nearest
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
 
-__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "read_node", "read_run"]
+__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "opening_in", "read_node", "read_run"]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
@@ -176,6 +176,23 @@ class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     nodes: dict[str, msgspec.Raw]
     run: msgspec.Raw
+
+
+def opening_in(
+    node: NodePlan, name: str, description: ModelDescription, folder: Path, log: Callable[[LogMessage], None]
+) -> Opening[Any]:
+    """What the kind of an instance gets to open it; its files go into ``folder``."""
+    item = node.instance(name)
+    return Opening(
+        name=name,
+        path=Path(item.fmu),
+        section=item.section,
+        description=description,
+        folder=folder,
+        limits=node.limits,
+        linear_inputs=item.linear_inputs,
+        log=log,
+    )
 
 
 def read_node(file: Path, name: str) -> NodeRun:
