@@ -11,7 +11,7 @@ launcher sends no more requests, the server ends after its last process.
 
 # Who meets here (ADR 71). In the launcher: the thread of `Launcher.run`, which asks for processes, the thread "fork
 # server" of `ForkServer`, which takes what the server answers, and for each process the thread of `Child` that waits
-# for its end. `Forked` is what they share: each field is written by one of them, and the end is an `Event`. In the
+# for its end. `Forked` is what they share: what the server has told is set once, and the end is an `Event`. In the
 # server: one thread, because only the thread that forks is there in the new process, and every lock that another one
 # held would stay locked.
 #

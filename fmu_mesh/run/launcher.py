@@ -6,11 +6,12 @@ the name of the process. A request to end goes to the master, which tells the no
 file of the run is left at the end.
 """
 
-# Who meets here (ADR 71). One thread calls `Launcher.run`: it alone starts processes, feeds `LaunchState` and does what
-# that says. It has to live as long as the processes, because the kernel signals the death of a *thread* (PDEATHSIG) to
-# what that thread has started. For each process, `Child` has three threads: one for each pipe, and one that waits for
-# the exit code. They, and whoever calls `interrupt` (any thread, or a signal handler), only put a function into one
-# queue, so nothing here needs a lock. It is a `SimpleQueue` because its `put` may also be called in a signal handler.
+# Who meets here (ADR 71). One thread calls `Launcher.run`: it alone starts processes, feeds `LaunchStates` and does
+# what that says. It has to live as long as the processes, because the kernel signals the death of a *thread*
+# (PDEATHSIG) to what that thread has started. For each process, `Child` has three threads: one for each pipe, and one
+# that waits for the exit code. They, and whoever calls `interrupt` (any thread, or a signal handler), only put a
+# function into one queue, so nothing here needs a lock. It is a `SimpleQueue` because its `put` may also be called in a
+# signal handler.
 #
 # What may go wrong: everything that has no event. A process that is stopped writes nothing and does not end; a process
 # that an FMU has left behind holds the pipes open; a fork server that is stopped or killed tells no exit code. So the
@@ -45,19 +46,12 @@ from .launcher_states import (
     SERVER,
     THE_MASTER,
     Action,
-    Ended,
     FinishServer,
-    GatewayReady,
-    InterruptAsked,
-    LaunchEvent,
-    LaunchState,
+    LaunchStates,
     LaunchTerms,
     Look,
-    Reported,
-    Seen,
     Signal,
     Start,
-    TimePassed,
 )
 from .outcome import Outcome, outcome_at
 from .results import rows_left, what_is_kept
@@ -87,7 +81,7 @@ class Launcher:
         self._files: tuple[tuple[str, int], ...] | None = None
         self._clock = AwakeClock()
         config, plan = run.loaded.config, run.plan
-        self._state = LaunchState(
+        self._states = LaunchStates(
             LaunchTerms(
                 {n: [item.name for item in node.instances] for n, node in plan.nodes.items() if n != RECORDER},
                 Deadlines.of(config.timeouts),
@@ -108,12 +102,12 @@ class Launcher:
         try:
             socket_endpoint(self._folder, MASTER)  # a path that is too long is found here
             self._file = str(self._run.write(self._folder))
-            self._do(self._state.begin())
-            while not self._state.is_ending:
+            self._do(self._states.begin())
+            while not self._states.is_ending:
                 self._turn()
         finally:
-            self._do(self._state.end(self._clock()))
-            while not self._state.is_over:
+            self._do(self._states.end(self._clock()))
+            while not self._states.is_over:
                 self._turn()
             self._close_all()
             if self._files is None:  # the master could not say it any more
@@ -123,20 +117,17 @@ class Launcher:
 
     def interrupt(self) -> None:
         """From any thread or signal handler: end the run; a second call ends it without waiting."""
-        self._happened.put(partial(self._take, InterruptAsked()))
+        self._happened.put(lambda: self._do(self._states.interrupted(self._clock())))
 
     # --- waiting and doing; all of it on the thread that called `run`
 
     def _turn(self) -> None:
         try:
-            self._happened.get(timeout=self._state.wait_s)()
+            self._happened.get(timeout=self._states.wait_s)()
             quiet = False
         except queue.Empty:
             quiet = True
-        self._take(TimePassed(quiet))
-
-    def _take(self, event: LaunchEvent) -> None:
-        self._do(self._state.take(event, self._clock()))
+        self._do(self._states.go_on(self._clock(), quiet=quiet))
 
     def _do(self, actions: Sequence[Action]) -> None:
         for action in actions:
@@ -150,7 +141,7 @@ class Launcher:
                 case Look():
                     running = [name for name, process in self._processes.items() if process.running]
                     stopped = tuple(name for name in running if self._processes[name].stopped)
-                    self._take(Seen(frozenset(running), stopped))
+                    self._states.seen(running, stopped, self._clock())
 
     def _start(self, name: str) -> None:
         if name == SERVER:
@@ -172,7 +163,12 @@ class Launcher:
 
     def _watch(self, name: str, process: Process, on_line: Callable[[bytes], None], *, limited: bool = False) -> None:
         self._processes[name] = child = Child(name, process, self._happened.put)
-        child.watch(on_line, self._take_output, lambda name, code: self._take(Ended(name, code)), limited=limited)
+        child.watch(
+            on_line,
+            self._take_output,
+            lambda name, code: self._states.ended(name, code, self._clock()),
+            limited=limited,
+        )
 
     def _take_event(self, line: bytes) -> None:
         try:
@@ -185,7 +181,7 @@ class Launcher:
             write_note(self._folder, MeshNote(self._run.mesh, prefix, event.endpoints, os.getpid(), file))
         elif isinstance(event, Outcome):
             self._files = event.files
-        self._take(Reported(event))
+        self._states.reported(event, self._clock())
         self._on_event(event)
 
     def _take_gateway_line(self, line: bytes) -> None:
@@ -194,7 +190,7 @@ class Launcher:
         except msgspec.DecodeError:
             self._take_output(GATEWAY, line)
         else:
-            self._take(GatewayReady())
+            self._do(self._states.gateway_ready())
 
     def _take_output(self, name: str, line: bytes) -> None:
         self._on_event(OutputLine(name, line.decode(errors="replace").rstrip()))
@@ -215,10 +211,10 @@ class Launcher:
         Raises:
             FmuMeshError: it did not.
         """
-        plan, outcome, error = self._run.plan, self._state.outcome, self._state.error()
+        plan, outcome, error = self._run.plan, self._states.outcome, self._states.error()
         if error is None:
             assert outcome is not None
-            self.outcome = replace(outcome, warnings=tuple(map(self._state.with_how, outcome.warnings)))
+            self.outcome = replace(outcome, warnings=tuple(map(self._states.with_how, outcome.warnings)))
             return self.outcome
         counted = zip(plan.system.records, files, strict=False)
         last = max((record.point_of(rows - 1) for record, (_, rows) in counted if rows), default=0)

@@ -13,20 +13,20 @@ It knows no process, no pipe and no clock: each call says what time it is. `fmu_
 #   SERVER_KILLED   it did not; what it knew of exit codes is lost
 #   OVER
 #
-# Why so many things are known twice (that a process has ended: by `Ended` and by `Seen`; that a node is lost: by the
+# Why so many things are known twice (that a process has ended: by `ended` and by `seen`; that a node is lost: by the
 # master and by its exit code): each of the two may be missing or late. An exit code comes through the fork server,
-# which may be stopped or killed; `Ended` waits for the pipes, which an FMU may have given to a process of its own; a
+# which may be stopped or killed; `ended` waits for the pipes, which an FMU may have given to a process of its own; a
 # master that is stopped reports nothing. The first that comes counts, and the master's words win if they come in time,
 # because only it knows the point.
 #
-# Silence counts only while nothing waits to be handled (`TimePassed.quiet`). Otherwise a launcher that was stopped, or
+# Silence counts only while nothing waits to be handled (`quiet`). Otherwise a launcher that was stopped, or
 # is slow, would take its own delay for that of the master.
 
 from __future__ import annotations
 
 import math
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from enum import IntEnum
 
 from msgspec import Struct
@@ -43,18 +43,12 @@ __all__ = [
     "GATEWAY",
     "SERVER",
     "THE_MASTER",
-    "Ended",
     "FinishServer",
-    "GatewayReady",
-    "InterruptAsked",
-    "LaunchState",
+    "LaunchStates",
     "LaunchTerms",
     "Look",
-    "Reported",
-    "Seen",
     "Signal",
     "Start",
-    "TimePassed",
 ]
 
 THE_MASTER = "the master"
@@ -63,40 +57,6 @@ SERVER = "the fork server"
 
 _SILENT = "does not answer any more"
 _UNTOLD = "has ended; the fork server, which knows how, does not answer"
-
-
-class Reported(Struct, frozen=True):
-    """The master has sent an event."""
-
-    event: Event
-
-
-class GatewayReady(Struct, frozen=True):
-    """The gateway has declared everything and misses no sample any more."""
-
-
-class Ended(Struct, frozen=True):
-    """A process has ended with an exit code: the negative number of a signal if it was one."""
-
-    name: str
-    code: int
-
-
-class Seen(Struct, frozen=True):
-    """Which processes run, and which of them are stopped by a signal: the answer to `Look`."""
-
-    running: frozenset[str]
-    stopped: tuple[str, ...] = ()
-
-
-class InterruptAsked(Struct, frozen=True):
-    """Somebody asks for the end of the run."""
-
-
-class TimePassed(Struct, frozen=True):
-    """It is later now; ``quiet``: everything that has happened before is handled."""
-
-    quiet: bool
 
 
 class Start(Struct, frozen=True):
@@ -117,10 +77,9 @@ class FinishServer(Struct, frozen=True):
 
 
 class Look(Struct, frozen=True):
-    """Look at all processes; answer with `Seen`."""
+    """Look at all processes; then call `LaunchStates.seen`."""
 
 
-LaunchEvent = Reported | GatewayReady | Ended | Seen | InterruptAsked | TimePassed
 Action = Start | Signal | FinishServer | Look
 
 
@@ -157,12 +116,13 @@ class _Loss(Struct, frozen=True):
     at: float
 
 
-class LaunchState:
-    """The state of a launch.
+class LaunchStates:
+    """The states of a launch.
 
-    Call sequence: `begin`, then `take` with each event until `is_ending`, then `end`, and `take` until `is_over`. Each
-    call returns what to do, in order. Afterwards `take` may still get what was on its way, and `error` says how the
-    run ended. Times are in s, by a clock that stands still while the launcher cannot run.
+    Call sequence: `begin`; then, for whatever happens, the method of that name and `go_on`, until `is_ending`; then
+    `end`, and the same until `is_over`. Afterwards there may still come what was on its way, and `error` says how the
+    run ended. What is returned is to be done, in order. Times are in s, by a clock that stands still while the launcher
+    cannot run.
 
     Attributes:
         outcome: how the run ended, as the master has said it.
@@ -197,65 +157,37 @@ class LaunchState:
 
     @property
     def wait_s(self) -> float:
-        """How long to wait for an event; then comes `TimePassed`."""
+        """How long to wait for an event; then comes `go_on`."""
         return self._terms.deadlines.look_at_end if self.is_ending else self._terms.deadlines.look
 
     def begin(self) -> Sequence[Action]:
         """Start the run. If there is a gateway, the nodes start when it is ready, so that it misses no sample."""
         return self._starts(SERVER, THE_MASTER, *([GATEWAY] if self._terms.has_gateway else self._terms.nodes))
 
-    def take(self, event: LaunchEvent, now: float) -> Sequence[Action]:
-        """Take what has happened."""
-        actions: Sequence[Action] = ()
-        match event:
-            case Reported(Outcome() as outcome):
-                asked = outcome.error is not None and outcome.error.kind == Interrupted.__name__
-                if not (self._signalled and asked):  # this process has asked, and that is not why the run ends
-                    self.outcome = outcome
-                self._heard = now
-            case Reported(report):
-                if isinstance(report, Status):
-                    self._take_status(report.status, now)
-                self._heard = now
-            case GatewayReady():
-                self._gateway_ready = True
-                actions = () if self.is_ending else self._starts(*self._terms.nodes)
-            case Ended(name, code):
-                self._running.discard(name)
-                self._take_end(name, code, now)
-            case Seen(running, stopped):
-                self._running &= running
-                self._take_stopped(stopped, now)
-            case InterruptAsked():
-                actions = self._interrupt(now)
-        quiet = isinstance(event, TimePassed) and event.quiet
-        return [*actions, *(self._end_on(now, quiet=quiet) if self.is_ending else self._go_on(now, quiet=quiet))]
-
-    def end(self, now: float) -> Sequence[Action]:
-        """Wait only for the end from now on, however far the run has come. May be called twice."""
-        if self.is_ending:
-            return ()
-        limits, outcome = self._terms.deadlines, self.outcome
-        patience_s = limits.leave if outcome is not None else limits.leave_lost
-        if outcome is not None and outcome.error is None:  # the gateway may still have samples for ROS
-            patience_s = limits.finish
-        self._phase, self._until = _Phase.LEAVING, now + patience_s
-        return (FinishServer(), Look())
-
-    def _starts(self, *names: str) -> Sequence[Action]:
-        self._running.update(names)
-        return [Start(name) for name in names]
-
     # --- what happens
 
-    def _take_status(self, status: MeshStatus, now: float) -> None:
-        self._status = status
-        ended = self._gateway_ended
-        if status.state in GOING_ON and ended is not None and now - ended > self._terms.deadlines.gateway:
-            self._gateway_ended = None
-            self._lost.append(_Loss(GATEWAY, 0, ended))
+    def reported(self, event: Event, now: float) -> None:
+        """The master has sent an event."""
+        self._heard = now
+        if isinstance(event, Outcome):
+            asked = event.error is not None and event.error.kind == Interrupted.__name__
+            if not (self._signalled and asked):  # this process has asked, and that is not why the run ends
+                self.outcome = event
+        elif isinstance(event, Status):
+            self._status, ended = event.status, self._gateway_ended
+            limit = self._terms.deadlines.gateway
+            if event.status.state in GOING_ON and ended is not None and now - ended > limit:
+                self._gateway_ended = None
+                self._lost.append(_Loss(GATEWAY, 0, ended))
 
-    def _take_end(self, name: str, code: int, now: float) -> None:
+    def gateway_ready(self) -> Sequence[Action]:
+        """The gateway has declared everything and misses no sample any more."""
+        self._gateway_ready = True
+        return () if self.is_ending else self._starts(*self._terms.nodes)
+
+    def ended(self, name: str, code: int, now: float) -> None:
+        """A process has ended with an exit code: the negative number of a signal if it was one."""
+        self._running.discard(name)
         if name == SERVER:  # it ends after all others, or is lost, whatever the master reports of what that means
             if code != 0 and self._how.get(name) != _UNTOLD:  # otherwise this process has killed it
                 self._how[name] = how_it_ended(code)
@@ -272,12 +204,13 @@ class LaunchState:
         elif name == GATEWAY:
             self._gateway_ended = now
 
-    def _take_stopped(self, stopped: Sequence[str], now: float) -> None:
-        """Find processes that are stopped before the run begins: the others would only notice at the deadline."""
+    def seen(self, running: Collection[str], stopped: Sequence[str], now: float) -> None:
+        """Which processes run, and which of them are stopped by a signal."""
+        self._running &= {*running}
         if self.is_ending:
             if not self._signalled:
                 self._how = dict.fromkeys(stopped, STOPPED) | self._how
-        elif self._starting:
+        elif self._starting:  # later, the others notice one that is stopped; now they would only at the deadline
             met = {THE_MASTER: self._status is not None, GATEWAY: self._gateway_ready}
             self._stopped_since = {n: self._stopped_since.get(n, now) for n in stopped if not met.get(n)}
             for name, since in self._stopped_since.items():
@@ -285,12 +218,8 @@ class LaunchState:
                     self._how[name] = STOPPED
                     self._lost.append(_Loss(name, -signal.SIGSTOP, now))
 
-    @property
-    def _starting(self) -> bool:
-        return self._status is None or self._status.state == "starting"
-
-    def _interrupt(self, now: float) -> Sequence[Action]:
-        """The first time, the master ends the run in order; the second time, nobody waits for that."""
+    def interrupted(self, now: float) -> Sequence[Action]:
+        """Somebody asks for the end: first the master ends the run in order; the second time, nobody waits for that."""
         if self._interrupted_at is None and THE_MASTER in self._running:
             self._interrupted_at = now
             return [Signal(THE_MASTER, signal.SIGTERM)]
@@ -299,15 +228,37 @@ class LaunchState:
             self._until = now
         return ()
 
+    @property
+    def _starting(self) -> bool:
+        return self._status is None or self._status.state == "starting"
+
+    def _starts(self, *names: str) -> Sequence[Action]:
+        self._running.update(names)
+        return [Start(name) for name in names]
+
     # --- what follows
 
-    def _go_on(self, now: float, *, quiet: bool) -> Sequence[Action]:
+    def go_on(self, now: float, *, quiet: bool) -> Sequence[Action]:
+        """What follows from what has happened, and from the time; ``quiet``: nothing waits to be handled."""
+        if self.is_ending:
+            return self._end_on(now, quiet=quiet)
         if self._is_decided(now, quiet=quiet):
             return self.end(now)
         if quiet or (self._starting and now - self._looked >= self._terms.deadlines.look):
             self._looked = now
             return [Look()]
         return ()
+
+    def end(self, now: float) -> Sequence[Action]:
+        """Wait only for the end from now on, however far the run has come. May be called twice."""
+        if self.is_ending:
+            return ()
+        limits, outcome = self._terms.deadlines, self.outcome
+        patience_s = limits.leave if outcome is not None else limits.leave_lost
+        if outcome is not None and outcome.error is None:  # the gateway may still have samples for ROS
+            patience_s = limits.finish
+        self._phase, self._until = _Phase.LEAVING, now + patience_s
+        return (FinishServer(), Look())
 
     def _is_decided(self, now: float, *, quiet: bool) -> bool:
         """Whether there is an outcome, or a reason not to wait for one."""
