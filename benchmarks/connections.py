@@ -15,9 +15,9 @@ import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import fmu_mesh
 from benchmarks.contestants.entry import FMUS
 from benchmarks.publishing import Figures, markdown_table
-from fmu_mesh.run.preparing import prepare
 
 __all__ = ["measured"]
 
@@ -50,7 +50,7 @@ def measured(rounds: int) -> Figures:
             for width, file in zip(widths, files, strict=True):
                 print(f"round {number + 1}: {width.connections} connections", file=sys.stderr)
                 started = time.perf_counter()
-                prepare(file)
+                fmu_mesh.load(file).plan()
                 width.seconds.append(time.perf_counter() - started)
     rows = [
         (

@@ -104,8 +104,8 @@ def _writer(format_: str, path: Path, variables: int) -> _Writer:
         return _Hdf5(path, [f"model.{name}" for name in _names(variables)], format_.partition("-")[2] or None)
     from fmu_mesh.results.formats import result_format  # noqa: PLC0415  as above
 
-    from fmu_mesh.config.loading import LoadedConfig  # noqa: PLC0415  what a format costs counts for it alone
-    from fmu_mesh.instances.configuration import parse  # noqa: PLC0415  as above
+    from fmu_mesh.config.loading import LoadedConfig, read_text  # noqa: PLC0415  what a format costs counts for it alone
+    from fmu_mesh.instances.configuration import examine_data  # noqa: PLC0415  as above
     from fmu_mesh.results.recording import Recording  # noqa: PLC0415  as above
     from fmu_mesh.variables.model_description import ModelDescription, Variable  # noqa: PLC0415  as above
 
@@ -117,7 +117,8 @@ def _writer(format_: str, path: Path, variables: int) -> _Writer:
         for number, name in enumerate(_names(variables))
     )
     description = ModelDescription("model", "model", "3.0", "co_simulation", "", own)
-    loaded = LoadedConfig(parse(text, Path("mesh.yaml")).config, Path("mesh.yaml"))
+    file = Path("mesh.yaml")
+    loaded = LoadedConfig(examine_data(read_text(text, file))[0].config, file)
     recorded = tuple(("model", name) for name in _names(variables))
     return found.open(path, Recording(loaded, {"model": description}, recorded))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 from ..config import loading
@@ -13,7 +12,7 @@ from ..config.mesh import Config, config_type
 from ..config.yaml_text import Plain
 from .registry import KINDS
 
-__all__ = ["examine_data", "installed_config", "parse"]
+__all__ = ["examine_data", "installed_config"]
 
 
 def examine_data(
@@ -21,17 +20,6 @@ def examine_data(
 ) -> tuple[LoadedConfig, Findings]:
     """A configuration and its findings, start values replaced; see `fmu_mesh.config.loading.examine_data`."""
     return loading.examine_data(plain, overrides, KINDS)
-
-
-def parse(text: str, path: Path, overrides: Mapping[str, Plain] = MappingProxyType({})) -> LoadedConfig:
-    """A configuration from the text of a file; relative paths and errors refer to ``path``.
-
-    Raises:
-        ConfigurationError: the structure is wrong; has all findings.
-    """
-    loaded, findings = examine_data(loading.read_text(text, path), overrides)
-    findings.raise_any()
-    return loaded
 
 
 def installed_config() -> type[Config]:

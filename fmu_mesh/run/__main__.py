@@ -9,14 +9,6 @@ from __future__ import annotations
 import gc
 import signal
 import sys
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .run_plan import NodeRun
 
 
 def main() -> int:
@@ -39,8 +31,14 @@ def main() -> int:
 
 def _run(role: str, *arguments: str) -> int:
     """Take a role in the run."""
+    # The launcher takes lines of UTF-8, and alone decides what of them a terminal can show. What a component prints is
+    # shown at once, not when the buffer is full.
+    for stream in (sys.stdout, sys.stderr):
+        stream.reconfigure(encoding="utf-8", errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]  # they are text files
     if role != "forks":
-        _job(role, *arguments)()
+        from .roles import job_of  # noqa: PLC0415 as above
+
+        job_of(role, *arguments)()
         return 0
     from setproctitle import setproctitle  # noqa: PLC0415 as above
 
@@ -50,63 +48,10 @@ def _run(role: str, *arguments: str) -> int:
     gc.disable()  # until `serve` has imported everything: as in `fmu_mesh.__main__`
     die_with_parent(signal.SIGKILL)  # which also ends a process that is stopped
     setproctitle("fmu-mesh fork server")
-    job = serve(int(arguments[0]), partial(_job, forks=True))
+    job = serve(int(arguments[0]))
     if job is not None:  # this is a process that the server has forked
         job()
     return 0
-
-
-def _job(role: str, plan: str, node: str = "", *, forks: bool = False) -> Callable[[], None]:
-    """Read what a process needs; returns what it does. The fork server calls this, and the result in a new process."""
-    file = Path(plan)
-    if role == "node":
-        from .roles import prepare_node  # noqa: PLC0415 only what the role needs
-        from .run_plan import read_node  # noqa: PLC0415 as above
-
-        run = read_node(file, node)
-        if forks:
-            prepare_node(run)
-        return partial(_be_node, run)
-    return partial(_be_master if role == "master" else _be_gateway, file)
-
-
-def _be_node(run: NodeRun) -> None:
-    from setproctitle import setproctitle  # noqa: PLC0415 as above
-
-    from .roles import run_node  # noqa: PLC0415 as above
-
-    setproctitle(f"fmu-mesh node {run.plan.node}")
-    # What a component prints is shown at once, not when the buffer is full.
-    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # it is a text file
-    run_node(run)
-
-
-def _be_master(file: Path) -> None:
-    from setproctitle import setproctitle  # noqa: PLC0415 as above
-
-    from ..errors import FmuMeshError  # noqa: PLC0415 as above
-    from .events import EventWriter  # noqa: PLC0415 as above
-    from .roles import run_master  # noqa: PLC0415 as above
-    from .run_plan import read_run  # noqa: PLC0415 as above
-
-    run = read_run(file)
-    setproctitle(f"fmu-mesh master {run.mesh}")
-    try:
-        run_master(run, EventWriter())
-    except FmuMeshError as error:
-        raise error.already_reported()  # noqa: B904 the launcher has the event and shows it
-
-
-def _be_gateway(file: Path) -> None:
-    from setproctitle import setproctitle  # noqa: PLC0415 as above
-
-    from .events import EventWriter  # noqa: PLC0415 as above
-    from .gateway_role import run_gateway  # noqa: PLC0415 as above
-    from .run_plan import read_run  # noqa: PLC0415 as above
-
-    run = read_run(file)
-    setproctitle(f"fmu-mesh gateway {run.mesh}")
-    run_gateway(run, EventWriter())
 
 
 if __name__ == "__main__":

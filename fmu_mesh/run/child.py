@@ -14,54 +14,19 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from ..errors import Interrupted
 from ..wire.runtime import is_stopped
-from .threads import ONE_THREAD
+from .fork_server import Forked
 
-__all__ = [
-    "Child",
-    "Process",
-    "executed",
-    "how_it_ended",
-    "is_other_python",
-    "own_command",
-    "own_environment",
-]
+__all__ = ["Child", "Process", "how_it_ended", "is_other_python"]
+
+Process = subprocess.Popen[bytes] | Forked
+"""A process that was started by exec, or by the fork server. It leads a process group of the number of its `pid`."""
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
-
-
-def own_command(*arguments: str, interpreter: str | None = None) -> list[str]:
-    """The program of the processes of a run (`fmu_mesh.run.__main__`) with these arguments.
-
-    It runs in this Python, or in ``interpreter``. With -P, Python does not look for modules in the current folder.
-    Otherwise a `random.py` of the user would be imported instead of that of the standard library.
-    """
-    return [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments]
-
-
-def own_environment() -> dict[str, str]:
-    """The environment of the processes of a run."""
-    # Without the last one, setproctitle would overwrite what `/proc/PID/environ` shows.
-    return os.environ | ONE_THREAD | {"SPT_NOENV": "1"}
-
-
-def executed(*arguments: str, interpreter: str | None = None) -> subprocess.Popen[bytes]:
-    """Start a process of a run by exec, with the arguments of `own_command`.
-
-    It has a session of its own, so that Ctrl-C reaches only the launcher.
-    """
-    return subprocess.Popen(
-        own_command(*arguments, interpreter=interpreter),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        env=own_environment(),
-    )
 
 
 def is_other_python(interpreter: str) -> bool:
@@ -71,42 +36,6 @@ def is_other_python(interpreter: str) -> bool:
     """
     own, other = Path(sys.executable), Path(interpreter)
     return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())
-
-
-class Process(Protocol):
-    """A process that was started by exec (`subprocess.Popen`) or by the fork server (`Forked`)."""
-
-    @property
-    def pid(self) -> int | None:
-        """Its process id; None before it has started. It leads a process group of this number."""
-        ...
-
-    @property
-    def stdin(self) -> IO[bytes] | None:
-        """The writing end of its standard input, if it has one of its own."""
-        ...
-
-    @property
-    def stdout(self) -> IO[bytes] | None:
-        """The reading end of its standard output, which is a pipe."""
-        ...
-
-    @property
-    def stderr(self) -> IO[bytes] | None:
-        """The same of its standard error."""
-        ...
-
-    def poll(self) -> int | None:
-        """None if it has not ended."""
-        ...
-
-    def wait(self) -> int:
-        """Wait for its end; returns its exit code."""
-        ...
-
-    def send_signal(self, number: int, /) -> None:
-        """Send a signal if it still runs."""
-        ...
 
 
 class Child:
@@ -141,13 +70,9 @@ class Child:
         output, errors = self._process.stdout, self._process.stderr
         assert output is not None
         assert errors is not None
-        read = self._read_beginning if limited else self._read
-        readers = [
-            threading.Thread(target=read, args=(output, on_line), daemon=True),
-            threading.Thread(target=read, args=(errors, lambda line: on_error_line(self.name, line)), daemon=True),
-        ]
-        waiter = threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)
-        self._threads = [*readers, waiter]
+        pipes = ((output, on_line), (errors, partial(on_error_line, self.name)))
+        readers = [threading.Thread(target=self._read, args=(*pipe, limited), daemon=True) for pipe in pipes]
+        self._threads = [*readers, threading.Thread(target=self._wait, args=(readers, on_exit), daemon=True)]
         for thread in self._threads:
             thread.start()
 
@@ -186,20 +111,13 @@ class Child:
             os.killpg(pid, number)
             self._left_others = True
 
-    # Each reader closes its pipe, because a process that was left behind may keep the other end open.
-
-    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        with pipe:
-            for line in pipe:
-                self._post(partial(on_line, line))
-
-    def _read_beginning(self, pipe: IO[bytes], on_line: Callable[[bytes], None]) -> None:
-        """Read everything, so that the process never blocks, but pass on only `_SHOWN_LINES` lines."""
+    def _read(self, pipe: IO[bytes], on_line: Callable[[bytes], None], limited: bool) -> None:  # noqa: FBT001  for a thread
+        """Read everything, so that the process never blocks; if ``limited``, pass on only `_SHOWN_LINES` lines."""
         count = 0
-        with pipe:
-            while line := pipe.readline(_LINE_BYTES):
+        with pipe:  # a process that was left behind may keep the other end open
+            while line := pipe.readline(_LINE_BYTES if limited else -1):
                 count += 1
-                if count <= _SHOWN_LINES:
+                if not limited or count <= _SHOWN_LINES:
                     self._post(partial(on_line, line))
                 elif count == _SHOWN_LINES + 1:
                     self._post(partial(on_line, b"(it writes a lot; nothing more of it is shown)"))

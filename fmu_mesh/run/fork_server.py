@@ -5,10 +5,27 @@ then forks a process for each request of its launcher. It loads no model. A fork
 shares the memory of all imported modules with the others.
 
 Launcher and server share a pair of sockets. A request has the arguments of `fmu_mesh.run.__main__`, and two descriptors
-for standard output and standard error. The server answers with the process id, and later with the exit code. It leaves
-an ended process as a zombie until the launcher knows the code, so that no other process can get its id before. When the
+for standard output and standard error. The server answers with the process id, and later with the exit code. When the
 launcher sends no more requests, the server ends after its last process.
 """
+
+# Who meets here (ADR 71). In the launcher: the thread of `Launcher.run`, which asks for processes, the thread "fork
+# server" of `ForkServer`, which takes what the server answers, and for each process the thread of `Child` that waits
+# for its end. `Forked` is what they share: what the server has told is set once, and the end is an `Event`. In the
+# server: one thread, because only the thread that forks is there in the new process, and every lock that another one
+# held would stay locked.
+#
+# Signals. SIGCHLD, SIGTERM and SIGINT of the server only write a byte into a pipe (the wakeup descriptor): the loop
+# reads it between two requests, so no handler ever runs in the middle of a fork. They are blocked around `os.fork`: a
+# signal for the server must not run its handler in the new process. The kernel signals the death of the launcher's
+# thread to the server, and the death of the server to all it has forked.
+#
+# What may go wrong. The server is killed: nobody can tell exit codes any more, so each `Forked` becomes an orphan, and
+# the code says that another process is missing. The server is stopped: it tells nothing, so `Forked.poll` asks the
+# kernel as well; and where the launcher is killed then, SIGTERM would wait in the server for ever. So the server has
+# SIGKILL for that until it forks, and afterwards a process whose standard input has ended wakes it
+# (`fmu_mesh.run.process`). A process ends: it stays a zombie until the launcher knows its code, or another process
+# could get its id, and a signal that was meant for it.
 
 from __future__ import annotations
 
@@ -21,18 +38,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from types import FrameType
+from functools import partial
 from typing import IO, Final
 
 import msgspec
 
 from ..errors import ConfigurationError, Interrupted, MeshLost
 from ..wire.runtime import is_alive
-from .child import own_command, own_environment
+from .threads import ONE_THREAD
 
-__all__ = ["ForkServer", "Forked", "fork_server", "serve", "started_ahead"]
+__all__ = ["ForkServer", "Forked", "executed", "fork_server", "serve", "started_ahead"]
 
 Job = Callable[[], None]
 """What a process does, from its start to its end."""
@@ -62,6 +79,25 @@ class _News(msgspec.Struct, frozen=True):
     code: int | None = None
 
 
+def executed(*arguments: str, interpreter: str | None = None, pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
+    """Start the program `fmu_mesh.run.__main__` by exec, with these arguments, in this Python or in ``interpreter``.
+
+    It has a session of its own, so that Ctrl-C reaches only the launcher.
+    """
+    return subprocess.Popen(
+        # With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
+        # imported instead of that of the standard library.
+        [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        pass_fds=pass_fds,
+        # Without the last one, setproctitle would overwrite what `/proc/PID/environ` shows.
+        env=os.environ | ONE_THREAD | {"SPT_NOENV": "1"},
+    )
+
+
 class ForkServer:
     """The fork server as its launcher sees it. It starts at once.
 
@@ -74,15 +110,7 @@ class ForkServer:
     def __init__(self) -> None:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            self.process = subprocess.Popen(
-                own_command("forks", str(theirs.fileno()), _ROOM),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                start_new_session=True,
-                pass_fds=(theirs.fileno(),),
-                env=own_environment(),
-            )
+            self.process = executed("forks", str(theirs.fileno()), _ROOM, pass_fds=(theirs.fileno(),))
         self._forked: list[Forked] = []
         self._reader = threading.Thread(target=self._read, name="fork server", daemon=True)
         self._reader.start()
@@ -208,13 +236,11 @@ class Forked:
         return self._code if self._code is not None else MeshLost.exit_code
 
 
-def serve(control: int, job: Callable[..., Job]) -> Job | None:
+def serve(control: int) -> Job | None:
     """Be the fork server. Returns in each forked process, with its job; in the server at its end, with None.
 
     Args:
         control: the descriptor of the server's end of the pair of sockets.
-        job: returns the job of a request from its arguments. It is called in the server: what it opens or reads, all
-            processes have that are forked later.
 
     Raises:
         ConfigurationError: the system starts no more processes.
@@ -222,18 +248,24 @@ def serve(control: int, job: Callable[..., Job]) -> Job | None:
     """
     from ..instances.registry import preload  # noqa: PLC0415 only the server needs it
     from ..system.run_metadata import versions  # noqa: PLC0415 as above
-    from . import roles  # noqa: F401, PLC0415 as above
+    from .roles import job_of  # noqa: PLC0415 as above
 
     preload()
     versions()
     gc.collect()
     gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
     gc.enable()
-    return _Server(control, job).run()
+    return _Server(control, partial(job_of, forks=True)).run()
 
 
 class _Server:
-    """The fork server itself."""
+    """The fork server itself.
+
+    Args:
+        control: see `serve`.
+        job: returns the job of a request from its arguments. It is called in the server: what it opens or reads, all
+            processes have that are forked later.
+    """
 
     def __init__(self, control: int, job: Callable[..., Job]) -> None:
         os.set_inheritable(control, False)  # noqa: FBT003 it takes no keyword
@@ -252,7 +284,9 @@ class _Server:
 
     def run(self) -> Job | None:
         """Serve; see `serve`."""
-        self._before = {number: signal.signal(number, _ignore) for number in _SIGNALS}
+        from .process import only_wake  # noqa: PLC0415 the launcher does without it
+
+        self._before = {number: signal.signal(number, only_wake) for number in _SIGNALS}
         signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
         while self._accepting or self._numbers:
             requests: list[int | socket.socket] = [self._control] if self._accepting else []
@@ -347,7 +381,3 @@ class _Server:
     def _tell(self, news: _News) -> None:
         with suppress(OSError):  # the launcher is gone
             self._control.send(msgspec.msgpack.encode(news))
-
-
-def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """The number of the signal is in the pipe."""

@@ -1,12 +1,25 @@
-"""A whole mesh in one process: `launch --local`, and what any distributed run must equal in every float.
+"""A whole mesh in one process: `launch --local`, `Mesh.run(processes=False)`, and what any distributed run must equal.
 
-The loop over the points of a `LocalSystem`, with what a run has around them: the result file, progress, the wall clock
-and the watch over FMUs that do not return.
+`LocalMesh` is the loop over the points of a `LocalSystem`, with what a run has around them: the result file, progress,
+the wall clock and the watch over FMUs that do not return. `InProcessRun` runs it on a thread of its own.
 """
+
+# Who meets here (ADR 12). The thread that called `InProcessRun.run` only waits. A thread of the run does all the work,
+# and alone calls FMUs. The thread of `CallWatch` takes a hang: the thread of the run is inside an FMU then and changes
+# nothing, so that the rows can be saved from outside. `interrupt` may come from any thread or a signal handler; a
+# thread "grace" gives up if the run does not come to its next point.
+#
+# What may go wrong: a call into an FMU that does not return cannot be ended from within a process. Then the run is over
+# for whoever waits for it, what was recorded is kept, and the thread is left. Neither signal handlers nor the process
+# as a whole are touched, so that a program can have several such runs. A process that ends with its run, as that of
+# `launch --local`, closes the instances after it has printed everything: an FMU may crash there.
 
 from __future__ import annotations
 
+import atexit
 import logging
+import os
+import sys
 import tempfile
 import threading
 import time
@@ -19,9 +32,9 @@ from types import MappingProxyType
 from ..config.loading import LoadedConfig
 from ..errors import FmuError, FmuMeshError, Interrupted, TerminationRequested
 from ..files import remove_tree
-from ..instances.call_guard import CallWatch, Guarded
+from ..instances.call_guard import ENDED, CallWatch, Guarded
 from ..instances.contract import Instance, LogMessage, Showing
-from ..instances.process_end import process_ends
+from ..instances.process_end import end_process, process_ends
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
 from ..recorder.row_buffer import RowBuffer
@@ -29,23 +42,30 @@ from ..results.growth import GrowthWatch
 from ..results.record_files import open_results, what_is_kept
 from ..system.layout import Layout
 from ..system.plan import Plan
+from ..wire.runtime import remove_stale_folders, run_folder, run_name
+from ..wire.views import LogLine, MeshStatus
+from .events import Event, Log, Status
 from .local_system import LocalSystem, opening_of
 from .one_process import OneProcess
-from .outcome import Outcome
+from .outcome import Outcome, outcome_at
+from .run_plan import RunPlan
 
-__all__ = ["LocalMesh"]
+__all__ = ["InProcessRun", "LocalMesh"]
 
 log = logging.getLogger(__name__)
 
 _ROWS = 1024
 _FLUSH_S = 0.2
+_STATUS_S = 0.1
+_GRACE_S = 1.0
+"""How long an interrupted run may take to come to its next point."""
 
 
 class LocalMesh:
     """Runs a plan in this process, as fast as its real-time factor allows.
 
     ```python
-    outcome = LocalMesh(prepare(Path("configs/pendulum_delay.yaml"))).run()
+    outcome = LocalMesh(fmu_mesh.load("configs/pendulum_delay.yaml").plan().plan).run()
     print(outcome.point, outcome.file)
     ```
 
@@ -134,30 +154,17 @@ class LocalMesh:
         try:
             self._run()
         except FmuMeshError as error:
-            error.with_hint(self._kept())
+            error.with_hint(what_is_kept(self.files))
             raise
         finally:
             if closes:
                 self.close()
-        ended_by = self._ended_by.report() if self._ended_by is not None else None
-        return Outcome(
-            state="done",
-            point=self.point,
-            time=self._plan.grid.time(self.point),
-            seconds=self._seconds,
-            rows=self.files[0][1] if self.files else 0,
-            file=self._plan.system.result_file,
-            ended_by=ended_by,
-            files=self.files,
-            warnings=self.warnings,
-        )
+        end, files, warnings = self._ended_by, self.files, self.warnings
+        return outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
 
     def close(self) -> None:
         """Close the instances and remove their files. May be called twice."""
         self._stack.close()
-
-    def _kept(self) -> str | None:
-        return what_is_kept(self.files)
 
     def _run(self) -> None:
         plan, system = self._plan, self._system
@@ -170,7 +177,8 @@ class LocalMesh:
         self._buffer = rows = RowBuffer(files, plan.grid, plan.system.records, types, self._growth)
         self._stack.callback(system.close)
         try:
-            system.start(partial(self._guarded, folder=self._folder, watch=watch))
+            timeouts = plan.system.config.timeouts
+            system.start(lambda name: Guarded(name, partial(self._open, name), watch, timeouts))
             started = time.perf_counter()
             self._begun = True
             try:
@@ -181,20 +189,18 @@ class LocalMesh:
         finally:
             self._save()
 
-    def _guarded(self, name: str, folder: Path, watch: CallWatch) -> Guarded:
-        return Guarded(name, lambda: self._open(name, folder), watch, self._plan.system.config.timeouts)
-
-    def _open(self, name: str, folder: Path) -> Instance:
+    def _open(self, name: str) -> Instance:
         if self._open_instance is not None:
             return self._open_instance(name)
-        return open_instance(opening_of(self._plan, name, folder, self._log, self._showing))
+        assert self._folder is not None
+        return open_instance(opening_of(self._plan, name, self._folder, self._log, self._showing))
 
     def _take_hang(self, error: FmuError) -> None:
         """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""
         if self._begun:
             error.at(self._system.begun_at, self._plan.grid.time(self._system.begun_at))
         self._save_from_outside()
-        self._on_hang(error.with_hint(self._kept()))
+        self._on_hang(error.with_hint(what_is_kept(self.files)))
 
     def _save_from_outside(self) -> None:
         with suppress(FmuMeshError):  # the process ends now for another reason
@@ -250,3 +256,135 @@ class LocalMesh:
             rows.close()
         finally:
             self.files = rows.counted
+
+
+class InProcessRun:
+    """Runs a plan in this process; it has the interface of `Launcher`.
+
+    Args:
+        run: the plan of the run.
+        on_event: called with every event, on the thread of the run.
+
+    Attributes:
+        outcome: how the run ended, also where `run` raises an error; None before.
+    """
+
+    def __init__(self, run: RunPlan, on_event: Callable[[Event], None]) -> None:
+        self.outcome: Outcome | None = None
+        self._run = run
+        self._on_event = on_event
+        self._started: float | None = None
+        self._told = 0.0
+        self._error: BaseException | None = None
+        self._over = threading.Event()
+        self._mesh: LocalMesh | None = None
+        self._interrupted = False
+        self._folder: Path | None = None
+
+    def run(self) -> Outcome:
+        """Run from the first to the last point.
+
+        Raises:
+            FmuMeshError: the run ended early, and why.
+        """
+        threading.Thread(target=self._work, name=f"run of {self._run.mesh}", daemon=True).start()
+        self._over.wait()
+        if self._error is not None:
+            if isinstance(self._error, FmuMeshError):
+                mesh = self._mesh
+                point, files, warnings = (mesh.point, mesh.files, mesh.warnings) if mesh is not None else (0, (), ())
+                self.outcome = outcome_at(self._run.plan, point, files, self._error, warnings=warnings)
+                self._on_event(self.outcome)
+            raise self._error
+        assert self.outcome is not None
+        self._on_event(self.outcome)
+        return self.outcome
+
+    def interrupt(self) -> None:
+        """From any thread: end the run at its next point; if it does not come there in time, without it."""
+        self._interrupted = True
+        if self._mesh is not None:
+            self._mesh.interrupt("interrupted")
+        threading.Thread(target=self._give_up, name="grace", daemon=True).start()
+
+    def _work(self) -> None:
+        try:
+            remove_stale_folders()
+            self._folder = folder = run_folder(self._run.mesh, run_name())
+            (fmus := folder / "fmus").mkdir()
+            self._mesh = mesh = LocalMesh(
+                self._run.plan,
+                self._log,
+                self._progress,
+                on_hang=self._end,
+                parent=fmus,
+                showing=self._run.showing,
+                loaded=self._run.loaded,
+                contents=self._run.contents,
+            )
+            if self._interrupted:
+                mesh.interrupt("interrupted")
+            self.outcome = mesh.run(closes=not process_ends())
+        except BaseException as error:  # noqa: BLE001 `run` raises it on the thread of the caller
+            self._error = self._error or error
+        if process_ends() and self._mesh is not None and not self._over.is_set():
+            self._close_at_exit(self._mesh)
+        self._leave()
+
+    def _close_at_exit(self, mesh: LocalMesh) -> None:
+        """Close the instances on this thread, when the process is about to end."""
+        ending, closed = threading.Event(), threading.Event()
+
+        def end() -> None:
+            with suppress(OSError):  # nobody reads it
+                sys.stdout.flush()
+            os.dup2(2, 1)  # standard output is for results, and not for what an FMU prints
+            ending.set()
+            closed.wait()  # each call has its deadline
+
+        atexit.register(end)
+        self._over.set()
+        ending.wait()
+        mesh.close()
+        self._leave()
+        closed.set()
+
+    def _give_up(self) -> None:
+        if not self._over.wait(_GRACE_S) and self._mesh is not None:
+            point = self._mesh.point
+            self._end(Interrupted("interrupted", point=point, time=self._run.plan.grid.time(point)))
+
+    def _end(self, error: FmuError | Interrupted) -> None:
+        """From another thread: the thread of the run does not return from an FMU."""
+        assert self._mesh is not None
+        self._mesh.clean_up()
+        if self._over.is_set():  # the outcome is printed
+            self._leave()
+            sys.stderr.write(f"fmu-mesh: warning: {error}\n")
+            end_process()
+        self._error = error.saying(error.message.removesuffix(ENDED))  # here, the process goes on
+        self._leave()
+
+    def _leave(self) -> None:
+        if self._folder is not None:
+            remove_tree(self._folder)
+        self._over.set()
+
+    def _log(self, message: LogMessage) -> None:
+        point = self._mesh.point if self._mesh is not None else 0
+        self._on_event(Log(LogLine(message.instance, message.status, message.category, message.message, point)))
+
+    def _progress(self, point: int) -> None:
+        now = time.monotonic()
+        self._started = now if self._started is None else self._started
+        if now - self._told < _STATUS_S:
+            return
+        self._told = now
+        plan, elapsed = self._run.plan, now - self._started
+        rate = point / elapsed if elapsed > 0.0 else 0.0
+        progress = dict.fromkeys(plan.nodes, point)
+        grid = plan.grid
+        status = MeshStatus(
+            self._run.mesh, "running", point, grid.last_point, grid.time(point), rate, rate * grid.step_size, progress
+        )
+        self._on_event(Status(status))

@@ -14,6 +14,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from msgspec.structs import replace
+
 from ..errors import FmuError, InitializationFailed, NotFinite, TerminationRequested
 from ..instances.call_guard import Guarded, doing
 from ..instances.contract import LogMessage, Opening, Showing
@@ -25,12 +27,13 @@ from ..rings.value_change import ValueChange
 from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
 from ..system.coupling_rule import CouplingRule
-from ..system.initialization_plan import Loop, Tear
+from ..system.initialization_plan import Loop
 from ..system.layout import Layout
-from ..system.plan import InstancePlan, Plan
+from ..system.plan import Plan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
 from ..variables.value_types import Value
+from .run_plan import opening_in
 from .threads import one_thread_meanwhile
 
 __all__ = ["LocalSystem", "SavedSystem", "opening_of"]
@@ -218,14 +221,15 @@ class LocalSystem:
             for name, variable in loop.outputs:
                 members[name].set_initial_inputs(known, point.assumed)
                 known[(name, variable)] = members[name].instance.get_values([variable])[0]
-            consistent = point.update([self._brought(tear, known) for tear in loop.tears])
+            brought = []
+            for tear in loop.tears:
+                ends = tear.target, tear.input
+                c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == ends)
+                value = _at(known[c.source_instance, c.source.name], c.source_index)
+                brought.append(ValueChange.of_tear(tear).of(value, InitializationFailed))
+            consistent = point.update(brought)
         for name, variable in point.assumed:
             members[name].settled.add(variable)
-
-    def _brought(self, tear: Tear, known: dict[tuple[str, str], Value]) -> Value:
-        c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == (tear.target, tear.input))
-        value = _at(known[c.source_instance, c.source.name], c.source_index)
-        return ValueChange.of_tear(tear).of(value, InitializationFailed)
 
 
 class _SavedMember(NamedTuple):
@@ -254,7 +258,7 @@ class _Member:
     """
 
     def __init__(self, plan: Plan, name: str, instance: Guarded) -> None:
-        self.plan = _instance_plan(plan, name)
+        self.plan = plan.nodes[plan.node_of(name)].instance(name)
         self.connections = [c for c in plan.connections if c.target_instance == name]
         self.instance = instance
         self._inputs = Ring(self.plan.input_row, 1)
@@ -415,22 +419,8 @@ def opening_of(
     plan: Plan, name: str, folder: Path, log: Callable[[LogMessage], None], showing: Showing
 ) -> Opening[Any]:
     """What the kind of an instance gets to open it; its files go into ``folder``."""
-    own = _instance_plan(plan, name)
-    return Opening(
-        name=name,
-        path=Path(own.fmu),
-        section=own.section,
-        description=plan.system.instances[name].description,
-        folder=folder,
-        limits=plan.system.config.limits,
-        linear_inputs=own.linear_inputs,
-        log=log,
-        showing=showing,
-    )
-
-
-def _instance_plan(plan: Plan, name: str) -> InstancePlan:
-    return plan.nodes[plan.node_of(name)].instance(name)
+    node, description = plan.nodes[plan.node_of(name)], plan.system.instances[name].description
+    return replace(opening_in(node, name, description, folder, log), showing=showing)
 
 
 def _at(value: Value, index: tuple[int, ...]) -> Value:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
 
-from ..errors import ErrorReport
+from ..errors import ErrorReport, FmuMeshError
+from ..system.plan import Plan
 from ..wire.time_profile import MeshProfile
 
-__all__ = ["Outcome"]
+__all__ = ["Outcome", "outcome_at"]
 
 
 class Outcome(msgspec.Struct, frozen=True, tag="end"):
@@ -42,3 +44,28 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     signal: str | None = None
     files: tuple[tuple[str, int], ...] = ()
     warnings: tuple[str, ...] = ()
+
+
+def outcome_at(  # noqa: PLR0913  each is a field of its own
+    plan: Plan,
+    point: int,
+    files: Sequence[tuple[str, int]] = (),
+    error: FmuMeshError | None = None,
+    ended_by: FmuMeshError | None = None,
+    *,
+    seconds: float = 0.0,
+    warnings: Sequence[str] = (),
+) -> Outcome:
+    """The outcome of a run of ``plan`` whose last point is ``point``; failed if there is an error."""
+    return Outcome(
+        state="done" if error is None else "failed",
+        point=point,
+        time=plan.grid.time(point),
+        seconds=seconds,
+        rows=files[0][1] if files else 0,
+        file=plan.system.result_file,
+        error=error.report() if error is not None else None,
+        ended_by=ended_by.report() if ended_by is not None else None,
+        files=tuple(files),
+        warnings=tuple(warnings),
+    )

@@ -46,7 +46,10 @@ def with_options(plain: PlainConfig, options: PlanOptions) -> PlainConfig:
         named, keys, records = name == "config_values", path.split("."), data.get("record")
         option, place = option_text(name, {path: value} if named else getattr(options, name)), path
         if keys[0] == "record" and isinstance(records, list) and not named:
-            place, data = f"record[0].{keys[1]}", {**data, "record": _with_record(records, keys[1], value)}
+            # Of what stays in memory, or of variables that the option names, there is one section.
+            others = records[1:] if isinstance(value, str) and not value.endswith(IN_MEMORY) else []
+            first = _replaced(records[0] if records else None, keys[1:], value)
+            place, data = f"record[0].{keys[1]}", {**data, "record": [first, *others]}
         elif (problem := _problem(data, path, value)) is not None:
             if named:  # what is wrong with a whole section, the check of the file says
                 findings.add(option, *problem)
@@ -74,11 +77,8 @@ def _replacements(options: PlanOptions) -> Iterator[tuple[str, str, Any]]:
     for name, key in {"scenario": "scenario", "record": "record.variables", **keys}.items():
         value = getattr(options, name)
         if value is not None and (name, value) != ("record", "memory"):
-            yield name, key, str(value.absolute()) if isinstance(value, Path) else _as_list(value)
-
-
-def _as_list(value: Any) -> Any:  # noqa: ANN401  any value of an option
-    return list(value) if isinstance(value, tuple) else value
+            value = list(value) if isinstance(value, tuple) else value
+            yield name, key, str(value.absolute()) if isinstance(value, Path) else value
 
 
 def _problem(data: Plain, path: str, value: Plain) -> tuple[str, str, str | None] | None:
@@ -107,15 +107,6 @@ def _replaced(data: Plain, keys: Sequence[str], value: Plain) -> Any:  # noqa: A
         return value
     section = data if isinstance(data, dict) else {}
     return {**section, keys[0]: _replaced(section.get(keys[0]), keys[1:], value)}
-
-
-def _with_record(records: list[Plain], key: str, value: Plain) -> list[Plain]:
-    """The sections `record` with another value of a key of the first one.
-
-    Of what stays in memory, or of variables that the option names, there is one section.
-    """
-    others = records[1:] if isinstance(value, str) and not value.endswith(IN_MEMORY) else []
-    return [_replaced(records[0] if records else None, (key,), value), *others]
 
 
 def memory_file() -> Path:

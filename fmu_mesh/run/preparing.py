@@ -24,8 +24,7 @@ from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, claims, content, describe, expected_model
 from ..results.formats import check_record, warn_of_endings
-from ..ssp.configuration_files import read_configuration
-from ..system.plan import Plan, make_plan
+from ..system.plan import make_plan
 from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
 from ..system.scenario import Scenario
@@ -37,7 +36,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "plan_run", "planned", "prepare"]
+__all__ = ["KnownModels", "planned"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -105,33 +104,6 @@ class KnownModels:
         return found
 
 
-def prepare(
-    path: Path,
-    options: PlanOptions = PlanOptions(),  # noqa: B008 a frozen Struct
-    tell: Callable[[str], None] = lambda _text: None,
-) -> Plan:
-    """As `plan_run`, for callers that need only the plan of the mesh."""
-    return plan_run(path, options, tell).plan
-
-
-def plan_run(
-    path: Path,
-    options: PlanOptions = PlanOptions(),  # noqa: B008 a frozen Struct
-    tell: Callable[[str], None] = lambda _text: None,
-) -> RunPlan:
-    """Read, check and plan the configuration at ``path``.
-
-    Args:
-        path: the YAML file, or a package of SSP.
-        options: what replaces values of the file.
-        tell: called before something that takes long, such as compiling an FMU.
-
-    Raises:
-        ConfigurationError: the configuration or an FMU is wrong; carries all findings.
-    """
-    return planned(read_configuration(path), options, tell)
-
-
 def planned(
     values: PlainConfig,
     options: PlanOptions,
@@ -150,7 +122,9 @@ def planned(
         ConfigurationError: the configuration or an FMU is wrong; carries all findings.
     """
     loaded, findings = examine_data(with_options(values, options), dict(options.start_values or {}))
-    loaded = _located(loaded)
+    folder = loaded.file.absolute().parent  # paths become absolute where a section names other files than its model
+    located = {name: section.located(folder) for name, section in loaded.config.instances.items()}
+    loaded = replace(loaded, config=replace(loaded.config, instances=located))
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
     check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
     obstacles = loaded.findings()
@@ -167,7 +141,7 @@ def planned(
 
         resolve(loaded, descriptions, findings)
     scenario = _scenario(loaded, descriptions, findings)
-    sections = loaded.config.instances
+    sections = located
 
     def claimed(name: str) -> Claims:
         own = placed(sections[name])
@@ -246,7 +220,11 @@ def _descriptions(
         found = cache[model]
         if isinstance(found, LoadFailed):
             text = found.message.rstrip(".") + (f" ({found.hint.rstrip('.')})" if found.hint else "")
-            findings.append(loaded.finding(place, text, _expected(section, path), _similar(path)))
+            expected = expected_model(section)
+            if not _leads_somewhere(path) and _leads_somewhere(Path(section.path)):
+                expected += "; paths are relative to the configuration file"
+            near = None if files.exists(path) else nearest_file(path)
+            findings.append(loaded.finding(place, text, expected, near))
             continue
         descriptions[name] = found
         if loaded.config.is_strict(section):
@@ -255,24 +233,6 @@ def _descriptions(
     return descriptions, findings
 
 
-def _located(loaded: LoadedConfig) -> LoadedConfig:
-    """The configuration with absolute paths where a section names other files than its model."""
-    folder = loaded.file.absolute().parent
-    sections = {name: section.located(folder) for name, section in loaded.config.instances.items()}
-    return replace(loaded, config=replace(loaded.config, instances=sections))
-
-
-def _expected(section: InstanceSection, path: Path) -> str:
-    """In words, what the file of a model should be, where the one at ``path`` is not."""
-    elsewhere = not _leads_somewhere(path) and _leads_somewhere(Path(section.path))
-    return expected_model(section) + ("; paths are relative to the configuration file" if elsewhere else "")
-
-
 def _leads_somewhere(path: Path) -> bool:
     """Whether there is something at the path, or an archive that it leads into."""
     return files.exists(path) or files.archive_on_the_way(path) is not None
-
-
-def _similar(path: Path) -> str | None:
-    """The nearest existing file name, if there is no such file."""
-    return None if files.exists(path) else nearest_file(path)

@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Self
 
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, Interrupted
 from ..wire.runtime import (
     enter_run_folder,
     leave_run_folder,
@@ -27,7 +27,7 @@ from ..wire.runtime import (
 )
 from .run_plan import MANUAL
 
-__all__ = ["GRACE_S", "Interruption", "RunProcess", "die_with_parent", "ended_by_signals", "forked_by"]
+__all__ = ["GRACE_S", "Interruption", "RunProcess", "die_with_parent", "ended_by_signals", "forked_by", "only_wake"]
 
 GRACE_S = 1.0
 """How long the main thread may take to end the process before another thread does."""
@@ -183,7 +183,7 @@ def ended_by_signals(
 
     # The C handler writes the number at once, whichever thread gets the signal and whatever that thread is doing.
     wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-    handlers = {number: signal.signal(number, _ignore) for number in (signal.SIGTERM, signal.SIGINT)}
+    handlers = {number: signal.signal(number, only_wake) for number in (signal.SIGTERM, signal.SIGINT)}
     watcher = threading.Thread(target=wait_for_signal, name="signals", daemon=True)
     watcher.start()
     if watch_stdin:
@@ -212,7 +212,7 @@ def _exit(reason: str, *, reported: bool) -> None:
     """End the process although its main thread does not return; say why, unless the launcher does."""
     if not reported:
         os.write(2, f"fmu-mesh: {reason}\n".encode())
-    os._exit(130)
+    os._exit(Interrupted.exit_code)
 
 
 def die_with_parent(number: signal.Signals = signal.SIGTERM) -> None:
@@ -227,5 +227,5 @@ def forked_by(server: int) -> None:
     die_with_parent()
 
 
-def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """The thread that reads the wakeup descriptor does the work."""
+def only_wake(_number: int, _frame: FrameType | None) -> None:
+    """The handler of a signal whose number whoever reads the wakeup descriptor gets."""

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 
 from ..errors import ConfigurationError, FmuMeshError, Interrupted
-from ..printing import OutputFailed, guard_streams, paragraph
+from ..printing import OutputFailed, paragraph
 from .limits import address_space_problem, out_of_memory
 
 __all__ = ["exit_code_of"]
@@ -22,7 +22,6 @@ def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = F
         needed_mib: the address space that the command needs, in MiB.
         debug: raise an error instead of writing it.
     """
-    guard_streams()
     code = 0
     try:
         code = _code_of(command, needed_mib, debug=debug)
@@ -38,7 +37,16 @@ def exit_code_of(command: Callable[[], int], needed_mib: int, *, debug: bool = F
 
 def _code_of(command: Callable[[], int], needed_mib: int, *, debug: bool) -> int:
     try:
-        return _run(command, needed_mib)
+        _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
+        if (lack := address_space_problem(needed_mib)) is not None:
+            raise lack
+        try:
+            return command()
+        except (MemoryError, OSError, RuntimeError, ImportError) as error:
+            problem = out_of_memory(error)  # a problem of this host and not an internal error
+            if problem is None:
+                raise
+            raise problem from error
     except FmuMeshError as error:
         if debug:
             raise
@@ -48,20 +56,6 @@ def _code_of(command: Callable[[], int], needed_mib: int, *, debug: bool) -> int
     except KeyboardInterrupt:
         sys.stderr.write("fmu-mesh: interrupted\n")
         return Interrupted.exit_code
-
-
-def _run(command: Callable[[], int], needed_mib: int) -> int:
-    """Run the command. A lack of memory is a problem of this host and not an internal error."""
-    _start_logging(os.environ.get("FMU_MESH_LOG") or "WARNING")
-    if (lack := address_space_problem(needed_mib)) is not None:
-        raise lack
-    try:
-        return command()
-    except (MemoryError, OSError, RuntimeError, ImportError) as error:
-        problem = out_of_memory(error)
-        if problem is None:
-            raise
-        raise problem from error
 
 
 def _start_logging(level: str) -> None:

@@ -39,7 +39,7 @@ from ..rings.host_memory import HostMemory
 from ..system.plan import Plan, make_plan
 from .local_system import opening_of
 from .one_process import OneProcess
-from .outcome import Outcome
+from .outcome import Outcome, outcome_at
 from .row_writer import RowWriter
 from .run_plan import RunPlan
 from .threads import LimitedThreads
@@ -257,20 +257,11 @@ class _Run:
 
     def _outcome(self) -> Outcome:
         """How a run ended that did not fail."""
-        time_s, writer = self._plan.grid.time(self.point), self.writer
-        ended_by = self._first[1].report() if self._first is not None else None
-        file, rows = writer.counted[0] if writer.counted else (None, 0)
-        return Outcome(
-            "done",
-            self.point,
-            time_s,
-            self._seconds,
-            rows,
-            file,
-            ended_by=ended_by,
-            files=writer.counted,
-            warnings=writer.warnings,
+        writer, end = self.writer, self._first[1] if self._first is not None else None
+        outcome = outcome_at(
+            self._plan, self.point, writer.counted, None, end, seconds=self._seconds, warnings=writer.warnings
         )
+        return replace(outcome, file=writer.counted[0][0] if writer.counted else None)
 
     def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         if self._around.before_close is not None:

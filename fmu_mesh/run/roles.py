@@ -9,11 +9,12 @@ import logging
 import os
 import shlex
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
+from msgspec.structs import replace
+from setproctitle import setproctitle
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
@@ -30,15 +31,55 @@ from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .child import is_other_python
-from .events import Event, Log, Reachable, Status
-from .outcome import Outcome
+from .events import Event, EventWriter, Log, Reachable, Status
+from .outcome import Outcome, outcome_at
 from .process import RunProcess
-from .run_plan import MANUAL, NodeRun, RunPlan
+from .run_plan import MANUAL, NodeRun, RunPlan, opening_in, read_node, read_run
 from .wiring import patient, wiring
 
-__all__ = ["prepare_node", "run_master", "run_node"]
+__all__ = ["job_of", "run_master", "run_node"]
 
 log = logging.getLogger(__name__)
+
+
+def job_of(role: str, plan: str, node: str = "", *, forks: bool = False) -> Callable[[], None]:
+    """What a process does that the launcher starts: as a `node`, as the `master`, or as the `gateway`.
+
+    Args:
+        role: one of the three.
+        plan: the file of the run plan.
+        node: name of the node.
+        forks: whether the process is forked from this one. Then what several nodes need is done here, once, such as
+            extracting the FMU of all.
+    """
+    file = Path(plan)
+    if role == "node":
+        run = read_node(file, node)
+        for item in run.plan.instances if forks else ():
+            with suppress(FmuMeshError):  # the node says it
+                prepare(_opening(run, item.name, run_folder(run.plan.mesh, run.run)))
+
+        def be_node() -> None:
+            setproctitle(f"fmu-mesh node {node}")
+            run_node(run)
+
+        return be_node
+
+    def be_other() -> None:
+        run = read_run(file)
+        setproctitle(f"fmu-mesh {role} {run.mesh}")
+        if role == "gateway":
+            from .gateway_role import run_gateway  # noqa: PLC0415  most runs have none
+
+            run_gateway(run, EventWriter())
+            return
+        try:
+            run_master(run, EventWriter())
+        except FmuMeshError as error:
+            error.already_reported()  # the launcher has the event and shows it
+            raise
+
+    return be_other
 
 
 def run_node(run: NodeRun) -> None:
@@ -75,7 +116,7 @@ class _NodeProcess:
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
         publishes = f"{Keys(plan.key_prefix, plan.mesh).root}/**"
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
-        own = msgspec.structs.replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
+        own = replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
         session = open_session(own)
         process.stack.callback(close_session, session)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
@@ -133,27 +174,9 @@ def _opening(
     run: NodeRun, name: str, folder: Path, log: Callable[[LogMessage], None] = lambda _message: None
 ) -> Opening[Any]:
     """How an instance is opened in this process, in the folder of the run."""
-    item, model = run.plan.instance(name), run.models[name]
-    return Opening(
-        name=name,
-        path=Path(item.fmu),
-        section=item.section,
-        description=model.description,
-        folder=fmu_folder(folder),
-        content=model.content,
-        limits=run.plan.limits,
-        linear_inputs=item.linear_inputs,
-        log=log,
-        showing=run.showing,
-    )
-
-
-def prepare_node(run: NodeRun) -> None:
-    """Before the process of a node is forked: do once what several nodes need, such as extracting the FMU of all."""
-    folder = run_folder(run.plan.mesh, run.run)
-    for item in run.plan.instances:
-        with suppress(FmuMeshError):  # the node says it
-            prepare(_opening(run, item.name, folder))
+    model = run.models[name]
+    opening = opening_in(run.plan, name, model.description, fmu_folder(folder), log)
+    return replace(opening, content=model.content, showing=run.showing)
 
 
 def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
@@ -170,12 +193,20 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
             session = open_session(own)
             process.stack.callback(close_session, session)
-            settings = _settings(run, process, own_endpoints(session, own) if zenoh.mode == "peer" else ())
+            ends = own_endpoints(session, own) if zenoh.mode == "peer" else ()
+            ends = ends or tuple(config.zenoh.connect)  # a client is reached through its router
+            settings = MasterSettings(
+                endpoints=tuple(sorted(ends, key=is_socket, reverse=True)),
+                config_file=str(run.loaded.file),
+                launch=process.launch,
+                profile=run.profile,
+                paused=run.paused,
+            )
             master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))
             process.stack.callback(master.close)
             master.claim()
         except FmuMeshError as error:  # before the first point, such as at a port that is in use
-            emit(Outcome("failed", 0, plan.grid.time(0), 0.0, 0, plan.system.result_file, error.report()))
+            emit(outcome_at(plan, 0, error=error))
             raise
         endpoints, file = settings.endpoints, settings.config_file
         if not process.is_child:
@@ -186,7 +217,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         try:
             if RECORDER in plan.nodes:
                 results = open_results(run.loaded, plan.system, digest=plan.digest, contents=run.contents)
-                with Recorder(
+                recorder = Recorder(
                     plan.nodes[RECORDER],
                     session,
                     results,
@@ -195,9 +226,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     notes=process.folder if process.is_child else None,
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
-                ) as recorder:
-                    master.run()
-            else:
+                )
+            with recorder or nullcontext():
                 master.run()
         except FmuMeshError as error:
             failure = error
@@ -209,37 +239,20 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         return outcome
 
 
-def _settings(run: RunPlan, process: RunProcess, own: tuple[str, ...]) -> MasterSettings:
-    """The settings of a master whose session listens at ``own``; a client is reached through its router."""
-    endpoints = own or tuple(run.loaded.config.zenoh.connect)
-    return MasterSettings(
-        endpoints=tuple(sorted(endpoints, key=is_socket, reverse=True)),
-        config_file=str(run.loaded.file),
-        launch=process.launch,
-        profile=run.profile,
-        paused=run.paused,
-    )
-
-
 def _outcome_of(
     run: RunPlan, master: Master, recorder: Recorder | None, error: FmuMeshError | None, signal: str | None
 ) -> Outcome:
-    status = master.last_status()
-    files = recorder.files if recorder is not None else ()
-    return Outcome(
-        state="done" if error is None else "failed",
-        point=status.point,
-        time=status.time,
+    files, warnings = (recorder.files, recorder.warnings) if recorder is not None else ((), ())
+    outcome = outcome_at(
+        run.plan,
+        master.last_status().point,
+        files,
+        error,
+        master.ended_by if error is None else None,
         seconds=master.seconds,
-        rows=files[0][1] if files else 0,
-        file=run.plan.system.result_file,
-        error=error.report() if error is not None else None,
-        ended_by=master.ended_by.report() if master.ended_by is not None and error is None else None,
-        profile=master.profile(),
-        signal=signal,
-        files=files,
-        warnings=(*(recorder.warnings if recorder is not None else ()), *master.warnings),
+        warnings=(*warnings, *master.warnings),
     )
+    return replace(outcome, profile=master.profile(), signal=signal)
 
 
 class _Emitter:

@@ -5,7 +5,8 @@ Owns the file through which they get it. Each process decodes only the parts of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,7 +16,7 @@ from msgspec.structs import replace
 from ..config.loading import LoadedConfig
 from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError
-from ..instances.contract import Showing
+from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
 from ..simtime import ENDLESS
 from ..system.layout import row_bytes
@@ -24,15 +25,13 @@ from ..text import counted, listed, nearest
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
 
-__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "read_node", "read_run"]
+__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "opening_in", "read_node", "read_run"]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
 
 _FILE_NAME = "run.plan"
 _MOST_BYTES = 1 << 30
-_ELSEWHERE = ModelDescription("", "", "", "co_simulation", "", ())
-"""Stands in the file where a model description would stand a second time."""
 
 T = TypeVar("T")
 
@@ -73,7 +72,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that follows from a configuration and the options of one run.
 
     ```python
-    run = plan_run(Path("configs/pendulum_delay.yaml"), PlanOptions(window=64))
+    run = fmu_mesh.load("configs/pendulum_delay.yaml").plan(window=64)
     file = run.write(folder)
     read_node(file, "pendulum").plan.window  # in another process
     ```
@@ -151,7 +150,10 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             zenoh=self.zenoh(),
             showing=self.showing,
             plan=replace(plan.nodes[name], restarts=self.restarts),
-            models={item.name: self._model(item.name) for item in plan.nodes[name].instances},
+            models={
+                item.name: PlannedModel(plan.system.instances[item.name].description, self.contents[item.name])
+                for item in plan.nodes[name].instances
+            },
         )
 
     def write(self, folder: Path) -> Path:
@@ -159,42 +161,38 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
         """
-        system = self.plan.system
-        bare = {name: replace(own, description=_ELSEWHERE) for name, own in system.instances.items()}
-        rest = replace(self, plan=replace(self.plan, nodes={}, system=replace(system, instances=bare)))
-        parts = _Parts(
-            config_file=self.config_file,
-            run=self.run,
-            restarts=self.restarts,
-            zenoh=self.loaded.config.zenoh,
-            showing=self.showing,
-            nodes={name: _encoded(plan) for name, plan in self.plan.nodes.items()},
-            models={name: _encoded(self._model(name)) for name in system.instances},
-            rest=_encoded(rest),
-        )
+        nodes = {name: _encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
         file = folder / _FILE_NAME
         try:
-            file.write_bytes(_encoded(parts))
+            file.write_bytes(_encoded(_Parts(nodes, _encoded(self))))
         except OSError as error:
             text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
         return file
 
-    def _model(self, instance: str) -> PlannedModel:
-        return PlannedModel(self.plan.system.instances[instance].description, self.contents[instance])
-
 
 class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file: what every node needs, and the parts that are decoded only where they are needed."""
+    """The file. Each process decodes one part of it; what several of them need stands in each."""
 
-    config_file: Path
-    run: str
-    restarts: int
-    zenoh: ZenohConfig
-    showing: Showing
     nodes: dict[str, msgspec.Raw]
-    models: dict[str, msgspec.Raw]
-    rest: msgspec.Raw
+    run: msgspec.Raw
+
+
+def opening_in(
+    node: NodePlan, name: str, description: ModelDescription, folder: Path, log: Callable[[LogMessage], None]
+) -> Opening[Any]:
+    """What the kind of an instance gets to open it; its files go into ``folder``."""
+    item = node.instance(name)
+    return Opening(
+        name=name,
+        path=Path(item.fmu),
+        section=item.section,
+        description=description,
+        folder=folder,
+        limits=node.limits,
+        linear_inputs=item.linear_inputs,
+        log=log,
+    )
 
 
 def read_node(file: Path, name: str) -> NodeRun:
@@ -206,15 +204,7 @@ def read_node(file: Path, name: str) -> NodeRun:
     parts = _read(file)
     if name not in parts.nodes:
         raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
-    plan = _decoded(file, parts.nodes[name], NodePlan)
-    return NodeRun(
-        config_file=parts.config_file,
-        run=parts.run,
-        zenoh=parts.zenoh,
-        showing=parts.showing,
-        plan=replace(plan, restarts=parts.restarts),
-        models={item.name: _decoded(file, parts.models[item.name], PlannedModel) for item in plan.instances},
-    )
+    return _decoded(file, parts.nodes[name], NodeRun)
 
 
 def read_run(file: Path) -> RunPlan:
@@ -223,13 +213,7 @@ def read_run(file: Path) -> RunPlan:
     Raises:
         ConfigurationError: it cannot be read, or is no run plan.
     """
-    parts = _read(file)
-    run = _decoded(file, parts.rest, RunPlan)
-    models = {name: _decoded(file, raw, PlannedModel) for name, raw in parts.models.items()}
-    system = run.plan.system
-    instances = {name: replace(own, description=models[name].description) for name, own in system.instances.items()}
-    nodes = {name: _decoded(file, raw, NodePlan) for name, raw in parts.nodes.items()}
-    return replace(run, plan=replace(run.plan, nodes=nodes, system=replace(system, instances=instances)))
+    return _decoded(file, _read(file).run, RunPlan)
 
 
 def _read(file: Path) -> _Parts:
@@ -244,26 +228,17 @@ def _read(file: Path) -> _Parts:
 
 
 def _encoded(value: object) -> msgspec.Raw:
-    return msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=_path_to_text))
+    return msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=os.fspath))
 
 
 def _decoded(file: Path, data: bytes | msgspec.Raw, type_: type[T]) -> T:
+    def decoded_value(of_type: type[Any], value: object) -> object:
+        return Path(value) if of_type is Path and isinstance(value, str) else decode_section(of_type, value)
+
     try:
-        return msgspec.msgpack.decode(data, type=type_, dec_hook=_decoded_value)
+        return msgspec.msgpack.decode(data, type=type_, dec_hook=decoded_value)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise ConfigurationError(f"'{file}' is no run plan of this version of fmu_mesh: {error}.") from error
-
-
-def _path_to_text(value: object) -> str:
-    if isinstance(value, Path):
-        return str(value)
-    raise NotImplementedError(f"a {type(value).__name__} cannot be part of a run plan")
-
-
-def _decoded_value(type_: type[Any], value: object) -> object:
-    if type_ is Path and isinstance(value, str):
-        return Path(value)
-    return decode_section(type_, value)
 
 
 def _no_node(plan: Plan, name: str) -> ConfigurationError:

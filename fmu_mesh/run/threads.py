@@ -11,7 +11,6 @@ import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from functools import cache
 from threading import Lock
 from typing import Any, Final
 
@@ -36,41 +35,30 @@ def one_thread_from_now_on() -> None:
     os.environ.update(ONE_THREAD)
 
 
-class _Limits:
-    """The limits that the runs in this process share: they are lifted when the last run ends."""
+_lock = Lock()
+_running: list[object] = []
+"""The runs of this process that have limited the libraries; blocks of threads may overlap."""
 
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._running = 0
-        self._set: list[Any] = []
-
-    def begin(self) -> None:
-        """Limit all libraries that are loaded by now."""
-        from threadpoolctl import threadpool_limits  # noqa: PLC0415 slow, and only a run in this process needs it
-
-        with self._lock:
-            self._running += 1
-            self._set.append(threadpool_limits(1))
-
-    def end(self) -> None:
-        """One of those that have begun is over."""
-        with self._lock:
-            self._running -= 1
-            while self._set and not self._running:
-                self._set.pop().restore_original_limits()
-
-
-_limits = _Limits()
+_limits: list[Any] = []
+"""What they have limited; it is lifted when the last of them ends."""
 
 
 @contextmanager
 def one_thread_meanwhile() -> Iterator[None]:
     """In the block, let the libraries that this process has loaded use one thread; blocks of threads may overlap."""
-    _limits.begin()
+    from threadpoolctl import threadpool_limits  # noqa: PLC0415 slow, and only a run in this process needs it
+
+    run = object()
+    with _lock:
+        _running.append(run)
+        _limits.append(threadpool_limits(1))
     try:
         yield
     finally:
-        _limits.end()
+        with _lock:
+            _running.remove(run)
+            while _limits and not _running:
+                _limits.pop().restore_original_limits()
 
 
 class LimitedThreads:
@@ -115,10 +103,5 @@ def _libraries_loaded() -> int:
         found.append(library.contents.loaded)
         return 1  # the first one is enough: the count is that of the process
 
-    _linker().dl_iterate_phdr(_Look(look), None)
+    ctypes.CDLL(None).dl_iterate_phdr(_Look(look), None)
     return found[0]
-
-
-@cache
-def _linker() -> ctypes.CDLL:
-    return ctypes.CDLL(None)

@@ -8,8 +8,8 @@ import pytest
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place, write_config
+from tests.planning import prepare
 
 POINTS = 12_000
 SLOW_S = 0.0001

@@ -11,9 +11,9 @@ import yaml
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.equivalence.reference import Reference, as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place
+from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 PENDULUM, CHAPTER, CHAIN, CYCLE = "pendulum_delay", "chapter_library_example", "chain8", "cycle2"

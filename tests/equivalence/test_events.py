@@ -15,9 +15,9 @@ import yaml
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.event_fmus import Version
 from tests.helpers import Place
+from tests.planning import prepare
 
 EventFmu = Callable[..., Path]
 

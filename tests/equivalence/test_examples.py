@@ -18,7 +18,7 @@ from examples import integrated_node
 from fmu_mesh import FMIAdapter
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
+from tests.planning import prepare
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "chapter_library_example.yaml"

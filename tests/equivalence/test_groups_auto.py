@@ -11,10 +11,10 @@ import pytest
 from fmu_mesh.config.loading import read_file
 from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.pictures.plan_page import plan_page
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.system.process_sharing import automatic_nodes
 from tests.helpers import Place, rows_of, write_config
+from tests.planning import prepare
 
 ADDER = {"fmu": "Adder"}
 INTEGRATOR = {"fmu": "Integrator"}

@@ -9,8 +9,8 @@ import pytest
 
 from fmu_mesh.errors import LoopNotConverged
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place, rows_of, write_config
+from tests.planning import prepare
 
 CONNECTIONS = ("pendulum.a -> sum.u1", "sum.y -> a.u", "a.y -> b.u", "b.y -> sum.u2", "b.y -> end.u")
 

@@ -13,9 +13,9 @@ import pytest
 
 from fmu_mesh.errors import FmuError, StepFailed
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+from tests.planning import prepare
 from tests.scenarios.scenario import Counter, Scenario
 
 MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])

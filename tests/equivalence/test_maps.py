@@ -14,11 +14,11 @@ import yaml
 
 import fmu_mesh
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import prepare
 from tests.equivalence.plain_loop import Wire, run_plainly
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import Place
+from tests.planning import prepare
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 

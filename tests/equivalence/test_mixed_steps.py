@@ -21,9 +21,9 @@ from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.local_system import opening_of
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import NodePlan, Plan
 from tests.helpers import FMUS, rows_of
+from tests.planning import prepare
 from tests.scenarios.engines import EngineMesh, MakeEngine, burst_engine
 
 POINTS = 400

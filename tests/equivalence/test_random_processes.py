@@ -10,9 +10,9 @@ import msgspec
 import pytest
 import yaml
 
-from fmu_mesh.run.preparing import prepare
 from tests.equivalence.reference import as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place
+from tests.planning import prepare
 
 STEP_SIZE = 0.0078125
 MODELS: dict[str, tuple[tuple[str, ...], str, dict[str, tuple[float, float]]]] = {

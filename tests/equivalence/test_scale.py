@@ -16,9 +16,9 @@ import zenoh
 import fmu_mesh
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.wire.session import Wiring, open_session
 from tests.helpers import DEADLINE_S, FMUS, Place, wait_until, write_config
+from tests.planning import prepare
 
 
 @pytest.mark.parametrize(("instances", "groups"), [(64, 64), (256, 4)])

@@ -15,7 +15,6 @@ import yaml
 
 from fmu_mesh.api.open_system import System
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import plan_run
 from tests.equivalence import test_equivalence as meshes
 from tests.equivalence import test_events as events
 from tests.equivalence import test_initialization as loops
@@ -24,6 +23,7 @@ from tests.equivalence.reference import read_csv
 from tests.fmus.event_fmus import Version
 from tests.fmus.helpers import NO_COMPILER
 from tests.helpers import Place
+from tests.planning import plan_run
 
 EventFmu = Callable[..., Path]
 Rows = list[list[Any]]

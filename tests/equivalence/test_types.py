@@ -17,9 +17,9 @@ import yaml
 from fmu_mesh.cli.main import main
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import Place
+from tests.planning import prepare
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 

@@ -14,9 +14,9 @@ from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
 from tests.helpers import Place, wait_until, write_config
+from tests.planning import prepare
 
 shares = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import psutil
 import pytest
@@ -431,7 +431,8 @@ def test_a_process_that_is_left_behind_is_killed_although_its_end_was_known_firs
         stderr=subprocess.PIPE,
     )
     lines: list[bytes] = []
-    child = Child("one", _KnownLate(process), lambda action: action())
+    known_late = cast("subprocess.Popen[bytes]", _KnownLate(process))  # it has all of that
+    child = Child("one", known_late, lambda action: action())
     child.watch(lines.append, lambda _name, _line: None, lambda _name, _code: None)
     assert process.wait(DEADLINE_S) == 0
     wait_until(lambda: len(lines), "its line")

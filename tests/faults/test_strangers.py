@@ -29,10 +29,10 @@ from fmu_mesh.rings.native import NEVER
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
+from tests.planning import prepare
 
 WAYS = pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
 needs_memory = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")

@@ -20,8 +20,8 @@ from gymnasium.utils.env_checker import check_env
 import fmu_mesh
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place
+from tests.planning import prepare
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "cart_pole"
 

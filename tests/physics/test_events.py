@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from fmu_mesh.run.local import LocalMesh
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.event_fmus import Version
 from tests.helpers import rows_of, write_config
+from tests.planning import prepare
 
 EventFmu = Callable[..., Path]
 Row = tuple[float, ...]

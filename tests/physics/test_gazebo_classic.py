@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place, rows_of
+from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

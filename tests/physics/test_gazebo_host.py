@@ -23,10 +23,10 @@ from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from tests.helpers import FMUS
+from tests.planning import prepare
 
 WORLDS = Path(__file__).resolve().parents[2] / "configs" / "worlds"
 DOUBLE = Path(__file__).with_name("gazebo_double.py")

@@ -17,8 +17,8 @@ from scipy.integrate import solve_ivp
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.helpers import Place
+from tests.planning import prepare
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
+from tests.planning import prepare
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "path_filter.yaml"
 

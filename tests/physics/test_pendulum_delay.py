@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from fmu_mesh.run.local import LocalMesh
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.reference import Pendulum, angle_after
+from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 MAIN = "pendulum_delay"

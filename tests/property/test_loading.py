@@ -19,12 +19,13 @@ from fmu_mesh.config.loading import LoadedConfig, examine_data, read_text
 from fmu_mesh.config.mesh import MAX_WINDOW, Config, ConnectionConfig, SimulationConfig
 from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.instances.configuration import installed_config, parse
+from fmu_mesh.instances.configuration import installed_config
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.instances.registry import KINDS
 from fmu_mesh.system.system import build
 from fmu_mesh.text import nearest, option_text
 from fmu_mesh.variables.model_description import ModelDescription, Variable
+from tests.planning import parse
 
 FILE = Path("/nowhere/mesh.yaml")
 

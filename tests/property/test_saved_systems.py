@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 from fmu_mesh.api.open_system import System, SystemState
-from fmu_mesh.run.preparing import plan_run
 from tests.helpers import FMUS
+from tests.planning import plan_run
 
 H = 0.01
 OUTPUTS = ("slow.y", "fast.y", "delayed.y", "sum.y", "oscillator.x", "stairs.counter", "free.y", "pid.effort")

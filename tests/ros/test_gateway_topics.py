@@ -12,10 +12,10 @@ from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.ros.gateway.mapping import resolve
 from fmu_mesh.ros.messages.topics import RosPlan
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, write_config
+from tests.planning import prepare
 
 WORLDS = Path(__file__).resolve().parents[2] / "configs" / "worlds"
 TWIST = "geometry_msgs/msg/TwistStamped"

@@ -15,7 +15,7 @@ from fmu_mesh.config.structure import json_schema
 from fmu_mesh.errors import Finding
 from fmu_mesh.instances.configuration import installed_config
 from fmu_mesh.pictures.plan_page import plan_page
-from fmu_mesh.run.preparing import prepare
+from tests.planning import prepare
 
 FMUS = Path(__file__).parents[2] / "fmus"
 

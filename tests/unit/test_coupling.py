@@ -8,11 +8,12 @@ import pytest
 
 from fmu_mesh.config.loading import read_file
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.configuration import examine_data, parse
+from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.instances.position_pid import describe_pid
 from fmu_mesh.system.plan import Plan, make_plan
 from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Variable
+from tests.planning import parse
 
 FILE = Path("/models/configs/mesh.yaml")
 AXES = "xyz"

@@ -13,12 +13,12 @@ import pytest
 import yaml
 
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system import digest
 from fmu_mesh.system.digest import difference
 from fmu_mesh.system.plan import Plan
 from tests.fmus.packing import repacked, unpacked
 from tests.helpers import FMUS, write_config
+from tests.planning import prepare
 
 WORLDS = FMUS.parent / "configs" / "worlds"
 TRIANGLES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

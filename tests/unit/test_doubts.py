@@ -13,7 +13,6 @@ import fmu_mesh
 from fmu_mesh.adapter.argument_checks import Arguments
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, ConfigurationError, UnknownName
-from fmu_mesh.instances.configuration import parse
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.position_pid import describe_pid
 from fmu_mesh.instances.python.component_description import description_of
@@ -25,6 +24,7 @@ from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription
 from tests.fmus.helpers import FMUS
 from tests.fmus.packing import repacked
+from tests.planning import parse
 
 FMI_1 = """\
 <fmiModelDescription fmiVersion="1.0" modelName="m" modelIdentifier="m" guid="1" numberOfContinuousStates="0"

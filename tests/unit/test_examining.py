@@ -11,8 +11,8 @@ import yaml
 from fmu_mesh.errors import ConfigurationError, LoadFailed
 from fmu_mesh.instances.fmi.archive.archive import sha256_of
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.packing import repacked
+from tests.planning import prepare
 
 
 def with_document_type(declaration: str, inside: str) -> Callable[[str], str]:

@@ -15,8 +15,8 @@ import pytest
 from fmu_mesh import plugins
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances import registry
-from fmu_mesh.instances.configuration import parse
 from tests.helpers import Launched, Place
+from tests.planning import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUP = "fmu_mesh.instances"
@@ -138,8 +138,7 @@ def test_a_model_that_another_package_cannot_read_is_a_finding_about_the_file(pl
 
 
 def test_another_content_of_its_file_is_another_model(place: Place, mesh: Path) -> None:
-    program = "import sys; from pathlib import Path; from fmu_mesh.run.preparing import prepare\n"
-    program += "print(prepare(Path(sys.argv[1])).digest)"
+    program = "import sys, fmu_mesh; print(fmu_mesh.load(sys.argv[1]).plan().plan.digest)"
 
     def digest() -> str:
         done = place.start_command([sys.executable, "-c", program, str(mesh)])
@@ -223,8 +222,10 @@ def test_an_installation_that_is_older_than_its_source_is_told_how_to_install_ag
 
 def test_a_configuration_is_read_without_the_engines_of_its_kinds() -> None:
     program = (
-        "import sys; from pathlib import Path; from fmu_mesh.instances.configuration import parse\n"
-        f"parse({FMU_ONLY!r}.replace('}}}}', '}}, b: {{mujoco: b.xml}}, c: {{gazebo_classic: c.sdf}}}}'), Path('a'))\n"
+        "import sys; from pathlib import Path; from fmu_mesh.config.loading import read_text\n"
+        "from fmu_mesh.instances.configuration import examine_data\n"
+        f"text = {FMU_ONLY!r}.replace('}}}}', '}}, b: {{mujoco: b.xml}}, c: {{gazebo_classic: c.sdf}}}}')\n"
+        "examine_data(read_text(text, Path('a')))[1].raise_any()\n"
         "print([name for name in ('fmpy', 'mujoco', 'lxml', 'fmu_mesh.instances.fmi.opening',"
         " 'fmu_mesh.instances.mujoco.mujoco_world', 'fmu_mesh.instances.gazebo.gazebo_world') if name in sys.modules])"
     )

@@ -20,9 +20,9 @@ from fmu_mesh.instances.fmi.archive.archive import Terms, content_of, opened, sh
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract
 from fmu_mesh.instances.fmi.opening import open_instance
-from fmu_mesh.run.preparing import prepare
 from tests.fmus.helpers import FMUS
 from tests.fmus.packing import without_binaries
+from tests.planning import prepare
 from tests.unit.test_archive import HOSTILE
 
 GAIN = FMUS / "Gain.fmu"

@@ -13,7 +13,6 @@ import pytest
 
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.mesh import ConnectionConfig
-from fmu_mesh.instances.configuration import parse
 from fmu_mesh.pictures.plan_page import plan_page
 from fmu_mesh.system.connections import Variables, resolve_connections
 from fmu_mesh.system.layout import Layout
@@ -21,6 +20,7 @@ from fmu_mesh.system.plan import make_plan
 from fmu_mesh.system.point_loops import warn_of_point_loops
 from fmu_mesh.system.system import build
 from fmu_mesh.variables.model_description import ModelDescription, Variable
+from tests.planning import parse
 
 FILE = Path("/models/mesh.yaml")
 FEW, MANY = 50, 400

@@ -11,7 +11,8 @@ from fmu_mesh.config.loading import MAXIMUM_BYTES, LoadedConfig, read_file
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.config.yaml_text import MAXIMUM_DEPTH, Plain
 from fmu_mesh.errors import ConfigurationError, Finding
-from fmu_mesh.instances.configuration import examine_data, parse
+from fmu_mesh.instances.configuration import examine_data
+from tests.planning import parse
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 

@@ -21,9 +21,9 @@ from msgspec.structs import replace
 import fmu_mesh
 from fmu_mesh.api.open_system import System, SystemState
 from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed, UnknownName
-from fmu_mesh.run.preparing import plan_run
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import DEADLINE_S, wait_until, write_config
+from tests.planning import plan_run
 
 EventFmu = Callable[..., Path]
 
@@ -487,11 +487,10 @@ def test_a_system_that_is_lost_is_closed(tmp_path: Path, temporary: Path) -> Non
 
 PROGRAM = """
 import sys, threading
-from pathlib import Path
+import fmu_mesh
 from fmu_mesh.api.open_system import System
-from fmu_mesh.run.preparing import plan_run
 
-run = plan_run(Path(sys.argv[1]))
+run = fmu_mesh.load(sys.argv[1]).plan()
 kept = [System(run)]
 kept[0].step(10)
 state = kept[0].save()

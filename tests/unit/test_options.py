@@ -25,9 +25,9 @@ from fmu_mesh.errors import CallRefused, ConfigurationError
 from fmu_mesh.instances.configuration import examine_data, installed_config
 from fmu_mesh.run.options import PlanOptions, RunOptions
 from fmu_mesh.run.overriding import with_options
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.text import listed
 from tests.helpers import FMUS
+from tests.planning import prepare
 
 TEXT = """\
 mesh: one

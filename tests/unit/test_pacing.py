@@ -9,8 +9,8 @@ import pytest
 
 from fmu_mesh.master import pacing
 from fmu_mesh.master.pacing import Pacer, Reach
-from fmu_mesh.run.preparing import prepare
 from tests.helpers import write_config
+from tests.planning import prepare
 
 STEP_SIZE = 0.5
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.instances.configuration import parse
 from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.results.parquet_tail import ParquetTail
 from fmu_mesh.results.recording import Recording
 from fmu_mesh.variables.model_description import ModelDescription, Variable
+from tests.planning import parse
 
 CONFIG = "mesh: m\nsimulation: {stop_time: 1.0, step_size: 0.1}\ninstances: {a: {fmu: A.fmu}}\n"
 

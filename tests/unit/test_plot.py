@@ -27,10 +27,10 @@ from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.pictures.drawing import reduced
 from fmu_mesh.pictures.result_drawing import Curves, PictureOptions, figure_of
 from fmu_mesh.results.recording import Columns
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.variables.model_description import Variability
+from tests.planning import prepare
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

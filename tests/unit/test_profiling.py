@@ -12,10 +12,10 @@ import pytest
 from fmu_mesh.cli.main import main
 from fmu_mesh.cli.output.profile_table import critical_path, profile_page, show_profile, trace
 from fmu_mesh.master.pacing import GrantWatch
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.wire.time_profile import GRANT, Burst, MeshProfile, NodeProfile, UnitProfile, Wait
 from tests.helpers import write_config
+from tests.planning import prepare
 
 GAIN = {"fmu": "Gain"}
 

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig, read_text
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.configuration import examine_data, parse
+from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.overriding import with_options
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.variables.model_description import ModelDescription, Variable
+from tests.planning import parse
 from tests.unit.test_system import ARRAYS, DESCRIPTIONS, FILE, built, checked, findings_of, text
 
 ENDINGS = " or ".join(result_endings())

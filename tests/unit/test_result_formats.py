@@ -26,7 +26,6 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.instances.configuration import parse
 from fmu_mesh.results import parquet_file
 from fmu_mesh.results.csv_file import CsvFile
 from fmu_mesh.results.parquet_file import ParquetFile
@@ -39,6 +38,7 @@ from fmu_mesh.variables.model_description import ModelDescription, Variable
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, VariableType, is_float
 from tests.fmus.helpers import find_fmu
 from tests.helpers import write_config
+from tests.planning import parse
 
 Write = Callable[[str], bytes]
 

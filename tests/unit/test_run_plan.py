@@ -13,9 +13,9 @@ from fmu_mesh.instances.fmi.archive.archive import Terms, sha256_of
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.run.preparing import plan_run
 from fmu_mesh.run.run_plan import RunPlan, read_node, read_run
 from tests.helpers import FMUS
+from tests.planning import plan_run
 
 CONFIGS = FMUS.parent / "configs"
 

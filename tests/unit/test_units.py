@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.pictures.plan_page import plan_page
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.variables.units import BaseUnit, Linear, conversion
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import FMUS, write_config
+from tests.planning import prepare
 
 RAD = BaseUnit(rad=1)
 DEG = BaseUnit(rad=1, factor=0.017453292519943295)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.instances.configuration import parse
+from tests.planning import parse
 
 GOOD = """\
 mesh: pair
