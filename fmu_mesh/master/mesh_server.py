@@ -5,29 +5,24 @@ Queries and samples arrive on threads of Zenoh, and are posted to the main threa
 
 from __future__ import annotations
 
-import os
-import socket
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from typing import Literal, Protocol
 
 import msgspec
 import zenoh
 from msgspec.structs import replace
 
-from .. import __version__
 from ..errors import MessageRefused
-from ..system.plan import Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
-from ..wire.runtime import this_host
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import LogLine, MeshInfo, MeshStatus
+from ..wire.views import LogLine, MeshStatus
 
-__all__ = ["STATUS_S", "Events", "MasterServer", "mesh_info"]
+__all__ = ["STATUS_S", "Events", "MasterServer"]
 
 STATUS_S = 0.1
 """Time in s between two publications of the status."""
@@ -153,38 +148,3 @@ class MasterServer:
     def close(self) -> None:
         """Undeclare everything."""
         undeclare_all(self._entities, [self._status_publisher, self._log_publisher])
-
-
-def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
-    """What `mesh/info` answers.
-
-    Args:
-        plan: the plan of the whole mesh.
-        run: the run's id.
-        config_file: name of the configuration file.
-        endpoints: where tools can reach this process.
-        shared: the participants that get all messages through shared memory.
-    """
-    config = plan.system.config
-    grid = plan.grid
-    return MeshInfo(
-        mesh=config.mesh,
-        version=__version__,
-        run=run,
-        config=config_file,
-        start_time=grid.start_time,
-        stop_time=grid.stop_time,
-        step_size=grid.step_size,
-        algorithm=config.simulation.algorithm,
-        window=plan.window,
-        real_time_factor=config.simulation.real_time_factor,
-        instances=tuple(plan.system.instances),
-        nodes=tuple(plan.nodes),
-        result_file=plan.system.result_file,
-        result_files=tuple(record.file for record in plan.system.records),
-        endpoints=tuple(endpoints),
-        pid=os.getpid(),
-        host=socket.gethostname(),
-        shared_memory=tuple(shared),
-        host_id=this_host(),
-    )
