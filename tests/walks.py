@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
@@ -179,7 +179,7 @@ def _error(folder: Path) -> tuple[_Walk, str, *tuple[str, ...]]:
     return _Walk(_TEXT, str(folder)), _configuration(folder, {"failing": {"python": "failing.py:Failing"}})
 
 
-def _configuration(folder: Path, instances: dict[str, dict[str, object]]) -> str:
+def _configuration(folder: Path, instances: Mapping[str, Mapping[str, object]]) -> str:
     text = {"mesh": "walk", "simulation": {"stop_time": 0.1, "step_size": 0.01}, "instances": instances}
     (folder / "walk.yaml").write_text(json.dumps(text), encoding="utf-8")
     return "walk.yaml"
