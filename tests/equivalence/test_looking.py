@@ -499,7 +499,7 @@ def test_watch_ends_with_the_mesh_and_with_ctrl_c() -> None:
         watchers[1].communicate(timeout=DEADLINE_S)
 
         assert [watcher.returncode for watcher in watchers] == [130, 0]
-        assert "mesh 'looked_at' is told to end, and was at point " in stopped.stdout
+        assert "mesh 'looked_at' is stopping at point " in stopped.stdout
         assert mesh.end() == 130, mesh.lines
 
 

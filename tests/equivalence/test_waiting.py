@@ -276,7 +276,7 @@ def test_stop_is_the_normal_end_of_a_run_without_a_stop_time(place: Place, pause
 
     stop = place.run("stop", "pair")
 
-    assert stop.output.startswith("mesh 'pair' is told to end, and was at point ")
+    assert stop.output.startswith("mesh 'pair' is stopping at point ")
     assert launched.wait() == 0
     rows = rows_of(config.with_suffix(".csv"))
     assert [row[0] for row in rows] == [point * 0.01 for point in range(len(rows))]

@@ -282,7 +282,7 @@ TEXTS = [
     ),
     pytest.param(
         GOOD + "mesh: again\n",
-        "mesh.yaml:9: mesh: a second time, first in line 1; expected every key at most once",
+        "mesh.yaml:9: mesh: duplicate key (first in line 1)",
         id="a duplicate key",
     ),
     pytest.param(
