@@ -34,10 +34,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Self
 
 import msgspec
 
+from ..config.deadlines import Deadlines
 from ..errors import (
     DeadlineExceeded,
     FmuMeshError,
@@ -54,7 +54,7 @@ from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = ["Action", "AnswerAll", "Deadlines", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "SendToAll"]
+__all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "SendToAll"]
 
 
 class AnswerAll(msgspec.Struct, frozen=True):
@@ -91,40 +91,6 @@ class EndAll(msgspec.Struct, frozen=True):
 Action = AnswerAll | FollowClock | RaiseGrant | SendToAll | EndAll
 
 
-class Deadlines(msgspec.Struct, frozen=True):
-    """How long the master waits, in s.
-
-    Attributes:
-        start: until all nodes are ready.
-        initialize: then, until all are at the first point.
-        step: without progress, if the process of a node is stopped.
-        silence: without progress. The instances of a node step one after the other, each with a deadline of its own.
-        stop: from the last point until all nodes have reported their end.
-        heartbeat: between two messages to the nodes, so that they know that the master lives.
-    """
-
-    start: float
-    initialize: float
-    step: float
-    silence: float
-    stop: float
-    heartbeat: float
-
-    @classmethod
-    def of(cls, plan: Plan) -> Self:
-        """The deadlines of a mesh."""
-        timeouts = plan.system.config.timeouts
-        most_instances = max(len(node.instances) for node in plan.nodes.values())
-        return cls(
-            start=timeouts.start,
-            initialize=timeouts.initialize,
-            step=timeouts.step,
-            silence=3 * timeouts.step * most_instances,
-            stop=timeouts.stop + timeouts.terminate * most_instances,
-            heartbeat=max(0.01, min(0.5, timeouts.step / 4)),
-        )
-
-
 class MasterStates:
     """The state of one run, as its master sees it.
 
@@ -148,7 +114,9 @@ class MasterStates:
     def __init__(self, plan: Plan, *, paused: bool = False) -> None:
         self.plan = plan
         self.state: MeshState = "starting"
-        self.deadlines = Deadlines.of(plan)
+        self.deadlines = Deadlines.of(
+            plan.system.config.timeouts, max(len(node.instances) for node in plan.nodes.values())
+        )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
         self.hold = 0 if paused else None

@@ -24,12 +24,12 @@ from fmu_mesh.master.master_states import (
     RaiseGrant,
     SendToAll,
 )
-from fmu_mesh.run.preparing import prepare
 from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.wire.membership import NodeReady, Registration
 from fmu_mesh.wire.messages import FINISH, GRANT, NodeReport, sealed
 from fmu_mesh.wire.views import Command
 from tests.helpers import write_config
+from tests.planning import prepare
 
 ALL = ("pendulum", "delay", RECORDER)
 LAST = 1000
