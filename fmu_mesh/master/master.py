@@ -208,7 +208,7 @@ class Master:
             if not actions:
                 break
         if self._watch is not None and states.takes_commands:
-            self._watch.look(states.granting.holder(hold=states.hold, paced=paced))
+            self._watch.note(states.granting.holder(hold=states.hold, paced=paced))
         return pause_s
 
     def _do(self, action: Action) -> None:

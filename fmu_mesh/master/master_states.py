@@ -4,9 +4,9 @@
 
     starting        until every node is ready                    -> answer them all
     initializing    until every node is at point 0               (Initialization Mode is over)
-    running/paused  until every node is at the last point, or at the one where an FMU asked to end the simulation:
+    running/paused  until every node is at the last point, or at the one where an FMU ends the simulation:
                     grant it                                     (less if the wall clock or a pause limits it)
-    stopping        tell the nodes to finish, until all have reported
+    stopping        until all nodes have reported their end
     done/failed
 """
 
@@ -15,7 +15,7 @@
 # Everything that happens to a run can happen in any order, and two of it in one turn: a node fails after its last step
 # while another is lost, a command arrives with the report of an FMU that ends the simulation, a node reports its end
 # before the memory shows its last point. When each handler acted on its own, each pair needed its own care. Now the
-# caller reports all that has arrived, and then asks once what follows. So the order within one turn matters only where
+# caller reports all that has arrived, and then calls `decide` once. So the order within one turn matters only where
 # it is a question of who was first: the first failure is the reason of the run.
 #
 # What may go wrong, and is decided here:
@@ -58,7 +58,7 @@ __all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "Rais
 
 
 class AnswerAll(msgspec.Struct, frozen=True):
-    """All nodes are ready and wait for an answer: tell them who shares the memory."""
+    """All nodes are ready and wait for an answer: who shares the memory."""
 
     shared: tuple[str, ...]
 

@@ -81,7 +81,7 @@ class Members:
         self._waiting[node] = query
 
     def welcome(self, profile_entries: int, shared: tuple[str, ...]) -> None:
-        """Answer all nodes, and tell them who shares the memory.
+        """Answer all nodes: who shares the memory.
 
         Args:
             profile_entries: how many bursts and waits each node stores for a profile; 0: nothing is measured.

@@ -28,9 +28,9 @@ STATUS_S = 0.1
 """Time in s between two publications of the status."""
 
 _MOST_LOG_BYTES = 1 << 20
-_KEPT_LINES = 1000
-_KEPT_BYTES = 1 << 20
-"""What is kept of the log: the newest lines, up to both limits."""
+_MOST_LINES = 1000
+_MOST_BYTES = 1 << 20
+"""Of the log, the newest lines are retained, up to both limits."""
 
 
 class Events(Protocol):
@@ -55,7 +55,7 @@ class MasterServer:
         instances: the names of all instances.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  the run and whom it tells
+    def __init__(  # noqa: PLR0913, PLR0917  the run and who learns of it
         self,
         session: zenoh.Session,
         keys: Keys,
@@ -73,8 +73,8 @@ class MasterServer:
         self._status_published = 0.0
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._log_lines = 0
-        self._kept_log: deque[msgspec.Raw] = deque()
-        self._kept_bytes = 0
+        self._newest_lines: deque[msgspec.Raw] = deque()
+        self._newest_bytes = 0
         self._log_publisher = session.declare_publisher(
             self._keys.mesh_key("log"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
         )
@@ -107,8 +107,8 @@ class MasterServer:
         )
 
     def hand_on_logs(self) -> None:
-        """From now on the log messages of all instances go to `Events.log`, are kept, and are published as one log."""
-        self.show("log", lambda: [*self._kept_log])
+        """From now on the log messages of all instances go to `Events.log` and into one log, which is published."""
+        self.show("log", lambda: [*self._newest_lines])
         post = self._inbox.post
         self._entities.append(
             self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
@@ -129,10 +129,10 @@ class MasterServer:
     def _keep(self, line: bytes) -> None:
         """Publish a line of the log of all instances, and keep it; forget the oldest ones beyond the limits."""
         self._log_publisher.put(line)
-        self._kept_log.append(msgspec.Raw(line))
-        self._kept_bytes += len(line)
-        while len(self._kept_log) > _KEPT_LINES or self._kept_bytes > _KEPT_BYTES:
-            self._kept_bytes -= len(self._kept_log.popleft())
+        self._newest_lines.append(msgspec.Raw(line))
+        self._newest_bytes += len(line)
+        while len(self._newest_lines) > _MOST_LINES or self._newest_bytes > _MOST_BYTES:
+            self._newest_bytes -= len(self._newest_lines.popleft())
 
     def publish_status(self, *, at_once: bool = False) -> None:
         """Publish the status if it is due, or ``at_once``."""

@@ -203,7 +203,7 @@ def test_the_time_of_a_grant_belongs_to_what_held_it() -> None:
     watch = GrantWatch()
 
     for holder in ("a", "a", "b", None, "a"):
-        watch.look(holder)
+        watch.note(holder)
 
     assert set(watch.held_s) == {"a", "b"}
     assert all(seconds >= 0.0 for seconds in watch.held_s.values())
