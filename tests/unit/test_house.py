@@ -35,7 +35,7 @@ def text(path: str) -> str:
     return (ROOT / path).read_text(encoding="utf-8")
 
 
-def test_the_installed_version_is_that_of_the_package_and_has_its_entry_in_the_changelog() -> None:
+def test_installed_version_is_that_of_package_and_has_its_entry_in_changelog() -> None:
     assert importlib.metadata.version("fmu-mesh") == fmu_mesh.__version__
     assert re.search(rf"^## \[{re.escape(fmu_mesh.__version__)}\]", text("CHANGELOG.md"), re.MULTILINE)
 
@@ -210,7 +210,7 @@ def test_every_command_of_a_page_is_one_that_there_is(page: Path) -> None:
 
 
 @pytest.mark.parametrize("name", command_parser()[1])
-def test_the_help_of_a_command_fits_80_columns_and_begins_with_what_it_does(
+def test_help_of_command_fits_80_columns_and_begins_with_what_it_does(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -258,6 +258,10 @@ def test_few_helpers_are_used_once(package: house.Package) -> None:
 
     # A number and no list: a name that says more than its lines may stay, and another one goes.
     assert len(found) <= max(house.MOST_ONE_USE_HELPERS, ONE_USE_HELPERS_LEFT), sorted(found)
+
+
+def test_the_name_of_a_test_is_a_short_sentence() -> None:
+    assert house.long_names_of_tests(house.TESTS) == set()
 
 
 def test_each_rule_of_the_house_finds_what_breaks_it(tmp_path: Path) -> None:

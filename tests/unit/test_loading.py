@@ -350,7 +350,7 @@ def test_aliases_that_explode_are_refused() -> None:
     assert finding.found == "more than 200000 values"
 
 
-def test_all_findings_of_a_file_are_shown_in_the_order_of_the_lines() -> None:
+def test_all_findings_of_a_file_are_shown_in_the_order_of_lines() -> None:
     text = """\
 mesh: 1
 simulation: {stop_time: x, step_size: .inf, windows: 3}

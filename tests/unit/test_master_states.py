@@ -135,7 +135,7 @@ def test_a_process_may_register_again_if_it_got_no_answer(plan: Plan) -> None:
     assert Driven(plan).register("delay", "delay") == [None, None]
 
 
-def test_a_second_process_of_a_node_is_refused_and_the_run_goes_on(plan: Plan) -> None:
+def test_a_second_process_of_a_node_is_refused_and_run_goes_on(plan: Plan) -> None:
     run = running(plan)
 
     reason = run.states.registrations.register(registration(plan, "delay", "another process"))
@@ -316,7 +316,7 @@ def test_the_earliest_of_two_early_ends_counts(plan: Plan) -> None:
     assert "pendulum" in str(run.states.ended_by)
 
 
-def test_a_value_that_is_not_finite_fails_the_run_at_the_point_before(plan: Plan) -> None:
+def test_a_value_that_is_not_finite_fails_the_run_at_point_before(plan: Plan) -> None:
     run = running(plan)
     run.states.report(NodeReport("delay", 20, NotFinite("y is NaN", instance="delay", point=20).report()))
     assert run.decide() == []

@@ -106,7 +106,7 @@ def test_the_reference_describes_every_type_that_a_public_call_returns() -> None
     assert {name: place for name, place in returned_types().items() if name not in names} == {}
 
 
-def test_a_link_to_a_file_or_a_folder_leads_to_a_page_that_shows_it(site: ModuleType) -> None:
+def test_a_link_to_file_or_folder_leads_to_page_that_shows_it(site: ModuleType) -> None:
     pages = site.site_pages()
 
     assert "](configs/README.md)" in pages["README.md"]
