@@ -86,7 +86,7 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
 
 
 def _comment(source: Path, ssd: str | None, given: PlainConfig) -> Iterator[str]:
-    """What the file was made from, which names have changed, and what it has not."""
+    """What the file was made from, which names have changed, and what was left out."""
     yield f"Converted from {_one_line(short_path(given.file))} by fmu-mesh."
     if named_package(source, ssd) is None:
         return

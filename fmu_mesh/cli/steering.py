@@ -37,7 +37,7 @@ def _command(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(answer)
         return 0
-    what = "is told to end, and was" if answer.command == "stop" else f"is {answer.state}"
+    what = "is stopping" if answer.command == "stop" else f"is {answer.state}"
     print(f"mesh '{run.name}' {what} at point {answer.point}")
     return 0
 

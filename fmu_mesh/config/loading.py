@@ -291,7 +291,7 @@ def _with_kinds(
 
 
 def _kind_meant(keys: AbstractSet[str], kinds: Kinds) -> str | None:
-    """The kind that one of the keys is, or is most likely a slip of."""
+    """The kind that one of the keys names, or else the nearest one."""
     names = kinds.names()
     exact = [name for name in names if name in keys]
     near = [name for key in sorted(keys) if (name := nearest(key, names)) is not None]

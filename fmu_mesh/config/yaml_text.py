@@ -228,7 +228,7 @@ class _Reader:
             if key in values:
                 first = self._lines.get(place)
                 self._lines[place] = line
-                self._findings.add(place, f"a second time, first in line {first}", "every key at most once")
+                self._findings.add(place, f"duplicate key (first in line {first})", "")
             self._lines[place] = line
             value = self._value(next(self._events), place, depth + 1)
             if value is None and _NO_BLANK.fullmatch(key):

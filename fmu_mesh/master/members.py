@@ -1,6 +1,7 @@
-"""The members of a mesh for its master: which nodes are present and registered, and how each node is reached.
+"""How the nodes of a mesh are reached by its master: their queries, their tokens, and messages to them.
 
-Owns the master's part of `fmu_mesh.wire.membership`. Knows nothing of points and progress; called on the main thread.
+Owns the master's part of `fmu_mesh.wire.membership`. `fmu_mesh.master.registrations` decides who belongs to the run.
+All of it runs on the main thread: what arrives on threads of Zenoh is posted to the inbox (ADR 0008).
 """
 
 from __future__ import annotations
@@ -12,166 +13,109 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
-from ..errors import DeadlineExceeded, FmuMeshError, MessageRefused
+from ..errors import FmuMeshError
 from ..rings.host_memory import Offer
-from ..system.digest import difference
-from ..system.plan import RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
-from ..wire.messages import HEADER, decode_json, encode_abort, sealed
+from ..wire.messages import HEADER, decode_json, encode_abort
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import tokens, undeclare_all
+from .registrations import Registrations
 
-__all__ = ["Followers", "Members", "spoken"]
+__all__ = ["Followers", "Members"]
 
 log = logging.getLogger(__name__)
 
 
 class Members:
-    """The nodes of one run.
+    """The processes of the nodes of one run.
 
     Args:
-        plan: the plan of the whole mesh.
+        nodes: who belongs to the run.
         session: the session of this process; the caller closes it.
         keys: the keys of the run.
         offer: the memory that processes of this host share; None if there is none.
-        on_lost: called with the name of a node whose process is gone.
         launch: the launcher that started this process; None if it was started manually.
 
-    Attributes:
-        shared: the nodes that use the shared memory, and the recorder.
-        doubted: nodes on this host whose token is gone, although their process runs.
-
-    Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when `complete` is true;
-    then `send`. `abort` may be called at any time, `close` at the end.
+    Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when all are ready; then
+    `send`, and `lost` now and then. `abort` may be called at any time, `close` at the end.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  the run and what it is reached by
-        self,
-        plan: Plan,
-        session: zenoh.Session,
-        keys: RunKeys,
-        offer: Offer | None,
-        on_lost: Callable[[str], None],
-        launch: str | None = None,
+    def __init__(
+        self, nodes: Registrations, session: zenoh.Session, keys: RunKeys, offer: Offer | None, launch: str | None
     ) -> None:
-        self._plan = plan
+        self._nodes = nodes
         self._session = session
         self._keys = keys
-        self._timeouts = plan.system.config.timeouts
-        self._nodes = list(plan.nodes)
         self._offer = offer
-        self._on_lost = on_lost
         self._launch = launch
-        self._admitted: dict[str, Registration] = {}
-        self._refused: list[str] = []
-        self._ready: dict[str, tuple[NodeReady, zenoh.Query]] = {}
-        self._welcomed = False
-        self.shared: tuple[str, ...] = ()
-        self.doubted: set[str] = set()
-        self._grant_keys = keys.grants(self._nodes)
+        self._waiting: dict[str, zenoh.Query] = {}
+        self._shared: tuple[str, ...] = ()
+        self._doubted: set[str] = set()
+        self._grant_keys = keys.grants([*nodes.plan.nodes])
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
             for key in dict.fromkeys(self._grant_keys.values())
         ]
 
     def register(self, query: zenoh.Query) -> None:
-        """Admit a node, or refuse one that is not part of this run; the run is not affected.
-
-        Raises:
-            MessageRefused: it is no registration.
-        """
+        """Answer a process that wants to be a node of this run."""
         registration = decode_json(payload_of(query), Registration)
         if registration.launch == self._launch:
-            reason = self._reason_against(registration)
+            reason = self._nodes.register(registration)
             if reason is None:
-                self._admitted[registration.node] = registration
                 admission = Admission(self._keys.run, self._grant_keys[registration.node], self._offer)
                 query.reply(query.key_expr, msgspec.json.encode(admission))
             else:
-                self._refused.append(reason)
                 log.info("node_refused", extra={"reason": reason})
                 query.reply_err(reason)
         # A process of another launch gets no answer here: its own master answers it.
         query.drop()
 
-    def _reason_against(self, registration: Registration) -> str | None:
-        node, where = registration.node, f"process {registration.pid} on {registration.host}"
-        if node not in self._plan.nodes:
-            return f"this mesh has no node '{node}'"
-        if registration.digest != self._plan.digest:
-            what = difference(self._plan.digest, registration.digest, self._plan.system.instances)
-            return f"node '{node}' ({where}) has {what}, not that of the master"
-        # The same node may ask again if it got no answer.
-        if self._admitted.get(node, registration) != registration:
-            return f"node '{node}' is there already; two processes run it"
-        return None
-
-    def is_of(self, node: str, opened: str) -> bool:
-        """Whether the sender of a message has registered as this node: it knows what the seal was made from."""
-        return node in self._admitted and sealed(opened) == self._admitted[node].seal
-
     def ready(self, query: zenoh.Query) -> None:
-        """Store that a node is ready; `welcome` answers it.
-
-        Raises:
-            MessageRefused: it is no such message, or not of a node of this run.
-        """
+        """Store that a node is ready; `welcome` answers it."""
         node = RunKeys.node_in(str(query.key_expr))
-        ready = decode_json(payload_of(query), NodeReady)
-        if not self.is_of(node, ready.opened) or node in self._ready:
-            raise MessageRefused("its sender is not the process that has registered")
-        self._ready[node] = (ready, query)
+        self._nodes.take_ready(node, decode_json(payload_of(query), NodeReady))
+        self._waiting[node] = query
 
-    def token_changed(self, sample: zenoh.Sample) -> None:
-        """Handle a liveliness token that seems to be gone, if it really is. On this host its process tells."""
-        node = RunKeys.node_in(str(sample.key_expr))
-        gone = sample.kind == zenoh.SampleKind.DELETE and node in self._admitted
-        if gone and node in self.shared:
-            self.doubted.add(node)
-        elif gone and not tokens(self._session, self._keys.node(node)):
-            self._on_lost(node)
-
-    def look_at_doubted(self, *, router_is_lost: bool) -> None:
-        """Call it now and then: a node whose token is gone is lost when its process has ended, or with the router."""
-        for node in [node for node in self.doubted if router_is_lost or not is_alive(self._admitted[node].pid)]:
-            self.doubted.discard(node)
-            self._on_lost(node)
-
-    @property
-    def stopped(self) -> list[str]:
-        """The nodes on this host whose processes are stopped."""
-        return [node for node in self.shared if is_stopped(self._admitted[node].pid)]
-
-    @property
-    def complete(self) -> bool:
-        """Whether every node is ready and waits for its welcome."""
-        return len(self._ready) >= len(self._nodes)
-
-    def absence(self) -> DeadlineExceeded:
-        """The error that names the nodes that are not ready."""
-        missing = [node for node in self._nodes if node not in self._ready]
-        if len(missing) > 1:  # the recorder only waits for the nodes
-            missing = [node for node in missing if node != RECORDER]
-        there = [node for node in missing if node in self._admitted]
-        hint = f"Started, but not ready: {', '.join(there)}." if there else "None of them was started."
-        if self._refused:
-            hint += f" Refused: {self._refused[-1]}."
-        return DeadlineExceeded(f"not ready within {self._timeouts.start:g} s: {spoken(*missing)}", hint=hint)
-
-    def welcome(self, profile_entries: int) -> None:
-        """Answer all nodes, and tell them who shares the memory.
+    def welcome(self, profile_entries: int, shared: tuple[str, ...]) -> None:
+        """Answer all nodes: who shares the memory.
 
         Args:
             profile_entries: how many bursts and waits each node stores for a profile; 0: nothing is measured.
+            shared: the nodes that use it, and the recorder.
         """
-        self.shared = tuple(node for node in self._nodes if self._ready[node][0].shared)
-        self._welcomed = True
-        for _, query in self._ready.values():
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, self.shared)))
+        self._shared = shared
+        for query in self._waiting.values():
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, shared)))
             query.drop()
+        self._waiting.clear()
+
+    def token_changed(self, sample: zenoh.Sample) -> None:
+        """A liveliness token appeared or seems to be gone. A lost token is a question; `lost` finds the answer."""
+        node = RunKeys.node_in(str(sample.key_expr))
+        if sample.kind == zenoh.SampleKind.DELETE and node in self._nodes.admitted:
+            self._doubted.add(node)
+
+    def lost(self, *, router_is_lost: Callable[[], bool]) -> list[str]:
+        """The nodes whose processes are gone. On this host the process itself shows it, elsewhere its token."""
+        found = []
+        for node in [*self._doubted]:
+            if here := node in self._shared:
+                gone = router_is_lost() or not is_alive(self._nodes.admitted[node].pid)
+            else:
+                gone = not tokens(self._session, self._keys.node(node))
+            if gone or not here:  # the question about a process of this host stays until the process has ended
+                self._doubted.discard(node)
+            if gone:
+                found.append(node)
+        return found
+
+    def stopped(self) -> list[str]:
+        """The nodes on this host whose processes are stopped."""
+        return [node for node in self._shared if is_stopped(self._nodes.admitted[node].pid)]
 
     def send(self, kind: int, point: int) -> None:
         """Send a message to all nodes."""
@@ -183,19 +127,13 @@ class Members:
         """Tell the nodes why the run ends, and wait so that they can end themselves."""
         for publisher in self._grants:
             publisher.put(encode_abort(error.report()))
-        if not self._welcomed:
-            for _, query in self._ready.values():  # they still wait for admission
-                query.reply_err(str(error))
-                query.drop()
+        for query in self._waiting.values():
+            query.reply_err(str(error))
+            query.drop()
 
     def close(self) -> None:
         """Undeclare all publishers."""
         undeclare_all(self._grants)
-
-
-def spoken(*nodes: str) -> str:
-    """The names of nodes as text for a message."""
-    return ", ".join("the recorder" if node == RECORDER else f"node '{node}'" for node in nodes)
 
 
 class Followers:

@@ -5,37 +5,32 @@ Queries and samples arrive on threads of Zenoh, and are posted to the main threa
 
 from __future__ import annotations
 
-import os
-import socket
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from typing import Literal, Protocol
 
 import msgspec
 import zenoh
 from msgspec.structs import replace
 
-from .. import __version__
 from ..errors import MessageRefused
-from ..system.plan import Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
-from ..wire.runtime import this_host
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import LogLine, MeshInfo, MeshStatus
+from ..wire.views import LogLine, MeshStatus
 
-__all__ = ["STATUS_S", "Events", "MasterServer", "mesh_info"]
+__all__ = ["STATUS_S", "Events", "MasterServer"]
 
 STATUS_S = 0.1
 """Time in s between two publications of the status."""
 
 _MOST_LOG_BYTES = 1 << 20
-_KEPT_LINES = 1000
-_KEPT_BYTES = 1 << 20
-"""What is kept of the log: the newest lines, up to both limits."""
+_MOST_LINES = 1000
+_MOST_BYTES = 1 << 20
+"""Of the log, the newest lines are retained, up to both limits."""
 
 
 class Events(Protocol):
@@ -60,7 +55,7 @@ class MasterServer:
         instances: the names of all instances.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  the run and whom it tells
+    def __init__(  # noqa: PLR0913, PLR0917  the run and who learns of it
         self,
         session: zenoh.Session,
         keys: Keys,
@@ -78,8 +73,8 @@ class MasterServer:
         self._status_published = 0.0
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._log_lines = 0
-        self._kept_log: deque[msgspec.Raw] = deque()
-        self._kept_bytes = 0
+        self._newest_lines: deque[msgspec.Raw] = deque()
+        self._newest_bytes = 0
         self._log_publisher = session.declare_publisher(
             self._keys.mesh_key("log"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
         )
@@ -112,8 +107,8 @@ class MasterServer:
         )
 
     def hand_on_logs(self) -> None:
-        """From now on the log messages of all instances go to `Events.log`, are kept, and are published as one log."""
-        self.show("log", lambda: [*self._kept_log])
+        """From now on the log messages of all instances go to `Events.log` and into one log, which is published."""
+        self.show("log", lambda: [*self._newest_lines])
         post = self._inbox.post
         self._entities.append(
             self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
@@ -134,10 +129,10 @@ class MasterServer:
     def _keep(self, line: bytes) -> None:
         """Publish a line of the log of all instances, and keep it; forget the oldest ones beyond the limits."""
         self._log_publisher.put(line)
-        self._kept_log.append(msgspec.Raw(line))
-        self._kept_bytes += len(line)
-        while len(self._kept_log) > _KEPT_LINES or self._kept_bytes > _KEPT_BYTES:
-            self._kept_bytes -= len(self._kept_log.popleft())
+        self._newest_lines.append(msgspec.Raw(line))
+        self._newest_bytes += len(line)
+        while len(self._newest_lines) > _MOST_LINES or self._newest_bytes > _MOST_BYTES:
+            self._newest_bytes -= len(self._newest_lines.popleft())
 
     def publish_status(self, *, at_once: bool = False) -> None:
         """Publish the status if it is due, or ``at_once``."""
@@ -153,38 +148,3 @@ class MasterServer:
     def close(self) -> None:
         """Undeclare everything."""
         undeclare_all(self._entities, [self._status_publisher, self._log_publisher])
-
-
-def mesh_info(plan: Plan, run: str, config_file: str, endpoints: Sequence[str], shared: Sequence[str]) -> MeshInfo:
-    """What `mesh/info` answers.
-
-    Args:
-        plan: the plan of the whole mesh.
-        run: the run's id.
-        config_file: name of the configuration file.
-        endpoints: where tools can reach this process.
-        shared: the participants that get all messages through shared memory.
-    """
-    config = plan.system.config
-    grid = plan.grid
-    return MeshInfo(
-        mesh=config.mesh,
-        version=__version__,
-        run=run,
-        config=config_file,
-        start_time=grid.start_time,
-        stop_time=grid.stop_time,
-        step_size=grid.step_size,
-        algorithm=config.simulation.algorithm,
-        window=plan.window,
-        real_time_factor=config.simulation.real_time_factor,
-        instances=tuple(plan.system.instances),
-        nodes=tuple(plan.nodes),
-        result_file=plan.system.result_file,
-        result_files=tuple(record.file for record in plan.system.records),
-        endpoints=tuple(endpoints),
-        pid=os.getpid(),
-        host=socket.gethostname(),
-        shared_memory=tuple(shared),
-        host_id=this_host(),
-    )

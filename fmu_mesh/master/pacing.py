@@ -119,14 +119,14 @@ class Pacer:
 
 
 class GrantWatch:
-    """Sums up how long each participant limited the grant; call `look` at every grant."""
+    """Sums up how long each participant limited the grant; call `note` at every grant."""
 
     def __init__(self) -> None:
         self.held_s: dict[str, float] = {}
         self._holder: str | None = None
         self._since = 0.0
 
-    def look(self, holder: str | None) -> None:
+    def note(self, holder: str | None) -> None:
         """From now on ``holder`` limits the grant; None: the grant is the last point."""
         now = time.perf_counter()
         if self._holder is not None:

@@ -196,7 +196,7 @@ class LocalMesh:
         return open_instance(opening_of(self._plan, name, self._folder, self._log, self._showing))
 
     def _take_hang(self, error: FmuError) -> None:
-        """From the watching thread: the main thread is inside an FMU, so nothing of this object changes any more."""
+        """From the watching thread. This is safe: the main thread is blocked in an FMU."""
         if self._begun:
             error.at(self._system.begun_at, self._plan.grid.time(self._system.begun_at))
         self._save_from_outside()

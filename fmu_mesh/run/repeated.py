@@ -362,7 +362,7 @@ class _Run:
         self.writer.write(self.point + 1, 1)
 
     def save(self, error: FmuError) -> None:
-        """From the watching thread: the main thread is inside a model, so nothing of this object changes any more."""
+        """From the watching thread. This is safe: the main thread is blocked in a model."""
         engine = self._engine
         if engine is not None:
             runner = engine.current

@@ -328,7 +328,7 @@ def _end(element: Any, side: str) -> str:  # noqa: ANN401  lxml ships no types
 
 
 def _entry(element: Any) -> str | None:  # noqa: ANN401  lxml ships no types
-    """What an entry of a mapping maps: `'gain to motor.k'`, or what there is of that."""
+    """What an entry of a mapping maps: `'gain to motor.k'`, or the part that is given."""
     source, target = element.get("source"), element.get("target")
     if source and target:
         return f"'{source} to {target}'"

@@ -1,4 +1,4 @@
-"""Inputs that change linearly within a step (`extrapolation: linear`): which ones there are, and who can take them."""
+"""Inputs that change linearly within a step (`extrapolation: linear`): which there are, which kinds support them."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ PlainInput = Any  # a constant of a file; `to_value` says what may be one
 
 
 class BagValues(NamedTuple):
-    """What the messages of a bag say about one variable: times in s, none before the one in front of it, and values."""
+    """What the messages of a bag say about one variable: times in s, in ascending order, and values."""
 
     times: tuple[float, ...]
     values: tuple[Value, ...]
@@ -293,7 +293,7 @@ class _Resolving(msgspec.Struct):
         for index in range(1, len(times)):
             if times[index] < times[index - 1]:
                 found = f"{times[index]:g} s after {times[index - 1]:g} s"
-                self.findings.add(f"{path}.times[{index}]", found, "a time that is not before the one in front of it")
+                self.findings.add(f"{path}.times[{index}]", found, "times in ascending order")
                 return None
         values = [self._value(one, variable, f"{path}.values[{i}]", change) for i, one in enumerate(plain)]
         if any(value is None for value in values) or any(map(math.isnan, times)):  # a time that is wrong

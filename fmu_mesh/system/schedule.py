@@ -48,7 +48,7 @@ class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         variable: its name.
-        times: in s, none before the one in front of it.
+        times: in s, in ascending order.
         values: the value from each time on.
         linear: whether it changes linearly between two times.
         initial: whether a value for the start or earlier is a start value, and not set in the first step.
@@ -84,7 +84,7 @@ class Course:
         20
 
     Args:
-        times: in s, none before the one in front of it; at least one.
+        times: in s, in ascending order; at least one.
         values: the value from each time on. Of equal times the last one counts; a line from before ends at the first.
         grid: the communication points.
         points: points per own step.

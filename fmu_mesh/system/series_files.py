@@ -46,7 +46,7 @@ class SeriesRefused(ValueError):
 
 
 class Series(msgspec.Struct, frozen=True):
-    """A column of a table: times in s, none before the one in front of it, and what stands beside them."""
+    """A column of a table: times in s, in ascending order, and what stands beside them."""
 
     times: tuple[float, ...]
     cells: tuple[Any, ...]
@@ -182,7 +182,7 @@ def _read(path: str, sha256: str, time: str, column: str) -> Series:
             raise SeriesRefused(f"{when!r} in {row} of the column '{time}'", "a time in s", "time")
         if moment < last:
             found = f"the time {moment:g} s in {row}, after {last:g} s"
-            raise SeriesRefused(found, "times of which none is before the one in front of it", "time")
+            raise SeriesRefused(found, "times in ascending order", "time")
         last = moment
         times.append(moment)
         cells.append(cell)

@@ -269,7 +269,7 @@ def test_connections_are_cut_by_their_ends() -> None:
         mesh.disconnect("pendulum.a")
 
 
-def test_findings_of_a_file_keep_their_lines_and_those_of_calls_name_them(folder: Path) -> None:
+def test_findings_of_file_keep_their_lines_and_those_of_calls_name_them(folder: Path) -> None:
     (folder / "mesh.yaml").write_text(
         f"mesh: lines\nsimulation: {{step_size: 0.1, stop_time: 1.0}}\ninstances:\n"
         f"  one: {{fmu: '{FMUS / 'Gain.fmu'}'}}\n  two: {{fmu: '{FMUS / 'Gain.fmu'}'}}\n  old: {{fmu: gone.fmu}}\n"

@@ -82,7 +82,7 @@ def test_values_set_at_any_moment_are_set_again_at_the_same_points(folder: Path)
     ]
 
 
-def test_a_run_that_was_steered_while_it_ran_and_stopped_is_run_again_to_its_last_row(folder: Path) -> None:
+def test_a_steered_and_stopped_run_is_run_again_to_its_last_row(folder: Path) -> None:
     with fmu_mesh.load(endless(folder, window=64)).start() as run:
         for value in range(20):
             run.set("free.u", float(value))
@@ -188,7 +188,7 @@ def test_the_configuration_of_the_metadata_is_that_of_the_run(path: Path) -> Non
     assert again.config == loaded.config
 
 
-def test_a_result_is_run_again_where_a_model_moved_and_not_where_it_changed(folder: Path) -> None:
+def test_result_is_run_again_where_model_moved_and_not_where_it_changed(folder: Path) -> None:
     shutil.copy(FMUS / "Gain.fmu", folder / "own.fmu")
     fmu_mesh.load(write_config(folder, instances={"gain": {"fmu": "own.fmu"}}, connections=())).run()
     shutil.copy(FMUS / "Integrator.fmu", folder / "own.fmu")
@@ -275,7 +275,7 @@ def test_the_command_fails_if_the_values_are_others(place: Place, folder: Path) 
     assert "dice.y" in done.errors
 
 
-def test_a_run_with_a_scenario_is_run_again_unless_a_file_of_it_has_changed(folder: Path) -> None:
+def test_run_with_scenario_is_run_again_unless_file_of_it_has_changed(folder: Path) -> None:
     Path("drive.csv").write_text("time,u\n0.0,1.0\n0.5,2.0\n", encoding="utf-8")
     Path("drive.yaml").write_text("values: {gain.u: {file: drive.csv, column: u}}\n", encoding="utf-8")
     config = write_config(folder, instances={"gain": {"fmu": "Gain"}}, connections=())

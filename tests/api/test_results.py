@@ -99,7 +99,7 @@ def test_floats_that_are_no_numbers_come_back(folder: Path) -> None:
     assert values[1:] == [-math.inf, 1e-320]
 
 
-def test_a_run_that_needs_more_memory_than_it_may_use_is_refused_before_it_starts(folder: Path) -> None:
+def test_a_run_that_needs_too_much_memory_is_refused_before_it_starts(folder: Path) -> None:
     mesh = fmu_mesh.load(write_config(folder))
     with pytest.raises(
         fmu_mesh.CallRefused, match=r"take 40040 bytes of memory; the limit is 1000 bytes\. Raise `memory_"

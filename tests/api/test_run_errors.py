@@ -29,7 +29,7 @@ def test_a_file_that_is_not_there_is_an_error_at_once(*, processes: bool) -> Non
 
 
 @pytest.mark.parametrize("processes", [True, False])
-def test_a_failing_fmu_is_named_with_point_and_time_and_its_rows_are_kept(faulty: Path, *, processes: bool) -> None:
+def test_a_failing_fmu_is_named_with_its_point_and_rows_are_kept(faulty: Path, *, processes: bool) -> None:
     with pytest.raises(fmu_mesh.StepFailed) as caught:
         failing(faulty, fail_at=1.0).run(record="memory", processes=processes)
 

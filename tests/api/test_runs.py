@@ -46,7 +46,7 @@ def test_a_run_is_set_paused_stepped_resumed_and_stopped() -> None:
     assert result.outcome.rows == len(result.times)
 
 
-def test_pauses_at_any_moment_hold_all_instances_at_one_point_and_change_no_float() -> None:
+def test_pauses_at_any_moment_hold_all_instances_at_one_point_without_changes() -> None:
     mesh = built(stop_time=None)
     with mesh.start(record=None) as run:
         for _ in range(20):
@@ -63,7 +63,7 @@ def test_pauses_at_any_moment_hold_all_instances_at_one_point_and_change_no_floa
         assert {name: system.get(name) for name in samples} == samples
 
 
-def test_a_pause_takes_effect_after_the_steps_under_way_however_large_the_window_is(tmp_path: Path) -> None:
+def test_a_pause_takes_effect_after_steps_under_way_however_large_window_is(tmp_path: Path) -> None:
     mesh = fmu_mesh.Mesh("slow", step_size=0.1, stop_time=1000.0)
     mesh.add("slow", fmu=find_fmu("Faulty", tmp_path), start_values={"slow": 0.02})
     with mesh.start(record=None) as run:

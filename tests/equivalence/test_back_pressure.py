@@ -22,7 +22,7 @@ TINY_QUEUES = """
 
 
 @pytest.mark.parametrize("way", ["shared memory", "zenoh"])
-def test_a_chain_of_eight_with_a_slow_end_runs_through_with_nothing_lost(way: str, place: Place, faulty: Path) -> None:
+def test_a_chain_of_eight_with_slow_end_runs_through_with_nothing_lost(way: str, place: Place, faulty: Path) -> None:
     """The queues of Zenoh hold one message each; that shared memory blocks when it is full has tests of its own."""
     (place.folder / "zenoh.json5").write_text(TINY_QUEUES, encoding="utf-8")
     names = [f"i{number}" for number in range(7)]

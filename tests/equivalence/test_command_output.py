@@ -243,7 +243,7 @@ def test_with_several_meshes_a_command_without_a_name_lists_them(place: Place) -
     assert place.run("step", "10").message == "fmu-mesh: 2 meshes are running: one, two. Give the name of one."
     assert "as in 'one/INSTANCE.VARIABLE'" in place.run("get", "delay.y").message
     assert "fmu_mesh/two/delay/out/y" in place.run("get", "two/delay.y").output
-    assert place.run("stop", "two").output.startswith("mesh 'two' is told to end")
+    assert place.run("stop", "two").output.startswith("mesh 'two' is stopping at point")
 
 
 def test_a_log_is_followed_to_the_end_of_the_mesh(place: Place) -> None:

@@ -237,7 +237,7 @@ def test_a_window_of_one_point_gives_the_same_bytes(place: Place) -> None:
     assert results[0] == results[1]
 
 
-def test_a_step_starts_at_its_point_and_its_outputs_belong_to_its_end(place: Place) -> None:
+def test_step_starts_at_its_point_and_its_outputs_belong_to_its_end(place: Place) -> None:
     """The system by hand: Gauss-Seidel, so the gain uses the value at the end of the step."""
     instances = {"lag": part("Lag", start_values={"u": 1.0}), "gain": part("gain", start_values={"k": 3.0})}
     both(place, written(place.folder, instances, ["lag.y -> gain.u"], stop_time=0.01))
@@ -462,7 +462,7 @@ def test_what_cannot_be_imported_is_a_finding_with_its_place(place: Place, keys:
     assert "Traceback" not in errors
 
 
-def test_the_folder_of_a_component_is_the_last_place_where_modules_are_looked_for(place: Place) -> None:
+def test_the_folder_of_component_is_last_place_where_modules_are_looked_for(place: Place) -> None:
     (place.folder / "random.py").write_text("raise RuntimeError('the one of the user')\n", encoding="utf-8")
     (place.folder / "helping.py").write_text("factor = 3.0\n", encoding="utf-8")
     text = "import random, helping, fmu_mesh\nclass C(fmu_mesh.Component):\n    y = fmu_mesh.Output()\n"
@@ -556,9 +556,7 @@ def test_a_component_runs_in_the_python_that_its_section_names(place: Place, oth
     assert last[1:] == ["42.0", f"{place.folder.resolve()}/env/bin/python"]
 
 
-def test_a_component_of_another_python_is_refused_in_one_process_and_in_a_group_of_this_one(
-    place: Place, other_python: Path
-) -> None:
+def test_a_component_of_another_python_is_refused_locally_and_in_a_group(place: Place, other_python: Path) -> None:
     local = place.run("launch", elsewhere(place, other_python), "--local")
     grouped = place.run("check", elsewhere(place, other_python, group="g"))
 
@@ -575,9 +573,7 @@ def test_this_python_by_its_name_is_no_other_python(place: Place) -> None:
     both(place, written(place.folder, {"lag": part("Lag", interpreter=sys.executable)}))
 
 
-def test_inputs_that_a_component_has_in_another_python_are_recorded_as_in_this_one(
-    place: Place, other_python: Path
-) -> None:
+def test_inputs_of_a_component_in_another_python_are_recorded_as_here(place: Place, other_python: Path) -> None:
     (place.folder / "parts.py").write_text(PARTS, encoding="utf-8")
     found = []
     for python in (sys.executable, str(other_python)):
@@ -592,9 +588,7 @@ def test_inputs_that_a_component_has_in_another_python_are_recorded_as_in_this_o
     assert found[0].startswith(b"time,source.y,lag.y,lag.u\n")
 
 
-def test_a_node_that_is_started_by_hand_in_the_wrong_python_says_how_to_start_it(
-    place: Place, other_python: Path
-) -> None:
+def test_node_started_by_hand_in_wrong_python_says_how_to_start_it(place: Place, other_python: Path) -> None:
     config = elsewhere(place, other_python)
 
     node = place.run("node", config, "c")
@@ -604,7 +598,7 @@ def test_a_node_that_is_started_by_hand_in_the_wrong_python_says_how_to_start_it
 
 
 @pytest.mark.parametrize("version", ["", "0.0.9"])
-def test_a_python_without_our_version_is_a_finding_that_says_what_to_install(place: Place, version: str) -> None:
+def test_a_python_without_our_version_is_finding_that_says_what_to_install(place: Place, version: str) -> None:
     python = place.folder / "python"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", place.folder / "bare"], check=True, timeout=120)
     if version:
@@ -652,7 +646,7 @@ def test_a_class_of_the_program_that_runs_is_found_in_its_file(place: Place) -> 
     place.assert_nothing_left(10.0)
 
 
-def test_a_program_that_is_a_module_of_a_folder_with_other_modules_is_found_in_its_file(place: Place) -> None:
+def test_a_program_in_a_folder_of_modules_is_found_in_its_file(place: Place) -> None:
     (place.folder / "package").mkdir()
     (place.folder / "package" / "__init__.py").touch()
     (place.folder / "package" / "program.py").write_text(GUARDED, encoding="utf-8")

@@ -65,7 +65,7 @@ def written(folder: Path, fmus: dict[str, Path], *more: str) -> Path:
     return path
 
 
-def test_parameters_get_their_values_in_the_order_of_their_dependencies_in_every_way_to_run(place: Place) -> None:
+def test_in_every_run_parameters_get_values_in_order_of_their_dependencies(place: Place) -> None:
     fmus = fmus_in(place.folder)
     config, result = written(place.folder, fmus), place.folder / "rows.csv"
     wires = [Wire("pendulum.a", "gain.u")]

@@ -38,7 +38,7 @@ def _first_time(curve: dict[str, list[float]]) -> float | None:
     return min(curve["tl"][0], curve["th"][0]) if curve["tl"] else None
 
 
-def test_only_requests_with_the_token_and_a_name_of_this_host_get_the_page(place: Place) -> None:
+def test_only_requests_with_token_and_a_name_of_this_host_get_page(place: Place) -> None:
     dashboard = Dashboard(place)
 
     inside, headers, page = dashboard.ask()
@@ -99,7 +99,7 @@ def test_sigterm_ends_it_and_leaves_nothing(place: Place) -> None:
     place.assert_nothing_left()
 
 
-def test_a_port_that_is_taken_and_a_mesh_that_does_not_run_are_errors_with_a_way_out(place: Place) -> None:
+def test_a_used_port_and_a_missing_mesh_are_errors_with_advice(place: Place) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         on_port = place.run("dashboard", "--no-browser", "--port", str(port))
@@ -174,7 +174,7 @@ def test_history_begins_at_the_start_also_for_a_dashboard_that_comes_later(place
         assert all(rows[time] == value for time, value in zip(change["th"], change["h"], strict=True))
 
 
-def test_history_of_a_parquet_file_begins_at_the_start_and_stays_after_its_end(place: Place) -> None:
+def test_history_of_parquet_file_begins_at_start_and_stays_after_its_end(place: Place) -> None:
     # Of values that only grow, the first and the last one are also the smallest and the largest of their intervals.
     ramps = {name: {"fmu": "Integrator", "start_values": {"u": rate}} for name, rate in (("slow", 0.1), ("fast", 2.0))}
     config = write_config(
@@ -278,7 +278,7 @@ def rows_of_first(file: Path) -> float:
     return float(file.read_text().splitlines()[1].split(",")[1])
 
 
-def test_the_result_is_the_same_bytes_with_a_dashboard_that_reads_all_the_time(place: Place) -> None:
+def test_the_result_is_same_bytes_with_a_dashboard_that_reads_all_time(place: Place) -> None:
     config = write_config(place.folder, stop_time=20.0)
     place.run("launch", config, "--no-progress", "--output", place.folder / "alone.csv")
 
@@ -296,7 +296,7 @@ def test_the_result_is_the_same_bytes_with_a_dashboard_that_reads_all_the_time(p
     assert (place.folder / "pair.csv").read_bytes() == (place.folder / "again.csv").read_bytes()
 
 
-def test_curves_that_are_chosen_after_the_end_of_the_run_are_there_as_well(place: Place) -> None:
+def test_curves_that_are_chosen_after_end_of_run_are_there_as_well(place: Place) -> None:
     config = write_config(place.folder, stop_time=2.0, simulation=PACED)
     dashboard = Dashboard(place)
     run = place.start("launch", config, "--no-progress")

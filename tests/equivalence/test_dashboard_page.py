@@ -75,7 +75,7 @@ def _field(page: Browser, name: str, selector: str) -> Any:  # noqa: ANN401  an 
     return wait_until(found, f"the field of {name}")
 
 
-def test_the_page_shows_the_run_from_its_start_and_asks_no_other_host(place: Place) -> None:
+def test_the_page_shows_run_from_its_start_and_asks_no_other_host(place: Place) -> None:
     config = write_config(place.folder, stop_time=3600.0, simulation=PACED)
     place.start("launch", config, "--no-progress")
     place.run("wait", "pair")

@@ -37,9 +37,7 @@ def point_of(sample: zenoh.Sample) -> int:
 
 
 @pytest.mark.parametrize("declaration", [SAME, OTHER], ids=["the same", "another"])
-def test_a_name_that_is_declared_twice_is_one_variable_in_one_process_and_in_many(
-    declaration: str, place: Place
-) -> None:
+def test_name_declared_twice_is_one_variable_in_one_process_and_in_many(declaration: str, place: Place) -> None:
     content = {
         "simulation": {"stop_time": 1.0, "step_size": 0.01},
         "instances": {

@@ -104,9 +104,7 @@ def assert_equivalent(place: Place, config: Path, reference: Reference) -> None:
 
 
 @pytest.mark.parametrize("name", [PENDULUM, CHAPTER])
-def test_a_kept_configuration_gives_the_same_floats_in_processes_in_one_process_and_in_fmpy(
-    name: str, place: Place
-) -> None:
+def test_a_kept_configuration_gives_equal_floats_in_processes_locally_and_in_fmpy(name: str, place: Place) -> None:
     content = launched(place, CONFIGS / f"{name}.yaml")
 
     assert_result(content, reference_of(CONFIGS / f"{name}.yaml", {"pendulum.a -> delay.x": 0}))

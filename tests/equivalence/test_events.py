@@ -93,7 +93,7 @@ def test_linear_inputs_give_the_same_floats(algorithm: str, place: Place, event_
 @pytest.mark.parametrize(
     ("version", "more"), [(2, {}), (2, {"retry_discarded_steps": True}), (3, {})], ids=["FMI 2", "retrying", "FMI 3"]
 )
-def test_the_step_at_whose_end_an_fmu_asks_to_end_is_a_row(
+def test_the_step_at_whose_end_an_fmu_asks_to_end_is_row(
     version: Version, more: Mapping[str, Any], place: Place, event_fmu: EventFmu
 ) -> None:
     """The third stair is at 3 s; an FMU of FMI 2.0 discards the step that ends there, and it has got to its end."""
@@ -116,7 +116,7 @@ def test_the_step_at_whose_end_an_fmu_asks_to_end_is_a_row(
     assert rows[-1][header.index(b"stairs.counter")] == b"3"
 
 
-def test_an_fmu_that_asks_to_end_ends_the_run_at_its_point_for_all(place: Place, event_fmu: EventFmu) -> None:
+def test_fmu_that_asks_to_end_ends_run_at_its_point_for_all(place: Place, event_fmu: EventFmu) -> None:
     content = system(event_fmu, ALL_2)
     content["instances"]["stairs"]["start_values"] |= {"end": 3, "increment": 1}
     content["connections"].pop()

@@ -98,11 +98,11 @@ def test_the_integrated_node_equals_the_chapter_s_mesh_in_every_float(example: R
     assert example == local_rows(CONFIG, tmp_path / "local.csv")
 
 
-def test_the_integrated_node_gives_the_same_floats_on_a_clock_of_unix_time(example: Rows) -> None:
+def test_the_integrated_node_gives_same_floats_on_a_clock_of_unix_time(example: Rows) -> None:
     assert integrated_node.run(start=1_700_000_000.123) == example
 
 
-def test_stamps_at_the_end_of_the_step_as_in_the_chapter_s_listing_are_jacobi(tmp_path: Path) -> None:
+def test_stamps_at_end_of_step_as_in_chapter_s_listing_are_jacobi(tmp_path: Path) -> None:
     rows: Rows = []
     with (
         FMIAdapter(ROOT / "fmus/DampedPendulum.fmu", 0.02) as pendulum,
@@ -124,9 +124,7 @@ def test_stamps_at_the_end_of_the_step_as_in_the_chapter_s_listing_are_jacobi(tm
     assert rows == local_rows(jacobi_config(tmp_path), tmp_path / "local.csv")
 
 
-def test_the_integrated_node_as_a_program_prints_the_end_and_writes_what_it_computed(
-    example: Rows, tmp_path: Path
-) -> None:
+def test_the_integrated_node_as_program_prints_end_and_writes_what_it_computed(example: Rows, tmp_path: Path) -> None:
     output = tmp_path / "made" / "result.csv"
 
     done = subprocess.run(
@@ -144,7 +142,7 @@ def test_the_integrated_node_as_a_program_prints_the_end_and_writes_what_it_comp
     assert rows_of(output) == example
 
 
-def test_in_real_time_the_integrated_node_waits_for_each_step_that_is_not_due_yet(
+def test_in_real_time_the_integrated_node_waits_until_a_step_is_due(
     example: Rows, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Clock(Event):
@@ -166,7 +164,7 @@ def test_in_real_time_the_integrated_node_waits_for_each_step_that_is_not_due_ye
     assert clock.now == pytest.approx(100.4, abs=1e-9)  # a sum of 20 differences of floats near 100
 
 
-def test_in_real_time_the_integrated_node_stops_when_it_is_told_and_keeps_its_rows(example: Rows) -> None:
+def test_in_real_time_a_stopped_integrated_node_keeps_its_rows(example: Rows) -> None:
     stop = Event()
     stop.set()
 

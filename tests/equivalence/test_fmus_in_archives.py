@@ -24,7 +24,7 @@ from tests.fmus.packing import without_binaries
 from tests.helpers import FMUS, Place
 
 
-def test_fmus_inside_an_archive_and_inside_an_archive_in_it_give_the_same_floats(place: Place) -> None:
+def test_fmus_inside_an_archive_and_inside_archive_in_it_give_same_floats(place: Place) -> None:
     config = rewritten(CHAPTER, place.folder, shortened(800, GAUSS_SEIDEL))
     reference = reference_of(config, {"pendulum.a -> delay.x": 0})
     plain = in_this_process(place, config)
@@ -54,7 +54,7 @@ def test_nodes_that_are_started_manually_open_the_archive_themselves(place: Plac
     place.assert_nothing_left()
 
 
-def test_the_source_of_an_fmu_inside_an_archive_is_compiled_for_a_run(place: Place) -> None:
+def test_the_source_of_an_fmu_inside_an_archive_is_compiled_for_run(place: Place) -> None:
     place.environment["FMU_MESH_CACHE_DIR"] = str(place.folder / "cache")
     bare = without_binaries(place.folder / "bare.fmu").read_bytes()
     with zipfile.ZipFile(place.folder / "system.ssp", "w") as archive:

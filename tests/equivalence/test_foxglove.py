@@ -103,7 +103,7 @@ def test_a_channel_says_what_its_variable_is(place: Place) -> None:
         assert [topic for topic in client.channels if topic.startswith("/delay/")] == ["/delay/y"]
 
 
-def test_parameters_are_those_that_can_be_set_and_setting_them_changes_the_mesh(place: Place) -> None:
+def test_parameters_are_those_that_can_be_set_and_setting_them_changes_mesh(place: Place) -> None:
     place.start("launch", gains(place), "--no-progress")
     _, url = start(place, "pair", "--steer")
 
@@ -136,7 +136,7 @@ def test_nothing_can_be_set_without_steer(place: Place) -> None:
         client.until(lambda: [text for text in client.statuses() if "--steer" in text], "the refusal")
 
 
-def test_a_client_that_comes_while_the_mesh_is_paused_sees_the_current_values(place: Place) -> None:
+def test_a_client_that_comes_while_the_mesh_is_paused_sees_current_values(place: Place) -> None:
     mesh = place.start("launch", paced(place), "--paused", "--no-progress")
     _, url = start(place, "pair")
 

@@ -22,7 +22,7 @@ def ask(session: zenoh.Session, key: str, value: object, attachment: str | None 
     return json.loads(wait_until(answer, f"an answer from {key}").payload.to_bytes())
 
 
-def test_inputs_follow_their_time_stamps_and_the_run_ends_at_its_stop_time(place: Place) -> None:
+def test_inputs_follow_their_time_stamps_and_run_ends_at_its_stop_time(place: Place) -> None:
     output = place.folder / "result.csv"
     process = place.start(
         "run", FMUS / "Gain.fmu", "--name", "amplifier", "--set", "k=2", "--step-size", "0.5",
@@ -54,9 +54,7 @@ def test_inputs_follow_their_time_stamps_and_the_run_ends_at_its_stop_time(place
 
 
 @pytest.mark.parametrize("window", ["1", "1000"])
-def test_an_input_of_a_mesh_holds_from_its_time_on_however_far_the_other_instances_are(
-    place: Place, window: str
-) -> None:
+def test_an_input_of_a_mesh_holds_from_its_time_for_all_instances(place: Place, window: str) -> None:
     config = write_config(
         place.folder,
         instances={"free": {"fmu": "Gain"}, "pendulum": {"fmu": "DampedPendulum"}},
@@ -75,7 +73,7 @@ def test_an_input_of_a_mesh_holds_from_its_time_on_however_far_the_other_instanc
     assert [row[1] for row in rows] == expected
 
 
-def test_it_runs_by_the_wall_clock_until_it_is_interrupted_and_leaves_nothing(place: Place) -> None:
+def test_it_runs_by_wall_clock_until_it_is_interrupted_and_leaves_nothing(place: Place) -> None:
     process = place.start("run", FMUS / "DampedPendulum.fmu", "--no-progress")
     status = wait_until(lambda: place.run("status", "--json").output, "a status")
     wait_until(lambda: '"state":"running"' in place.run("status", "--json").output, "a running mesh")

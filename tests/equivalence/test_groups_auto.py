@@ -150,7 +150,7 @@ def test_the_name_of_a_node_collides_with_no_other(tmp_path: Path) -> None:
     assert (nodes["sum"], nodes["loop"]) == ("sum-cycle-3", "sum-cycle-3")
 
 
-def test_two_instances_of_an_fmu_that_allows_one_per_process_get_two_nodes(tmp_path: Path) -> None:
+def test_two_instances_of_fmu_that_allows_one_per_process_get_two_nodes(tmp_path: Path) -> None:
     plan = prepare(written(tmp_path))
     once = {name for name, own in plan.system.instances.items() if own.description.model_name == "Integrator"}
     edges = [(c.source_instance, c.target_instance) for c in plan.connections]

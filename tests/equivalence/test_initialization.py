@@ -45,7 +45,7 @@ def test_a_loop_over_processes_starts_with_consistent_values_and_equals_one_proc
     assert abs(second + 0.75 * angle) <= 1e-9
 
 
-def test_a_loop_that_does_not_converge_ends_the_run_with_its_names_and_residuals(place: Place) -> None:
+def test_loop_that_does_not_converge_ends_run_with_its_names_and_residuals(place: Place) -> None:
     config = ring(place.folder, 4.0)
 
     process = place.run("launch", config, "--no-progress")

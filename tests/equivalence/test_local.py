@@ -42,7 +42,7 @@ def test_the_wall_clock_holds_a_run_in_one_process_too(place: Place, options: tu
     assert paced.read_bytes() == free.read_bytes()
 
 
-def test_the_rows_of_a_paced_run_in_one_process_are_there_while_it_runs_and_ctrl_c_ends_it(place: Place) -> None:
+def test_a_paced_local_run_shows_its_rows_and_ends_by_ctrl_c(place: Place) -> None:
     config = write_config(place.folder, stop_time=10_000.0, simulation={"real_time_factor": 1, "step_size": 0.01})
     result = config.with_suffix(".csv")
     launched = place.start("launch", config, "--local")
@@ -103,7 +103,7 @@ class Ended(Counter):
         super().do_step(step)
 
 
-def test_the_rows_before_a_step_that_does_not_return_are_kept_when_the_process_is_ended(tmp_path: Path) -> None:
+def test_rows_before_a_hanging_step_are_kept_when_the_process_is_ended(tmp_path: Path) -> None:
     result = tmp_path / "result.csv"
     plan = Scenario(("a -> b",), points=10).plan(record=True)
     records = (msgspec.structs.replace(plan.system.records[0], file=str(result)),)

@@ -417,7 +417,7 @@ def test_the_only_mesh_needs_no_name_and_a_number_alone_means_points(call: Call)
         assert call("resume", "--quiet") == (0, "", "")
 
 
-def test_the_clock_stands_while_a_mesh_rests_after_a_step_that_was_given_while_it_ran(call: Call) -> None:
+def test_clock_stands_while_mesh_rests_after_step_given_while_it_ran(call: Call) -> None:
     def status() -> dict[str, Any]:
         view: dict[str, Any] = json.loads(call("status", "looked_at", "--json")[1])
         return view
@@ -452,7 +452,7 @@ def test_without_a_mesh_the_error_says_how_to_start_one(
     assert "nobody answered at tcp/127.0.0.1:9 within 0.2 s" in capsys.readouterr().err
 
 
-def test_without_a_mesh_ls_has_an_empty_answer_and_a_hint_beside_it(
+def test_without_a_mesh_ls_has_an_empty_answer_and_hint_beside_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(tmp_path))
@@ -499,11 +499,11 @@ def test_watch_ends_with_the_mesh_and_with_ctrl_c() -> None:
         watchers[1].communicate(timeout=DEADLINE_S)
 
         assert [watcher.returncode for watcher in watchers] == [130, 0]
-        assert "mesh 'looked_at' is told to end, and was at point " in stopped.stdout
+        assert "mesh 'looked_at' is stopping at point " in stopped.stdout
         assert mesh.end() == 130, mesh.lines
 
 
-def test_the_speed_counts_what_was_stepped_by_hand_with_its_time_and_no_rest(place: Place) -> None:
+def test_the_speed_counts_steps_by_hand_with_their_time_and_no_pause(place: Place) -> None:
     simulation = {"step_size": 0.01, "real_time_factor": 2.0}
     config = write_config(place.folder, stop_time=1.0, simulation=simulation)
     mesh = place.start("launch", config, "--paused", "--no-progress")
@@ -518,7 +518,7 @@ def test_the_speed_counts_what_was_stepped_by_hand_with_its_time_and_no_rest(pla
     assert float(mesh.output.rpartition("real-time factor ")[2]) <= 100 / 98 * 2.0 + 0.01
 
 
-def test_watch_shows_the_last_point_though_it_had_no_processor_at_the_end(place: Place) -> None:
+def test_watch_shows_the_last_point_though_it_had_no_processor_at_end(place: Place) -> None:
     mesh = place.start("launch", write_config(place.folder, stop_time=0.2), "--paused", "--no-progress")
     mesh.wait_for_error_line("mesh 'pair' at")
     watch = place.start("watch", "pendulum.a")
@@ -632,7 +632,7 @@ def test_a_stream_is_what_is_recorded_point_by_point() -> None:
     assert [(time, value) for _, time, value in streamed] == rows[points[0] : points[-1] + 1]
 
 
-def test_what_a_get_answers_is_the_row_of_the_point_that_it_tells() -> None:
+def test_what_a_get_answers_is_the_row_of_point_that_it_tells() -> None:
     read = 0
     for _ in range(_RUNS):  # on a busy machine, a run is over after few questions
         read += read_and_compared()

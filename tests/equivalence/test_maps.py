@@ -142,7 +142,7 @@ def values_in(file: Path) -> list[tuple[Any, ...]]:
     return [(float(time), *map(json.loads, row)) for time, *row in rows]
 
 
-def test_values_are_mapped_as_in_a_plain_loop_in_one_process_and_in_many() -> None:
+def test_values_are_mapped_as_in_a_plain_loop_in_all_processes() -> None:
     with Place() as place:
         fmus = fmus_in(place.folder)
         config = written(place.folder, fmus)

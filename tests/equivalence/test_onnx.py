@@ -101,7 +101,7 @@ def test_a_cycle_has_the_floats_of_the_model(group: str | None, place: Place) ->
     assert len(set(actions)) > 300
 
 
-def test_a_model_with_a_step_size_of_its_own_is_computed_at_its_own_points(place: Place) -> None:
+def test_model_with_step_size_is_computed_at_its_own_points(place: Place) -> None:
     instances = {
         "pendulum": {"fmu": PENDULUM},
         "policy": {"onnx": "policy.onnx", "step_size": 0.05},
@@ -163,9 +163,7 @@ def test_a_running_model_can_be_looked_at_and_set(place: Place) -> None:
 
 
 @pytest.mark.parametrize("options", [[], ["--local"]], ids=["distributed", "local"])
-def test_an_output_that_is_no_number_ends_the_run_with_instance_variable_and_point(
-    options: list[str], place: Place
-) -> None:
+def test_output_that_is_no_number_ends_run_with_instance_variable_and_point(options: list[str], place: Place) -> None:
     sizes = {"x": ("DOUBLE", ["N"])}
     write_model(place.folder / "log.onnx", [("Log", ["x"], ["y"])], sizes, {"y": ("DOUBLE", ["N"])})
     # The ramp is 0.505 - t: it passes zero between the points 50 and 51.

@@ -21,7 +21,7 @@ sys.addaudithook(note)
 """
 
 
-def test_a_launch_opens_the_configuration_once_and_each_fmu_once_to_plan_and_once_for_all_nodes(place: Place) -> None:
+def test_a_launch_opens_the_configuration_once_and_each_fmu_twice(place: Place) -> None:
     opened = place.folder / "opened.txt"
     (place.folder / "sitecustomize.py").write_text(COUNTING)
     place.environment = {**place.environment, "PYTHONPATH": str(place.folder), "OPENED_FILES": str(opened)}

@@ -33,7 +33,7 @@ def place() -> Iterator[Place]:
         yield place
 
 
-def test_a_profiled_run_has_the_numbers_of_the_run_in_one_process_and_a_trace_of_every_node(place: Place) -> None:
+def test_a_profiled_run_has_equal_numbers_and_a_trace_of_every_node(place: Place) -> None:
     config = write_config(place.folder, instances=INSTANCES, connections=CONNECTIONS, name="five")
 
     run = place.run("launch", config, "--profile", "trace.json")
@@ -64,7 +64,7 @@ def test_a_master_by_hand_asks_nodes_by_hand_for_their_profile(place: Place) -> 
     assert master.output.startswith("Profile\n  node      instance  steps")
 
 
-def test_a_profile_of_a_run_by_the_wall_clock_names_the_wall_clock(place: Place) -> None:
+def test_a_profile_of_a_run_by_the_wall_clock_names_wall_clock(place: Place) -> None:
     config = write_config(place.folder, stop_time=0.5, simulation={"real_time_factor": 1})
 
     run = place.run("launch", config, "--profile")

@@ -40,7 +40,7 @@ def lines_of(path: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def test_a_distributed_run_and_a_local_one_write_the_same_bytes_with_the_numbers_of_a_csv(extended: Place) -> None:
+def test_distributed_run_and_local_one_write_same_bytes_with_numbers_of_csv(extended: Place) -> None:
     config = write_config(extended.folder, record={"file": "pair.jsonl"})
     local, table = extended.folder / "local.jsonl", extended.folder / "pair.csv"
 
@@ -91,7 +91,7 @@ def test_what_is_cut_off_within_a_row_is_not_counted(extended: Place) -> None:
     assert result.read_text() == '{"time": 0.0}\n{"time": 0.5}\n'
 
 
-def test_a_disk_that_gets_full_leaves_whole_rows_as_many_as_are_told(extended: Place) -> None:
+def test_disk_that_gets_full_leaves_whole_rows_as_many_as_are_told(extended: Place) -> None:
     config = write_config(extended.folder, record={"file": "pair.jsonl"}, stop_time=100.0)
     result = extended.folder / "pair.jsonl"
 

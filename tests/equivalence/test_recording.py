@@ -135,7 +135,7 @@ def test_many_runs_with_loaded_models_record_the_same(
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_the_states_of_fmus_without_outputs_are_recorded_in_every_way_to_run(
+def test_states_of_fmus_without_outputs_are_recorded_in_every_way_to_run(
     version: int, place: Place, event_fmu: Callable[..., Path]
 ) -> None:
     source = event_fmu("Oscillator", version)
@@ -169,9 +169,7 @@ def columns_of(path: Path) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
-def test_an_input_has_the_value_with_which_its_instance_came_to_the_point(
-    place: Place, options: tuple[str, ...]
-) -> None:
+def test_an_input_has_the_value_with_which_its_instance_came_to_point(place: Place, options: tuple[str, ...]) -> None:
     """That of the source at this point, or with delay 1 at the point before; of a slow instance, at its own point."""
     path = write_config(
         place.folder,
@@ -228,7 +226,7 @@ def test_inputs_and_parameters_of_every_type_and_version_of_fmi(place: Place, ze
     place.assert_nothing_left()
 
 
-def test_a_value_that_is_set_while_it_waits_is_in_the_rows_after_this_point(place: Place) -> None:
+def test_value_set_while_it_waits_is_in_rows_after_this_point(place: Place) -> None:
     """Also if somebody begins to watch before: a row has what its step used. A query tells the new value."""
     path = write_config(
         place.folder,

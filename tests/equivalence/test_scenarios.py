@@ -115,7 +115,7 @@ def test_a_run_that_is_paused_and_stepped_by_hand_follows_its_scenario(tmp_path:
         assert result[name].tobytes() == expected[name].tobytes(), name
 
 
-def test_a_value_set_by_hand_holds_until_the_next_change_that_the_scenario_prescribes() -> None:
+def test_a_value_set_by_hand_holds_until_next_change_that_scenario_prescribes() -> None:
     """A gain of 1: what it gives at a point is what it was given for the step to this point."""
     mesh = fmu_mesh.Mesh("steered", step_size=0.01, stop_time=0.3)
     mesh.add("gain", fmu=FMUS / "Gain.fmu")
@@ -140,7 +140,7 @@ def test_a_value_set_by_hand_holds_until_the_next_change_that_the_scenario_presc
     assert result["gain.y"].tolist() == expected
 
 
-def test_set_at_a_time_that_is_past_says_from_when_on_the_value_holds(place: Place) -> None:
+def test_set_at_time_that_is_past_says_from_when_on_value_holds(place: Place) -> None:
     config = write_config(place.folder, instances={"gain": {"fmu": "Gain"}}, connections=(), name="free", stop_time=1.0)
     launched = place.start("launch", config, "--paused")
     place.note()
@@ -242,7 +242,7 @@ def test_values_of_all_types_and_arrays_follow_a_scenario(place: Place) -> None:
     assert b"18446744073709551615" in rows
 
 
-def test_a_table_that_changes_after_the_run_was_planned_ends_the_run_with_its_name(tmp_path: Path) -> None:
+def test_table_that_changes_after_run_was_planned_ends_run_with_its_name(tmp_path: Path) -> None:
     config = written(tmp_path)
     mesh = fmu_mesh.load(config)
     plan = mesh.plan()

@@ -249,7 +249,7 @@ def plan_columns(config: Path) -> list[str]:
 
 @pytest.mark.parametrize("kind", ["co_simulation", "model_exchange"])
 @pytest.mark.parametrize("version", [2, 3])
-def test_an_fmu_that_asks_to_end_leaves_the_system_at_the_last_point_of_all(
+def test_fmu_that_asks_to_end_leaves_system_at_last_point_of_all(
     version: Version, kind: str, place: Place, event_fmu: EventFmu
 ) -> None:
     """The third stair is at 0.93 s, which is point 93 but for rounding."""

@@ -37,7 +37,7 @@ def last_row(content: bytes) -> dict[str, float]:
         pytest.param(0.0, 10.0, 0.1, id="only the slower one ends after the last point"),
     ],
 )
-def test_an_fmu_is_told_a_stop_time_that_its_last_step_of_the_regular_size_does_not_exceed(
+def test_an_fmu_gets_a_stop_time_that_its_last_step_keeps(
     start: float, stop: float, step: float, place: Place, event_fmu: EventFmu
 ) -> None:
     fmus = [str(find_fmu(f"Steps{version}", place.folder / "fmus")) for version in (1, 2)]
@@ -89,7 +89,7 @@ def test_the_parts_of_the_last_step_end_in_time_too(stop: float, place: Place, e
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_an_event_that_is_past_the_stop_time_by_rounding_leaves_the_model_in_time(
+def test_event_that_is_past_stop_time_by_rounding_leaves_model_in_time(
     version: Version, place: Place, event_fmu: EventFmu
 ) -> None:
     """The third stair is at 0.1 + 0.1 + 0.1, which is greater than 0.3."""

@@ -13,9 +13,7 @@ from tests.helpers import Place
 
 
 @pytest.mark.parametrize("name", ["Steps2", "Events3"])
-def test_an_fmu_is_told_the_tolerance_of_its_instance_or_that_of_its_default_experiment_or_none(
-    name: str, place: Place
-) -> None:
+def test_an_fmu_gets_the_tolerance_of_its_instance_its_experiment_or_none(name: str, place: Place) -> None:
     fmu = find_fmu(name, place.folder / "fmus")
     default = repacked(
         place.folder / "default.fmu",

@@ -171,7 +171,7 @@ def cell(value: Any) -> str:  # noqa: ANN401 of any type
     return value if isinstance(value, str) else json.dumps(value).replace("e-0", "e-").replace("e+", "e")
 
 
-def test_every_type_is_the_same_over_the_wire_and_in_one_process_and_right() -> None:
+def test_every_type_is_same_over_wire_and_in_one_process_and_right() -> None:
     with Place() as place:
         config = written(place.folder)
         local = place.folder / "local.csv"

@@ -122,7 +122,7 @@ def following(place: Place, *arguments: str) -> Launched:
         ("kill", 4, "fmu-mesh: mesh 'pair' is gone, and does not become done any more"),
     ],
 )
-def test_the_end_of_a_mesh_is_waited_for_and_told_with_the_exit_code_of_its_launch(
+def test_the_end_of_a_mesh_has_the_exit_code_of_launch(
     place: Place, faulty: Path, end: str, code: int, said: str
 ) -> None:
     instances = {"faulty": {"fmu": str(faulty), "start_values": {"fail_at": 0.5 if end == "failed" else FAR_S}}}
@@ -140,7 +140,7 @@ def test_the_end_of_a_mesh_is_waited_for_and_told_with_the_exit_code_of_its_laun
     assert runs.wait() == code
 
 
-def test_a_state_that_a_mesh_cannot_come_to_any_more_is_told_at_once(place: Place) -> None:
+def test_state_that_mesh_cannot_come_to_any_more_is_told_at_once(place: Place) -> None:
     running(place)
 
     for state in ("starting", "initializing"):
@@ -242,7 +242,7 @@ def test_pause_and_step_tell_the_point_where_the_mesh_really_rests(place: Place)
         assert json.loads(place.run("get", "pendulum.a", "--json").output)["point"] == point
 
 
-def test_a_mesh_that_does_not_rest_in_time_says_where_it_is_going_to(place: Place) -> None:
+def test_a_mesh_that_pauses_too_late_says_where_it_is_going(place: Place) -> None:
     running(place)
 
     step = place.run("step", "pair", "1000", "--timeout", "0.5")  # 10 s by the wall clock
@@ -276,7 +276,7 @@ def test_stop_is_the_normal_end_of_a_run_without_a_stop_time(place: Place, pause
 
     stop = place.run("stop", "pair")
 
-    assert stop.output.startswith("mesh 'pair' is told to end, and was at point ")
+    assert stop.output.startswith("mesh 'pair' is stopping at point ")
     assert launched.wait() == 0
     rows = rows_of(config.with_suffix(".csv"))
     assert [row[0] for row in rows] == [point * 0.01 for point in range(len(rows))]
@@ -290,7 +290,7 @@ def test_stop_is_the_normal_end_of_a_run_without_a_stop_time(place: Place, pause
     place.assert_nothing_left()
 
 
-def test_stop_of_a_free_running_fmu_is_its_normal_end_and_that_before_a_stop_time_is_not(place: Place) -> None:
+def test_a_stop_of_a_free_running_fmu_is_its_normal_end(place: Place) -> None:
     codes, errors = [], []
     for options in ([], ["--stop-time", "1000"]):
         run = place.start("run", FMUS / "Gain.fmu", "--no-progress", *options)

@@ -43,7 +43,7 @@ def wait_until_there(place: Place, count: int) -> None:
     [("pendulum", "delay", "master"), ("master", "delay", "pendulum"), ("delay", "master", "pendulum")],
     ids=", ".join,
 )
-def test_processes_started_by_hand_in_any_order_do_the_same_job_as_launch(place: Place, order: tuple[str, ...]) -> None:
+def test_processes_started_by_hand_in_any_order_do_same_job_as_launch(place: Place, order: tuple[str, ...]) -> None:
     config = write_config(place.folder)
     result = config.with_suffix(".csv")
     assert place.run("launch", config).wait() == 0
@@ -89,7 +89,7 @@ def test_a_node_without_a_master_gives_up_after_the_deadline(place: Place) -> No
     place.assert_nothing_left()
 
 
-def test_a_second_master_of_a_mesh_is_refused_and_the_first_goes_on(place: Place) -> None:
+def test_a_second_master_of_a_mesh_is_refused_and_first_goes_on(place: Place) -> None:
     config = write_config(place.folder)
     first = start(place, config, "master")
     place.note()
@@ -104,7 +104,7 @@ def test_a_second_master_of_a_mesh_is_refused_and_the_first_goes_on(place: Place
     place.assert_nothing_left()
 
 
-def test_a_second_process_for_a_node_is_refused_and_the_first_goes_on(place: Place) -> None:
+def test_a_second_process_for_a_node_is_refused_and_first_goes_on(place: Place) -> None:
     config = write_config(place.folder)
     first = start(place, config, "pendulum")
     wait_until_there(place, 1)
@@ -237,7 +237,7 @@ def test_an_unknown_node_is_told_with_the_names_that_there_are(place: Place, nam
 
 
 @pytest.mark.parametrize("victim", ["master", "pendulum"])
-def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(place: Place, victim: str) -> None:
+def test_when_process_started_by_hand_is_killed_others_end_and_say_so(place: Place, victim: str) -> None:
     config = write_config(place.folder, stop_time=10_000.0, simulation={"real_time_factor": 1})
     by_hand = {role: start(place, config, role) for role in ("pendulum", "delay", "master")}
     wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")
@@ -252,9 +252,7 @@ def test_when_a_process_started_by_hand_is_killed_the_others_end_and_say_so(plac
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=lambda number: number.name)
-def test_a_master_that_ends_before_all_nodes_are_there_ends_those_that_are(
-    place: Place, number: signal.Signals
-) -> None:
+def test_master_that_ends_before_all_nodes_are_there_ends_those_that_are(place: Place, number: signal.Signals) -> None:
     """Long before the deadline of the start: what it waited for cannot come any more."""
     config = write_config(place.folder, timeouts={"start": 10 * DEADLINE_S})
     master = start(place, config, "master")
@@ -301,7 +299,7 @@ def test_what_a_killed_process_has_left_is_removed_by_the_next_start(place: Plac
     place.assert_nothing_left()
 
 
-def test_what_a_killed_run_in_one_process_has_left_is_removed_by_the_next_start(place: Place) -> None:
+def test_the_next_start_removes_what_a_killed_local_run_left(place: Place) -> None:
     config = write_config(place.folder, stop_time=10_000.0)
     killed = place.start("launch", config, "--local")
     wait_until(lambda: row_count(config.with_suffix(".csv")) > 100, "100 rows")

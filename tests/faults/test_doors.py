@@ -73,7 +73,7 @@ def value_of_angle(endpoint: str) -> float:
         return wait_until(lambda: ask(session), "the angle")
 
 
-def test_the_only_way_in_is_a_socket_that_any_zenoh_client_of_the_user_opens(place: Place) -> None:
+def test_only_way_in_is_socket_that_any_zenoh_client_of_user_opens(place: Place) -> None:
     launched = running(place)
     endpoint = endpoint_of(launched)
 
@@ -235,9 +235,7 @@ def test_a_mesh_is_not_launched_there(place: Place) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
-def test_the_folder_of_another_user_that_su_has_left_in_the_environment_is_not_used(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_folder_of_another_user_after_su_is_not_used(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs = place.folder / "theirs"
     theirs.mkdir(mode=0o700)
     os.chown(theirs, NOBODY, NOBODY)

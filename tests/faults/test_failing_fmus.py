@@ -56,7 +56,7 @@ def with_faulty(
         ),
     ],
 )
-def test_a_failed_step_is_told_with_instance_point_time_and_the_message_of_the_fmu(
+def test_failed_step_is_told_with_instance_point_time_and_message_of_fmu(
     place: Place, faulty: Path, fault: str, status: str, says: str, options: tuple[str, ...]
 ) -> None:
     config = with_faulty(place, faulty, {fault: 1.0})
@@ -91,7 +91,7 @@ def test_when_an_fmu_fails_all_rows_before_are_kept(
 
 
 @pytest.mark.parametrize("zenoh", [{}, {"shared_memory": False}], ids=["shared", "zenoh"])
-def test_a_node_that_is_killed_in_a_long_step_has_sent_everything_before_it(
+def test_node_that_is_killed_in_long_step_has_sent_everything_before_it(
     place: Place, faulty: Path, zenoh: dict[str, bool]
 ) -> None:
     config = write_config(
@@ -111,7 +111,7 @@ def test_a_node_that_is_killed_in_a_long_step_has_sent_everything_before_it(
     place.assert_nothing_left()
 
 
-def test_nobody_waits_long_for_the_last_rows_of_a_node_whose_fmu_does_not_return(place: Place, faulty: Path) -> None:
+def test_nobody_waits_long_for_rows_of_a_node_whose_fmu_hangs(place: Place, faulty: Path) -> None:
     config = write_config(
         place.folder,
         instances={
@@ -134,7 +134,7 @@ def test_nobody_waits_long_for_the_last_rows_of_a_node_whose_fmu_does_not_return
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize("name", ["Steps1", "Steps2"])
-def test_a_step_that_is_pending_for_ever_ends_at_the_deadline_of_the_step(
+def test_a_step_that_is_pending_for_ever_ends_at_deadline_of_step(
     place: Place, tmp_path: Path, name: str, options: tuple[str, ...]
 ) -> None:
     instances = {"pump": {"fmu": str(find_fmu(name, tmp_path)), "start_values": {"polls": -1}}}
@@ -214,7 +214,7 @@ def test_status_is_answered_while_an_fmu_does_not_return(place: Place, faulty: P
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
-def test_an_fmu_that_asks_to_end_the_simulation_is_named_and_nothing_has_failed(
+def test_fmu_that_asks_to_end_simulation_is_named_and_nothing_has_failed(
     place: Place, event_fmu: Callable[..., Path], options: tuple[str, ...]
 ) -> None:
     """Its steps are five points long: the outputs hold to the last point before the step that it did not finish."""
@@ -242,7 +242,7 @@ def test_an_fmu_that_asks_to_end_the_simulation_is_named_and_nothing_has_failed(
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
-def test_a_failed_step_of_several_points_is_told_with_the_point_at_which_it_began(
+def test_a_failed_step_of_several_points_names_the_point_where_it_began(
     place: Place, faulty: Path, options: tuple[str, ...]
 ) -> None:
     slow = {"fmu": str(faulty), "start_values": {"fail_at": 0.022}, "step_size": 0.01}
@@ -281,7 +281,7 @@ class Clutch(fmu_mesh.Component):
 @pytest.mark.parametrize("clutch", ["FMU", "component"])
 @pytest.mark.parametrize("first", [1, 300], ids=["at a point", "at the start"])
 @pytest.mark.parametrize("way", ["in C", "in Python", "local"])
-def test_a_number_beyond_the_type_of_its_input_ends_the_run_with_both_ends(
+def test_a_number_beyond_type_of_its_input_ends_run_with_both_ends(
     place: Place, tmp_path: Path, clutch: str, first: int, way: str
 ) -> None:
     """A model puts out an Enumeration that is none of its items, and an Int8 can be each of these."""

@@ -78,7 +78,7 @@ def test_an_fmu_without_a_place_names_folder_reason_and_the_way_out(place: Place
     place.assert_nothing_left()
 
 
-def test_a_path_that_is_too_long_for_a_socket_is_found_before_anything_starts(place: Place) -> None:
+def test_path_that_is_too_long_for_socket_is_found_before_anything_starts(place: Place) -> None:
     config = write_config(place.folder)
     place.environment |= {"FMU_MESH_RUNTIME_DIR": str(place.folder / ("x" * 60))}
 

@@ -53,7 +53,7 @@ def sockets_of(process: psutil.Process) -> set[str]:
 @pytest.mark.parametrize(
     ("number", "how"), [(signal.SIGKILL, "was ended by SIGKILL"), (signal.SIGTERM, "was asked to end by a signal")]
 )
-def test_without_its_fork_server_a_run_ends_with_its_name_and_its_rows(
+def test_without_its_fork_server_run_ends_with_its_name_and_its_rows(
     place: Place, number: signal.Signals, how: str
 ) -> None:
     launched, result = running(place)
@@ -124,9 +124,7 @@ def test_a_run_whose_fork_server_is_stopped_meanwhile_ends_as_any_other(place: P
 @pytest.mark.parametrize(
     ("victim", "lost"), [("pendulum", "node 'pendulum' was lost"), ("master", "the master was lost")]
 )
-def test_the_end_of_a_process_is_noticed_although_the_fork_server_is_stopped(
-    place: Place, victim: str, lost: str
-) -> None:
+def test_the_end_of_a_process_is_noticed_although_fork_server_is_stopped(place: Place, victim: str, lost: str) -> None:
     launched, _ = running(place)
     launched.child("fork").suspend()
 
@@ -153,7 +151,7 @@ def test_whoever_is_killed_together_with_the_launcher_nothing_is_left(place: Pla
     place.assert_nothing_left()
 
 
-def test_a_fork_server_that_is_stopped_does_not_outlive_a_launcher_that_is_killed(place: Place) -> None:
+def test_fork_server_that_is_stopped_does_not_outlive_launcher_that_is_killed(place: Place) -> None:
     launched, _ = running(place)
     launched.child("fork").suspend()
 
@@ -162,7 +160,7 @@ def test_a_fork_server_that_is_stopped_does_not_outlive_a_launcher_that_is_kille
     wait_until(lambda: not place.processes(), "the end of all processes", 15.0)
 
 
-def test_a_fork_server_that_is_stopped_before_it_forks_does_not_outlive_a_launcher_that_is_killed(place: Place) -> None:
+def test_fork_server_stopped_before_it_forks_does_not_outlive_launcher_killed(place: Place) -> None:
     launched = place.start("launch", write_config(place.folder, stop_time=FAR_S))
     launched.child("fork").suspend()
 

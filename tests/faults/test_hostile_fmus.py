@@ -81,7 +81,7 @@ HANGS = [
     [*(((), hang) for hang in (*HANGS[:2], *HANGS[3:])), *((("--local",), hang) for hang in HANGS)],
     ids=lambda value: value[0] if value else "distributed",
 )
-def test_an_fmu_that_hangs_in_a_call_is_ended_with_its_name_the_call_and_the_point(
+def test_an_fmu_that_hangs_in_a_call_is_ended_and_named(
     place: Place, hostile: Path, hang: tuple[str, str, str, str], options: tuple[str, ...]
 ) -> None:
     function, said, setting, point = hang
@@ -154,7 +154,7 @@ def test_what_an_fmu_says_in_terminate_is_shown(place: Place, hostile: Path, opt
     assert "talker at point 10: farewell" in launched.errors
 
 
-def test_an_fmu_that_crashes_at_its_end_costs_no_run_of_a_sweep(
+def test_an_fmu_that_crashes_at_its_end_costs_no_run_of_sweep(
     place: Place, hostile: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
@@ -171,9 +171,7 @@ def test_an_fmu_that_crashes_at_its_end_costs_no_run_of_a_sweep(
     assert [float(result.curves(k)[f"{fault}.third"][-1]) for k in range(4)] == [k / 3.0 for k in range(4)]
 
 
-def test_an_fmu_that_takes_its_time_to_initialize_makes_no_other_node_believe_that_the_master_is_gone(
-    place: Place, hostile: Path
-) -> None:
+def test_an_fmu_that_initializes_slowly_makes_no_node_miss_the_master(place: Place, hostile: Path) -> None:
     slow = mesh_of(place, hostile, ["slow_fmi2ExitInitializationMode"], timeouts={"step": 3.0})
 
     launched = place.run("launch", slow)
@@ -182,7 +180,7 @@ def test_an_fmu_that_takes_its_time_to_initialize_makes_no_other_node_believe_th
     assert len(rows_of(slow.with_suffix(".csv"))) == 11
 
 
-def test_a_step_that_hangs_in_a_group_is_told_of_the_instance_that_hangs(place: Place, hostile: Path) -> None:
+def test_a_step_that_hangs_in_group_is_told_of_instance_that_hangs(place: Place, hostile: Path) -> None:
     config = mesh_of(place, hostile, ["first", "hang_fmi2DoStep"], group="together", timeouts=SHORT)
 
     launched = place.run("launch", config)
@@ -192,9 +190,7 @@ def test_a_step_that_hangs_in_a_group_is_told_of_the_instance_that_hangs(place: 
     place.assert_nothing_left()
 
 
-def test_an_instance_that_has_nothing_to_step_does_not_hang_while_another_one_of_its_group_steps(
-    place: Place, hostile: Path
-) -> None:
+def test_an_instance_without_a_step_does_not_hang_while_its_group_steps(place: Place, hostile: Path) -> None:
     config = write_config(
         place.folder,
         instances={
@@ -212,9 +208,7 @@ def test_an_instance_that_has_nothing_to_step_does_not_hang_while_another_one_of
     assert len(rows_of(config.with_suffix(".csv"))) == 11
 
 
-def test_an_fmu_that_becomes_slow_from_one_step_to_the_next_keeps_on_telling_its_progress(
-    place: Place, hostile: Path
-) -> None:
+def test_an_fmu_that_suddenly_becomes_slow_still_reports_its_progress(place: Place, hostile: Path) -> None:
     """More than four hundred steps take no time, and the next twelve together more than a mesh may stand still."""
     config = write_config(
         place.folder,
@@ -230,7 +224,7 @@ def test_an_fmu_that_becomes_slow_from_one_step_to_the_next_keeps_on_telling_its
 
 
 @pytest.mark.parametrize("group", [None, "together"])
-def test_slow_steps_one_after_the_other_may_take_longer_than_one_step_may(
+def test_slow_steps_one_after_other_may_take_longer_than_one_step_may(
     place: Place, hostile: Path, group: str | None
 ) -> None:
     names = [f"tardy{number}_fmi2DoStep" for number in range(7)]
@@ -244,7 +238,7 @@ def test_slow_steps_one_after_the_other_may_take_longer_than_one_step_may(
     assert len(rows_of(config.with_suffix(".csv"))) == 7
 
 
-def test_a_step_that_the_wall_clock_was_waited_for_has_its_whole_time(place: Place, hostile: Path) -> None:
+def test_a_step_that_wall_clock_was_waited_for_has_its_whole_time(place: Place, hostile: Path) -> None:
     """Points are seven seconds apart, and a mesh may stand still for six."""
     config = mesh_of(
         place,
@@ -279,7 +273,7 @@ def test_an_fmu_that_ends_its_process_ends_no_other(place: Place, hostile: Path,
 
 
 @pytest.mark.parametrize("way", ["launch", "--local", "repeated", "open"])
-def test_what_an_fmu_does_to_its_process_in_any_call_changes_no_result(place: Place, hostile: Path, way: str) -> None:
+def test_what_fmu_does_to_its_process_in_any_call_changes_no_result(place: Place, hostile: Path, way: str) -> None:
     faults = [f"{fault}_{function}" for fault in STATE_FAULTS for function in CALLS]
     faults.remove("traps_fmi2SetReal")  # its own doStep follows, and divides by zero
     config = write_config(
@@ -330,7 +324,7 @@ def values_seen(place: Place, config: Path, way: str) -> dict[str, list[float]]:
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
-def test_what_an_fmu_does_to_the_floating_point_mode_changes_no_result_of_a_cycle(
+def test_what_fmu_does_to_floating_point_mode_changes_no_result_of_cycle(
     place: Place, hostile: Path, options: tuple[str, ...]
 ) -> None:
     results = []
@@ -422,7 +416,7 @@ class _KnownLate:
         return code
 
 
-def test_a_process_that_is_left_behind_is_killed_although_its_end_was_known_first() -> None:
+def test_process_left_behind_is_killed_although_its_end_was_known_first() -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", _LEAVES_ONE],
         start_new_session=True,

@@ -34,7 +34,7 @@ def command(*arguments: str | Path) -> list[str]:
     return [str(Path(sys.executable).with_name("fmu-mesh")), *map(str, arguments)]
 
 
-def test_a_mesh_is_launched_from_a_folder_with_files_that_are_called_like_modules(place: Place) -> None:
+def test_mesh_is_launched_from_folder_with_files_that_are_called_like_modules(place: Place) -> None:
     write_modules(place.folder, FIRST)
     config = write_config(place.folder)
 

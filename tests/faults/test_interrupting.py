@@ -39,7 +39,7 @@ def is_pending(pid: int, number: signal.Signals) -> bool:
     return bool(int(waiting, 16) >> (number - 1) & 1)
 
 
-def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answer(place: Place) -> None:
+def test_ctrl_c_ends_the_run_within_two_seconds_without_an_answering_master(place: Place) -> None:
     config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S)
     launched = place.start("launch", config)
     wait_until(lambda: row_count(config.with_suffix(".csv")) > 1000, "1000 rows")
@@ -55,7 +55,7 @@ def test_ctrl_c_ends_the_run_within_two_seconds_even_if_the_master_does_not_answ
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
-def test_a_signal_ends_the_run_within_two_seconds_with_a_readable_partial_result(
+def test_a_signal_ends_run_within_two_seconds_with_a_readable_partial_result(
     place: Place, number: signal.Signals, options: tuple[str, ...]
 ) -> None:
     config = write_config(place.folder, instances=braked(place.folder), stop_time=FAR_S)
@@ -104,7 +104,7 @@ def test_a_run_that_is_interrupted_is_plotted_up_to_there(place: Place, options:
 
 
 @pytest.mark.parametrize("module", ["fmu_mesh.cli.main", "fmu_mesh.cli.run_arguments", "fmu_mesh.cli.checking"])
-def test_ctrl_c_while_the_command_is_being_loaded_is_told_like_any_other(module: str) -> None:
+def test_ctrl_c_while_command_is_being_loaded_is_told_like_any_other(module: str) -> None:
     program = [sys.executable, "-c", _INTERRUPTED_WHILE_LOADING.replace("MODULE", module)]
 
     done = subprocess.run(program, capture_output=True, text=True, check=False, timeout=DEADLINE_S)

@@ -87,9 +87,7 @@ def test_a_run_that_fails_before_its_first_point_leaves_what_was_there(
 
 
 @OLDER
-def test_a_run_in_which_only_some_have_reached_the_first_point_leaves_what_was_there(
-    place: Place, hostile: Path, older: str | None
-) -> None:
+def test_a_run_that_only_some_have_begun_leaves_what_was_there(place: Place, hostile: Path, older: str | None) -> None:
     launched, result = hanging(place, hostile, older=older)
     before = kept_bytes(result)
     with place.session() as session:
@@ -110,7 +108,7 @@ def test_a_run_in_which_only_some_have_reached_the_first_point_leaves_what_was_t
 
 @OLDER
 @MODES
-def test_a_second_run_is_refused_although_the_first_has_not_reached_its_first_point(
+def test_second_run_is_refused_although_first_has_not_reached_its_first_point(
     place: Place, hostile: Path, options: tuple[str, ...], older: str | None
 ) -> None:
     first, result = hanging(place, hostile, older=older)
@@ -128,7 +126,7 @@ def test_a_second_run_is_refused_although_the_first_has_not_reached_its_first_po
 
 
 @OLDER
-def test_a_master_that_is_killed_before_the_first_point_leaves_what_was_there(
+def test_a_master_that_is_killed_before_first_point_leaves_what_was_there(
     place: Place, hostile: Path, older: str | None
 ) -> None:
     launched, result = hanging(place, hostile, older=older)
@@ -145,7 +143,7 @@ def test_a_master_that_is_killed_before_the_first_point_leaves_what_was_there(
 
 @OLDER
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_run_in_one_process_that_is_ended_before_the_first_point_leaves_what_was_there(
+def test_run_in_one_process_ended_before_first_point_leaves_what_was_there(
     place: Place, hostile: Path, number: signal.Signals, older: str | None
 ) -> None:
     launched, result = hanging(place, hostile, "--local", older=older)
@@ -162,7 +160,7 @@ def test_a_run_in_one_process_that_is_ended_before_the_first_point_leaves_what_w
     assert not list(place.folder.glob("*.starting"))
 
 
-def test_a_run_that_is_paused_at_its_first_point_has_that_as_its_result(place: Place) -> None:
+def test_run_paused_at_its_first_point_has_that_as_its_result(place: Place) -> None:
     config = write_config(place.folder)
     launched = place.start("launch", config, "--paused")
     wait_until(lambda: row_count(config.with_suffix(".csv")) == 1, "the row of the first point")
@@ -175,7 +173,7 @@ def test_a_run_that_is_paused_at_its_first_point_has_that_as_its_result(place: P
 
 
 @MODES
-def test_a_run_that_records_nothing_says_nothing_of_an_older_result_and_leaves_it(
+def test_run_that_records_nothing_says_nothing_of_older_result_and_leaves_it(
     place: Place, options: tuple[str, ...]
 ) -> None:
     old = place.folder / "old.csv"

@@ -69,7 +69,7 @@ def point_in(message: str) -> int:
 
 @pytest.mark.parametrize("victim", ["pendulum", "delay", "master"])
 @pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
-def test_a_killed_process_ends_the_run_within_two_seconds_and_the_rows_before_are_kept(
+def test_killed_process_ends_run_within_two_seconds_and_rows_before_are_kept(
     place: Place, victim: str, simulation: dict[str, float], rows: int
 ) -> None:
     launched, result = started(place, simulation, rows)
@@ -92,7 +92,7 @@ def test_a_killed_process_ends_the_run_within_two_seconds_and_the_rows_before_ar
 
 
 @pytest.mark.parametrize("victim", ["delay", "master"])
-def test_with_restarts_a_run_whose_process_is_killed_ends_with_the_same_numbers(place: Place, victim: str) -> None:
+def test_with_restarts_a_run_whose_process_is_killed_ends_with_same_numbers(place: Place, victim: str) -> None:
     config = write_config(place.folder, stop_time=3.0, simulation={"real_time_factor": 1})
     result = config.with_suffix(".csv")
     launched = place.start("launch", config, "--restarts", "2")
@@ -133,7 +133,7 @@ class Killer(fmu_mesh.Component):
 
 @pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
 @pytest.mark.parametrize("window", [1, 300, "auto"])
-def test_of_a_process_that_is_killed_in_a_step_all_rows_before_it_are_kept(
+def test_of_process_killed_in_step_all_rows_before_it_are_kept(
     place: Place, window: int | str, *, shared_memory: bool
 ) -> None:
     (place.folder / "killer.py").write_text(KILLER, encoding="utf-8")
@@ -181,7 +181,7 @@ def _status_of_delay(place: Place) -> dict[str, Any] | None:
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_a_run_that_is_lost_again_and_again_starts_again_as_often_as_it_may(
+def test_run_lost_again_and_again_starts_again_as_often_as_it_may(
     place: Place, number: signal.Signals, how: str
 ) -> None:
     config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1})
@@ -209,9 +209,7 @@ def test_a_node_that_is_killed_before_the_first_point_is_named(place: Place) -> 
 
 
 @pytest.mark.parametrize("victim", ["pendulum", "master", "gateway"])
-def test_a_process_that_is_stopped_before_it_has_met_the_others_is_named_long_before_the_deadline(
-    place: Place, victim: str
-) -> None:
+def test_process_stopped_before_it_has_met_others_is_named_long_before_deadline(place: Place, victim: str) -> None:
     sections: dict[str, dict[str, Any]] = {"timeouts": {"start": 10 * DEADLINE_S, "link": 4.0}}
     if victim == "gateway":
         sections["ros"] = {"profile": "ros2dds", "distribution": "jazzy"}
@@ -241,7 +239,7 @@ def test_a_process_that_goes_on_in_time_is_not_lost(place: Place) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
-def test_a_signal_of_somebody_else_to_the_master_is_a_loss_and_says_which(place: Place, number: signal.Signals) -> None:
+def test_a_signal_of_somebody_else_to_master_is_loss_and_says_which(place: Place, number: signal.Signals) -> None:
     launched, result = started(place, {"real_time_factor": 1}, 300)
 
     launched.child("master").send_signal(number)
@@ -333,7 +331,7 @@ def test_restarts_do_not_go_together_with(place: Place, option: str) -> None:
 
 
 @pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
-def test_when_the_launcher_is_killed_its_children_end_by_themselves_and_remove_their_files(
+def test_when_launcher_is_killed_its_children_end_and_remove_their_files(
     place: Place, simulation: dict[str, float], rows: int
 ) -> None:
     launched, result = started(place, simulation, rows)
@@ -361,7 +359,7 @@ def test_a_launcher_that_is_killed_while_the_processes_start_leaves_nothing_eith
 
 @pytest.mark.parametrize("victim", ["pendulum", "delay", "master"])
 @pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
-def test_a_process_that_stays_stopped_is_named_at_the_deadline_of_a_step(
+def test_a_process_that_stays_stopped_is_named_at_deadline_of_a_step(
     place: Place, victim: str, simulation: dict[str, float], rows: int
 ) -> None:
     launched, result = started(place, simulation, rows, timeouts={"step": 5.0})
@@ -376,7 +374,7 @@ def test_a_process_that_stays_stopped_is_named_at_the_deadline_of_a_step(
     assert_is_what_one_process_calculates(place, result)
 
 
-def test_a_run_that_is_over_before_its_launcher_looks_is_a_run_like_any_other(place: Place) -> None:
+def test_run_over_before_its_launcher_looks_is_run_like_any_other(place: Place) -> None:
     config = write_config(place.folder, stop_time=0.1)
     place.hold("node pendulum")
     launched = place.start("launch", config)

@@ -42,9 +42,7 @@ def assert_ends_well(first: Launched, result: Path) -> None:
     assert len(rows_of(result)) == POINTS + 1
 
 
-def test_a_second_launch_of_a_mesh_is_refused_in_words_and_the_first_does_not_notice(
-    place: Place, router: Launched
-) -> None:
+def test_a_second_launch_of_a_mesh_is_refused_without_disturbing_the_first(place: Place, router: Launched) -> None:
     config = through(router, place, "client")
     result = place.folder / "pair.csv"
     first = place.start("launch", config, "--no-progress")
@@ -60,7 +58,7 @@ def test_a_second_launch_of_a_mesh_is_refused_in_words_and_the_first_does_not_no
     assert_ends_well(first, result)
 
 
-def test_two_launches_of_a_mesh_that_a_router_makes_meet_do_not_mix(place: Place, router: Launched) -> None:
+def test_two_launches_of_a_mesh_that_router_makes_meet_do_not_mix(place: Place, router: Launched) -> None:
     """A router passes nothing on between peers; they meet when it has told them of each other, which takes its time."""
     config = through(router, place, "peer")
     result = place.folder / "pair.csv"
@@ -75,9 +73,7 @@ def test_two_launches_of_a_mesh_that_a_router_makes_meet_do_not_mix(place: Place
         assert (place.folder / "second.csv").read_bytes() == result.read_bytes()
 
 
-def test_a_second_process_for_a_node_is_refused_in_words_and_the_first_does_not_notice(
-    place: Place, router: Launched
-) -> None:
+def test_a_second_process_for_a_node_is_refused_without_disturbing_the_first(place: Place, router: Launched) -> None:
     config = through(router, place, "client")
     result = place.folder / "pair.csv"
     # Each in a runtime folder of its own, as on hosts of their own: on one host its socket tells.
@@ -97,7 +93,7 @@ def test_a_second_process_for_a_node_is_refused_in_words_and_the_first_does_not_
     assert len(rows_of(result)) == POINTS + 1
 
 
-def test_a_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place, router: Launched) -> None:
+def test_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place, router: Launched) -> None:
     config = through(router, place, "client")
     result = place.folder / "pair.csv"
     first = place.start("launch", config, "--no-progress")

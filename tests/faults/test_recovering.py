@@ -99,7 +99,7 @@ def test_launch_finishes_the_file_of_a_killed_master(place: Place, name: str) ->
 @pytest.mark.parametrize(
     ("options", "zenoh"), [((), {"shared_memory": False}), (("--local",), {})], ids=["distributed", "local"]
 )
-def test_a_parquet_file_on_a_disk_that_gets_full_has_the_rows_that_are_told(
+def test_parquet_file_on_disk_that_gets_full_has_rows_that_are_told(
     place: Place, options: tuple[str, ...], zenoh: dict[str, bool]
 ) -> None:
     """The limit for the size of a file is the disk that a test can fill. The stream reaches it before the file."""
@@ -116,7 +116,7 @@ def test_a_parquet_file_on_a_disk_that_gets_full_has_the_rows_that_are_told(
     assert_beginning(result, rows, place)
 
 
-def test_a_parquet_file_for_whose_end_there_is_no_room_is_recovered_later(place: Place) -> None:
+def test_parquet_file_for_whose_end_there_is_no_room_is_recovered_later(place: Place) -> None:
     """A draft that cannot be written, as a folder is in its place; the stream stays, and the error says where it is."""
     config = write_config(place.folder, record={"file": "pair.parquet"})
     result, in_the_way = place.folder / "pair.parquet", place.folder / "pair.unfinished.parquet"

@@ -29,7 +29,7 @@ def test_a_folder_is_no_result_file(place: Place, options: tuple[str, ...]) -> N
 
 
 @MODES
-def test_a_result_file_that_cannot_be_made_ends_the_run_before_its_first_point(
+def test_result_file_that_cannot_be_made_ends_run_before_its_first_point(
     place: Place, options: tuple[str, ...]
 ) -> None:
     in_a_file = place.folder / "file"
@@ -74,7 +74,7 @@ def test_a_second_run_does_not_write_into_the_file_of_the_first(place: Place, op
 @pytest.mark.parametrize(
     ("options", "zenoh"), [((), {"shared_memory": False}), (("--local",), {})], ids=["distributed", "local"]
 )
-def test_a_disk_that_gets_full_in_mid_run_leaves_whole_rows_as_many_as_are_told(
+def test_a_disk_that_gets_full_leaves_as_many_complete_rows_as_reported(
     place: Place, options: tuple[str, ...], zenoh: dict[str, bool]
 ) -> None:
     """The limit for the size of a file is the disk that a test can fill."""

@@ -27,7 +27,7 @@ for visit in range({_VISITS}):
 """
 
 
-def test_who_enters_while_the_last_one_leaves_has_a_folder_and_nothing_is_left(
+def test_who_enters_while_last_one_leaves_has_folder_and_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(tmp_path))

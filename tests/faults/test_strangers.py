@@ -113,7 +113,7 @@ def assert_unharmed(place: Place, config: Path, launched: Launched) -> None:
 
 
 @WAYS
-def test_the_messages_that_once_ended_a_run_are_refused_and_it_goes_on(place: Place, *, shared_memory: bool) -> None:
+def test_the_messages_that_once_ended_run_are_refused_and_it_goes_on(place: Place, *, shared_memory: bool) -> None:
     config = config_of(place, shared_memory=shared_memory)
     with paused(place, config) as (launched, stranger):
         public, keys = stranger.public, stranger.keys
@@ -314,9 +314,7 @@ threading.Event().wait()
 
 
 @WAYS
-def test_ten_thousand_open_queries_of_a_client_that_does_not_read_end_no_run(
-    place: Place, *, shared_memory: bool
-) -> None:
+def test_ten_thousand_open_queries_of_a_client_end_no_run(place: Place, *, shared_memory: bool) -> None:
     config = config_of(place, shared_memory=shared_memory, stop_time=8.0, real_time_factor=1.0)
     launched = place.start("launch", config, "--no-progress")
     wait_until(lambda: row_count(config.with_suffix(".csv")), "the first row")
@@ -423,7 +421,7 @@ def too_many_rows(stranger: Stranger) -> None:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_registered_peer_that_breaks_the_protocol_ends_the_run_with_both_names(
+def test_a_registered_peer_that_breaks_the_protocol_ends_run_with_both_names(
     place: Place, forge: Callable[[Stranger], None], names: tuple[str, ...]
 ) -> None:
     """A forgery that is sent exactly as a peer sends its messages cannot be told from a peer; it must do no harm."""
@@ -500,7 +498,7 @@ def memory_stamps(intruder: Intruder) -> None:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_number_that_is_forged_in_the_shared_memory_makes_no_wrong_row(
+def test_a_number_that_is_forged_in_shared_memory_makes_no_wrong_row(
     place: Place, forge: Callable[[Intruder], None], names: tuple[str, ...]
 ) -> None:
     """The run ends with names, or goes on where the owner of the number writes its own before anybody looks."""
@@ -527,7 +525,7 @@ def test_nobody_can_take_the_shared_memory_away(place: Place) -> None:
 
 
 @needs_memory
-def test_whoever_rings_bells_and_writes_needs_delays_a_run_and_changes_no_number(place: Place) -> None:
+def test_whoever_rings_bells_and_writes_needs_delays_run_and_changes_no_number(place: Place) -> None:
     config = config_of(place, shared_memory=True)
     with paused(place, config) as (launched, _):
         intruder = Intruder(launched, config)
@@ -540,7 +538,7 @@ def test_whoever_rings_bells_and_writes_needs_delays_a_run_and_changes_no_number
     assert_unharmed(place, config, launched)
 
 
-def test_a_value_that_is_forged_as_a_peer_sends_it_is_found_when_that_peer_sends_its_own(place: Place) -> None:
+def test_a_forged_value_is_found_when_the_real_peer_sends_its_value(place: Place) -> None:
     config = config_of(place, shared_memory=False)
     with paused(place, config) as (launched, stranger):
         for index in range(5):

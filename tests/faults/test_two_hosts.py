@@ -84,7 +84,7 @@ def test_nodes_of_another_host_connect_to_a_master_that_listens(tmp_path: Path) 
         assert (first.folder / RESULT).read_bytes() == expected
 
 
-def test_two_processes_of_two_hosts_are_two_though_name_and_number_are_equal(place: Place) -> None:
+def test_two_processes_of_two_hosts_with_equal_names_and_numbers_are_two(place: Place) -> None:
     router = place.start("router", "--listen", "tcp/127.0.0.1:0")
     wait_until(lambda: "router at " in router.output, "a router")
     config = write_config(place.folder, zenoh={"connect": [router.output.split("router at ")[1].split()[0]]})

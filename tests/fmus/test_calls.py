@@ -92,7 +92,7 @@ def test_a_call_that_the_fmi_forbids_is_an_error_that_says_why(
         assert (message.instance_name, message.status, message.category) == ("unit", ERROR, "logStatusError")
 
 
-def test_a_step_past_the_stop_time_is_an_error_and_one_onto_it_is_not(folder: Find) -> None:
+def test_step_past_stop_time_is_error_and_one_onto_it_is_not(folder: Find) -> None:
     with Unit(folder("Gain")) as unit:
         unit.setup(stop_time=0.3).fmi.exitInitializationMode()
         for k in range(3):

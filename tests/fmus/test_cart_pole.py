@@ -175,7 +175,7 @@ def test_a_stored_state_goes_on_in_another_instance(folder: Find) -> None:
         ("g", 1e9, "move faster than 10000 1/s"),
     ],
 )
-def test_a_parameter_that_makes_no_sense_is_refused_at_the_start_and_in_a_step(
+def test_parameter_that_makes_no_sense_is_refused_at_start_and_in_step(
     name: str, value: float, expected: str, folder: Find
 ) -> None:
     with Unit(folder("CartPole")) as unit, pytest.raises(FMICallException, match="fmi2ExitInitializationMode"):

@@ -177,7 +177,7 @@ def test_without_a_delay_y_is_x_after_the_step(folder: Find) -> None:
     assert [y for _, y in rows] == [math.cos(t) for t, _ in rows]
 
 
-def test_before_the_delay_has_passed_y_is_x_of_the_end_of_initialization_mode(folder: Find) -> None:
+def test_before_delay_has_passed_y_is_x_of_end_of_initialization_mode(folder: Find) -> None:
     with Unit(folder("TransportDelay")) as unit:
         unit.setup(start_time=10.0)
         unit.set("d", 0.5)
@@ -228,7 +228,7 @@ def test_steps_too_short_to_be_told_apart_do_no_harm(folder: Find) -> None:
 # ---- Gain, Adder, Integrator ----
 
 
-def test_a_gain_can_be_tuned_between_steps_and_acts_at_the_next_one(folder: Find) -> None:
+def test_a_gain_can_be_tuned_between_steps_and_acts_at_next_one(folder: Find) -> None:
     with Unit(folder("Gain")) as unit:
         unit.start({"k": 2.0, "u": 3.0})
         at_start = unit.real("y")
@@ -304,7 +304,7 @@ def test_faulty_is_a_plain_unit_by_default(folder: Find) -> None:
     assert [row["y"] for row in rows] == [1.0, 2.0]
 
 
-def test_faulty_fails_with_a_message_in_the_step_that_ends_after_fail_at(folder: Find) -> None:
+def test_faulty_fails_with_a_message_in_step_that_ends_after_fail_at(folder: Find) -> None:
     with Unit(folder("Faulty")) as unit:
         unit.start({"fail_at": 0.5})
         unit.step(0.0, 0.5)

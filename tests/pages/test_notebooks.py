@@ -54,7 +54,7 @@ def test_a_notebook_is_kept_without_its_outputs(notebook: Path) -> None:
     nbformat.validate(nbformat.from_dict(content))  # type: ignore[no-untyped-call]  # it has no types
 
 
-def test_the_first_mesh_shows_tables_a_graph_two_pictures_and_a_live_cell(clone: Path) -> None:
+def test_the_first_mesh_shows_tables_a_graph_two_pictures_and_live_cell(clone: Path) -> None:
     found = run(clone, "first_mesh.ipynb")
 
     assert_is_short(found)

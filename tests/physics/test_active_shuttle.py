@@ -40,7 +40,7 @@ def run(unit: Unit, duration: float, step_size: float = 0.01) -> None:
         ("angularVelocityCommand", "angularVelocity", YAW_INERTIA / (TRACK / 2) ** 2),
     ],
 )
-def test_without_friction_a_velocity_is_approached_as_by_a_motor_with_a_mass(
+def test_without_friction_a_velocity_is_approached_as_by_a_motor_with_mass(
     command: str, velocity: str, inertia: float, folder: Find
 ) -> None:
     gain = 2 * CONSTANT * (PROPORTIONAL + CONSTANT) / RESISTANCE / DRIVE_RADIUS**2  # N.s/m, of both drives
@@ -91,7 +91,7 @@ def test_the_way_of_a_steady_curve_is_an_arc(folder: Find) -> None:
     assert heading == pytest.approx(1.6, rel=ACCURACY)
 
 
-def test_at_rest_the_casters_hold_against_the_drives_with_four_times_torque_times_lever_over_trail(
+def test_at_rest_the_casters_hold_against_the_torque_of_the_drives(
     folder: Find,
 ) -> None:
     """Straight casters, held drives and a slow turn: what the drives give is what the patches take."""

@@ -14,7 +14,7 @@ from tests.fmus.harness import VARYING_STEPS, Unit
 Find = Callable[[str], Path]
 
 
-def test_the_torque_is_what_an_engine_s_own_damping_would_be_in_every_float(folder: Find) -> None:
+def test_torque_is_what_engine_s_own_damping_would_be_in_every_float(folder: Find) -> None:
     with Unit(folder("Damper")) as unit:
         rows = unit.start({"d": 0.3}).run(VARYING_STEPS)
 

@@ -90,7 +90,7 @@ def test_a_time_event_happens_exactly_where_the_fmu_says(version: Version, event
 
 @pytest.mark.parametrize("version", [1, 2, 3])
 @pytest.mark.parametrize("solver", ["cvode", "euler"])
-def test_an_input_that_jumps_over_a_level_is_an_event_and_is_integrated_as_it_is(
+def test_an_input_that_jumps_over_a_level_is_integrated_as_an_event(
     version: Version, solver: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     """The steps of a stair are held inputs: the integral is a sum, which even Euler gets right."""

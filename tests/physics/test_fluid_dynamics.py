@@ -58,7 +58,7 @@ def expected(velocity: Array) -> tuple[Array, Array]:
 
 
 @given(velocity=st.tuples(component, component, component))
-def test_force_and_moment_are_those_of_a_plate_at_its_angle_of_attack(
+def test_force_and_moment_are_those_of_plate_at_its_angle_of_attack(
     plate: Callable[[Array], tuple[Array, Array]], velocity: tuple[float, float, float]
 ) -> None:
     vector = np.array(velocity)

@@ -69,7 +69,7 @@ def test_the_actuator_example_is_that_of_mujoco_within_a_milliradian(tmp_path: P
     assert peaks == pytest.approx([1.171, 1.229, 1.113], rel=1e-2)
 
 
-def test_a_pendulum_that_the_engine_damps_is_that_with_the_damper_fmu_in_every_float(tmp_path: Path) -> None:
+def test_pendulum_that_engine_damps_is_that_with_damper_fmu_in_every_float(tmp_path: Path) -> None:
     result = columns(with_gazebo("damped_pendulum", tmp_path), tmp_path / "gazebo.csv")
 
     engine, fmu = result["world.engine.position"], result["world.fmu.position"]
@@ -89,9 +89,7 @@ def test_a_pendulum_that_the_engine_damps_is_that_with_the_damper_fmu_in_every_f
         ("dart", pytest.approx(1.39e-3, abs=0.1e-3)),
     ],
 )
-def test_the_pendulums_of_each_engine_are_as_far_apart_as_the_pages_say(
-    engine: str, apart: float, tmp_path: Path
-) -> None:
+def test_the_pendulums_of_each_engine_are_as_far_apart_as_pages_say(engine: str, apart: float, tmp_path: Path) -> None:
     config = with_gazebo("damped_pendulum", tmp_path)
     world = (CONFIGS / "worlds" / "damped_pendulum.sdf").read_text(encoding="utf-8")
     assert '<physics type="ode">' in world
@@ -106,7 +104,7 @@ def test_the_pendulums_of_each_engine_are_as_far_apart_as_the_pages_say(
     assert difference == apart
 
 
-def test_a_cube_is_braked_by_the_drag_and_a_free_one_is_not(tmp_path: Path) -> None:
+def test_a_cube_is_braked_by_drag_and_a_free_one_is_not(tmp_path: Path) -> None:
     result = columns(with_gazebo("fluid_body", tmp_path), tmp_path / "gazebo.csv")
 
     assert 0.096 < result["world.cube.position_x"][-1] < 0.1

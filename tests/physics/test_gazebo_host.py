@@ -191,7 +191,7 @@ def test_the_sun_and_the_ground_need_no_file(uri: str, tmp_path: Path) -> None:
     assert [link.name for link in world.links] == ["rod"]
 
 
-def test_a_file_in_which_nothing_is_changed_goes_to_gazebo_as_it_is(tmp_path: Path) -> None:
+def test_file_in_which_nothing_is_changed_goes_to_gazebo_as_it_is(tmp_path: Path) -> None:
     path = write_world(tmp_path, arm())
 
     world = load_gazebo_world(path, GazeboClassicConfig(gazebo_classic=""))
@@ -231,7 +231,7 @@ def test_models_in_models_have_their_joints_and_links(tmp_path: Path) -> None:
     }
 
 
-def test_what_has_no_variables_or_is_not_there_is_a_warning_of_check_with_its_name(
+def test_check_warns_of_a_missing_or_empty_model_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fault: Callable[[str], None]
 ) -> None:
     fault("nothing")
@@ -398,7 +398,7 @@ def test_a_position_cannot_be_set_and_the_message_says_why(tmp_path: Path) -> No
         ("refuse", "the world has no joint arm::elbow"),
     ],
 )
-def test_a_world_that_does_not_load_is_an_error_with_gazebo_s_words(
+def test_a_world_that_does_not_load_is_error_with_gazebo_s_words(
     kind: str, expected: str, fault: Callable[[str], None], tmp_path: Path
 ) -> None:
     fault(kind)

@@ -14,7 +14,7 @@ from tests.fmus.harness import Unit
 Find = Callable[[str], Path]
 
 
-def test_the_force_is_against_the_velocity_along_each_axis_and_there_is_no_moment(folder: Find) -> None:
+def test_force_is_against_velocity_along_each_axis_and_there_is_no_moment(folder: Find) -> None:
     velocity = {"x": 0.3, "y": -1.7, "z": 1e-9}
 
     with Unit(folder("LinearFluidDrag")) as unit:
@@ -31,7 +31,7 @@ def test_the_force_is_against_the_velocity_along_each_axis_and_there_is_no_momen
     assert moment == [0.0, 0.0, 0.0]
 
 
-def test_a_body_of_one_kilogram_is_braked_as_exp_of_minus_gain_t(folder: Find) -> None:
+def test_body_of_one_kilogram_is_braked_as_exp_of_minus_gain_t(folder: Find) -> None:
     step_size, velocity, position = 1e-3, 1.0, 0.0
 
     with Unit(folder("LinearFluidDrag")) as unit:

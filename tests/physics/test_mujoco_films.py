@@ -115,9 +115,7 @@ def test_a_film_shows_the_world_from_the_first_point_to_the_last(
 @pytest.mark.usefixtures("renderer")
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 @pytest.mark.parametrize("older", [b"an older film", None], ids=["older film", "no film"])
-def test_a_film_has_its_name_at_its_end_and_only_if_the_world_has_moved(
-    tmp_path: Path, suffix: str, older: bytes | None
-) -> None:
+def test_a_film_gets_its_name_at_its_end_if_the_world_moved(tmp_path: Path, suffix: str, older: bytes | None) -> None:
     film = tmp_path / f"film{suffix}"
     if older is not None:
         film.write_bytes(older)

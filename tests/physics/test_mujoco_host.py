@@ -121,7 +121,7 @@ def test_it_starts_at_the_keyframe_with_start_values_on_top(tmp_path: Path) -> N
 # --- the effort that it owns
 
 
-def test_the_effort_of_a_step_is_what_the_mesh_gave_for_it_and_nothing_is_left_over(tmp_path: Path) -> None:
+def test_the_effort_of_a_step_is_exactly_what_the_mesh_gave(tmp_path: Path) -> None:
     names = ["slide.velocity", "slide.effort_applied", "slide.acceleration"]
     world = Driven(write_world(tmp_path, slider()), ["slide.effort"], names)
 
@@ -208,7 +208,7 @@ def test_a_force_acts_along_the_axes_of_the_body(tmp_path: Path) -> None:
     assert velocity == pytest.approx([0.0, 0.002, 0.0], abs=1e-15)
 
 
-def test_a_force_acts_at_the_origin_and_turns_a_body_whose_centre_is_elsewhere(tmp_path: Path) -> None:
+def test_a_force_acts_at_origin_and_turns_body_whose_centre_is_elsewhere(tmp_path: Path) -> None:
     inertial = "pos='0 1 0' mass='2' diaginertia='1 1 1'"
     names = ["cube.angular_velocity_z", "cube.linear_velocity_x"]
     world = Driven(write_world(tmp_path, body(inertial=inertial)), ["cube.force_x", "cube.moment_z"], names)
@@ -274,7 +274,7 @@ def test_a_wind_that_is_connected_is_felt_at_the_first_point(tmp_path: Path) -> 
 # --- time and steps
 
 
-def test_the_engine_takes_as_few_steps_as_none_is_longer_than_the_models(tmp_path: Path) -> None:
+def test_the_engine_takes_as_few_steps_as_none_is_longer_than_models(tmp_path: Path) -> None:
     path = write_world(tmp_path, slider(), rest="<sensor><clock name='clock'/></sensor>")
     found = {}
     for step_size in (0.0005, 0.001, 0.0025, 0.01):
@@ -300,7 +300,7 @@ def test_physics_steps_are_free(tmp_path: Path) -> None:
 # --- sensors
 
 
-def test_sensors_of_positions_are_those_of_the_point_and_of_accelerations_of_the_last_step(tmp_path: Path) -> None:
+def test_position_sensors_show_the_point_and_acceleration_sensors_the_last_step(tmp_path: Path) -> None:
     sledge = slider().replace("<inertial", "<site name='s'/><inertial")
     sensors = "<sensor><jointpos name='where' joint='slide'/><accelerometer name='feel' site='s'/></sensor>"
     names = ["slide.position", "where.value", "feel.value[1]"]
@@ -386,7 +386,7 @@ def test_an_input_that_is_no_number_ends_the_run_with_its_name(tmp_path: Path, n
     assert (error.value.instance, error.value.variable) == ("world", name)
 
 
-def test_a_world_that_flies_apart_ends_the_run_and_does_not_start_again(tmp_path: Path) -> None:
+def test_a_world_that_flies_apart_ends_run_and_does_not_start_again(tmp_path: Path) -> None:
     world = Driven(write_world(tmp_path, slider("axis='1 0 0' damping='1e9'")), ["slide.effort"], ["slide.position"])
 
     with pytest.raises(StepFailed, match="MuJoCo says") as error:

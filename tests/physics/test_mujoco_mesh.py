@@ -43,7 +43,7 @@ record: {{file: arm.csv, variables: [world.weak.position, controller.effort]}}
     return path
 
 
-def test_target_and_gains_are_set_and_the_world_is_looked_at_while_it_runs(place: Place) -> None:
+def test_target_and_gains_are_set_while_the_world_is_watched(place: Place) -> None:
     config = endless(place.folder)
     launched = place.start("launch", config)
     result = config.with_suffix(".csv")
@@ -93,7 +93,7 @@ def test_a_killed_engine_actuator_or_controller_ends_the_run_with_its_name(place
 
 
 @pytest.mark.parametrize("how", [("--local",), ()], ids=["local", "distributed"])
-def test_a_world_that_cannot_be_computed_ends_the_run_with_what_came_before(place: Place, how: tuple[str, ...]) -> None:
+def test_a_world_that_cannot_be_computed_ends_run_with_what_came_before(place: Place, how: tuple[str, ...]) -> None:
     world = (WORLDS / "damped_pendulum.xml").read_text(encoding="utf-8").replace('damping="0.1"', 'damping="1e6"')
     (place.folder / "world.xml").write_text(world, encoding="utf-8")
     config = place.folder / "flies.yaml"

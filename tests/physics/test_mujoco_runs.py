@@ -95,9 +95,7 @@ def pair(columns: Columns) -> tuple[Floats, Floats]:
     return columns["world.engine.position"], columns["world.fmu.position"]
 
 
-def test_damping_by_an_fmu_in_its_own_process_equals_damping_by_the_engine_in_every_float(
-    place: Place, run: Run
-) -> None:
+def test_damping_by_an_fmu_equals_damping_by_the_engine_in_every_float(place: Place, run: Run) -> None:
     output = place.folder / "result.csv"
 
     launched = place.run(
@@ -144,7 +142,7 @@ def test_the_pendulum_swings_as_its_equation_says(run: Run) -> None:
     assert angles == pytest.approx(reference, abs=1e-3)
 
 
-def test_the_error_grows_with_order_one_and_jacobis_is_well_above_that_of_gauss_seidel(run: Run) -> None:
+def test_the_error_has_order_one_and_is_larger_with_jacobi(run: Run) -> None:
     steps = (1, 2, 10, 20)
     reference = pendulum_angle(np.linspace(0.0, 10.0, 10001))
     errors: dict[str, list[float]] = {"gauss_seidel": [], "jacobi": []}

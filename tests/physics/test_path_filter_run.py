@@ -52,13 +52,13 @@ def peak_of_the_turn(columns: dict[str, Array], vehicle: str) -> float:
     return float(np.abs(currents).max())
 
 
-def test_the_peak_without_the_filter_is_the_18_ampere_that_it_is_fitted_to(
+def test_the_peak_without_filter_is_18_ampere_that_it_is_fitted_to(
     columns: Callable[[float], dict[str, Array]],
 ) -> None:
     assert peak_of_the_turn(columns(4.0), "bare") == pytest.approx(18.0, abs=0.05)
 
 
-def test_at_the_documented_slope_speed_the_peak_is_a_quarter_to_two_fifths_less(
+def test_at_documented_slope_speed_peak_is_a_quarter_to_two_fifths_less(
     columns: Callable[[float], dict[str, Array]],
 ) -> None:
     bare, filtered = (peak_of_the_turn(columns(4.0), vehicle) for vehicle in ("bare", "filtered"))

@@ -96,7 +96,7 @@ def test_before_the_delay_has_passed_the_delayed_angle_is_the_initial_one(run: R
 
 
 @both
-def test_a_delay_of_a_whole_number_of_steps_and_a_half_is_interpolated(run: Run, name: str) -> None:
+def test_a_delay_of_a_whole_number_of_steps_and_half_is_interpolated(run: Run, name: str) -> None:
     step_size = float(run(name)["time"][1])
     steps = round(DELAYS[name] / step_size)
     result = run(name, f"delay.d={DELAYS[name] + step_size / 2!r}")
@@ -109,7 +109,7 @@ def test_a_delay_of_a_whole_number_of_steps_and_a_half_is_interpolated(run: Run,
     assert np.abs(delayed[steps + 1 :] - middle[:-steps]).max() <= tolerance
 
 
-def test_the_interpolated_angle_is_the_true_one_within_the_error_of_a_chord(run: Run) -> None:
+def test_the_interpolated_angle_is_the_true_one_within_error_of_a_chord(run: Run) -> None:
     result = run(MAIN, "delay.d=2.331")
     time, delayed = result["time"], result["delay.y"]
     step_size = time[1]
@@ -145,7 +145,7 @@ def energy_per_mass(result: Result, pendulum: Pendulum) -> Array:
 
 
 @both
-def test_the_energy_of_a_damped_pendulum_falls_from_each_point_to_the_next(run: Run, name: str) -> None:
+def test_the_energy_of_a_damped_pendulum_falls_from_each_point_to_next(run: Run, name: str) -> None:
     energy = energy_per_mass(run(name), PENDULUMS[name])
 
     # No tolerance: even at a turning point a step loses d l^2 a''^2 h^3 / 12, which is above 1e-10 J/kg here; rounding

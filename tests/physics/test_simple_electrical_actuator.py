@@ -70,7 +70,7 @@ def test_the_voltage_is_limited(asked: float, given: float, folder: Find) -> Non
         assert unit.real("motorCurrent") == given / 1.0
 
 
-def test_the_damper_is_in_series_so_a_stalled_motor_brakes_the_joint_and_nothing_else_does(folder: Find) -> None:
+def test_the_damper_is_in_series_so_a_stalled_motor_brakes_the_joint(folder: Find) -> None:
     with Unit(folder("SimpleElectricalActuator")) as unit:
         unit.start({"jointVelocity": 1.0})
         at_start = unit.real("jointTorque")
@@ -115,7 +115,7 @@ def seconds(step_size: float) -> Array:
     ("proportional", "derivative", "constant", "peak"),
     [(10.0, 3.0, 0.1, 1.229), (10.0, 3.0, 1e-3, 1.861)],
 )
-def test_in_a_position_loop_the_angle_is_that_of_the_continuous_loop_to_first_order_in_the_step_size(
+def test_the_angle_of_a_position_loop_is_of_first_order(
     proportional: float, derivative: float, constant: float, peak: float, folder: Find
 ) -> None:
     errors = []

@@ -150,7 +150,7 @@ def test_the_packages_run_as_they_are(name: str, tmp_path: Path) -> None:
 
 @settings(max_examples=50, suppress_health_check=[HealthCheck.too_slow])
 @given(changed_files())
-def test_a_changed_package_has_findings_with_file_and_line_or_is_exported_alike(files: Files) -> None:
+def test_changed_package_has_findings_with_file_and_line_or_is_exported_alike(files: Files) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = write_package(Path(folder, "changed.ssp"), files)
         check = checked(path)

@@ -215,7 +215,7 @@ def test_a_grant_wakes_an_engine() -> None:
 
 
 @pytest.mark.parametrize("make", MAKERS)
-def test_an_fmu_that_ends_the_simulation_steps_no_more_and_the_others_do(make: MakeEngine) -> None:
+def test_an_fmu_that_ends_the_simulation_steps_no_more_and_others_do(make: MakeEngine) -> None:
     def end() -> None:
         raise TerminationRequested("enough", instance="i0")
 
@@ -266,7 +266,7 @@ def run_for_ever(engine: Engine) -> None:
 
 @needs_library
 @pytest.mark.parametrize("stamp", [0, 3, 2**62, -1])
-def test_a_row_that_is_not_the_one_that_was_written_ends_the_run_with_names(stamp: int) -> None:
+def test_row_that_is_not_one_that_was_written_ends_run_with_names(stamp: int) -> None:
     mesh, _, second = stepped_first(chain(2, 12, 64))
     mesh.rings["i0"][0].stamps[9] = stamp
 
@@ -301,7 +301,7 @@ def test_a_grant_beyond_the_last_point_grants_the_last_point() -> None:
 
 
 @needs_library
-def test_forged_progress_of_a_target_overwrites_rows_that_it_needs_and_it_says_so() -> None:
+def test_forged_progress_of_a_target_overwrites_rows_and_is_reported() -> None:
     """The window is what protects rows in use; who breaks it cannot make a wrong value of it."""
     mesh, _ = meshed(chain(2, 500, 4), burst_engine)
     mesh.memory.grant.raise_to(500)
@@ -315,7 +315,7 @@ def test_forged_progress_of_a_target_overwrites_rows_that_it_needs_and_it_says_s
 
 
 @needs_library
-def test_a_step_whose_row_is_forged_is_not_taken_and_can_be_taken_later() -> None:
+def test_a_step_with_a_forged_row_can_be_taken_later() -> None:
     mesh, _, second = stepped_first(chain(2, 12, 64))
     ring = mesh.rings["i0"][0]
     stamps = ring.stamps.copy()

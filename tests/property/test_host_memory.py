@@ -118,7 +118,7 @@ def test_nobody_can_change_its_size(memory: HostMemory, size: int) -> None:
         os.close(descriptor)
 
 
-def test_closed_memory_cannot_be_opened_any_more_and_who_has_it_goes_on() -> None:
+def test_closed_memory_cannot_be_opened_and_who_has_it_goes_on() -> None:
     memory = HostMemory.create(MAP, MASTER)
     offer, other = memory.offer, opened(memory, "a")
     memory.close()
@@ -306,7 +306,7 @@ def ball_from(memory: HostMemory, first: int) -> None:
     assert time.monotonic() - started < LONG_S
 
 
-def test_a_process_that_was_killed_leaves_what_it_has_written_and_nobody_waits_for_ever(memory: HostMemory) -> None:
+def test_process_killed_leaves_what_it_has_written_and_nobody_waits_for_ever(memory: HostMemory) -> None:
     own = memory.participant("a")
     with player(memory, 10**9) as process:
         own.progress["a"].raise_to(1)

@@ -165,7 +165,7 @@ def test_any_section_is_accepted_or_told_with_its_path(section: object, name: st
 @given(
     st.dictionaries(WORDS, STRUCTURES, max_size=3), st.sampled_from(["simulation", "instances", "connections", "mesh"])
 )
-def test_what_is_wrong_in_the_structure_is_never_lost_on_the_way_to_a_system(section: object, name: str) -> None:
+def test_what_is_wrong_in_structure_is_never_lost_on_way_to_system(section: object, name: str) -> None:
     text = as_json(SECTIONS | {name: section})
     found = findings_of(text)
     assume(found)

@@ -70,5 +70,5 @@ def test_no_node_is_beyond_the_point_of_a_pause(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("part", ["the fence of claim", "the fence of grant_withdraw", "the limit of what is claimed"])
-def test_without_one_of_its_parts_a_node_passes_the_point_of_a_pause(part: str) -> None:
+def test_without_one_of_its_parts_a_node_passes_point_of_a_pause(part: str) -> None:
     assert explore(Machine.WEAK, part).lost

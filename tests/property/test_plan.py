@@ -150,7 +150,7 @@ def test_the_cycle_that_an_error_shows_is_one(names: list[int], given_edges: lis
 
 
 @given(systems())
-def test_delays_are_those_of_the_algorithm_and_leave_no_loop_within_a_point(drawn: Drawn) -> None:
+def test_delays_are_those_of_algorithm_and_leave_no_loop_within_a_point(drawn: Drawn) -> None:
     plan = planned(drawn)
 
     for pipe, connection in zip(drawn.pipes, plan.connections, strict=True):
@@ -194,7 +194,7 @@ def test_every_value_that_another_node_needs_has_one_link(drawn: Drawn) -> None:
 
 
 @given(systems())
-def test_a_plan_is_a_function_of_the_system_and_survives_the_way_to_another_process(drawn: Drawn) -> None:
+def test_a_plan_is_function_of_system_and_survives_way_to_another_process(drawn: Drawn) -> None:
     plan, again = planned(drawn), planned(drawn)
 
     assert (plan.digest, plan.nodes) == (again.digest, again.nodes)
@@ -232,7 +232,7 @@ def test_initial_values_are_known_before_they_are_needed(drawn: Drawn) -> None:
 
 
 @given(systems())
-def test_every_output_of_a_loop_is_reached_from_every_other_and_no_other_has_its_levels(drawn: Drawn) -> None:
+def test_every_output_of_a_loop_is_reached_from_every_other_alone(drawn: Drawn) -> None:
     plan = planned(drawn)
     levels = plan.initialization.levels
 

@@ -418,7 +418,7 @@ def test_any_system_gives_the_reference_result_on_nodes(drawn: Drawn) -> None:
 
 @given(looped())
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_any_system_with_a_loop_at_the_start_gives_the_reference_result_on_nodes(drawn: Drawn) -> None:
+def test_any_system_with_a_loop_at_start_gives_reference_result_on_nodes(drawn: Drawn) -> None:
     assert_reference_on_nodes(drawn)
 
 

@@ -194,9 +194,7 @@ def test_every_way_of_running_gives_the_floats_of_a_loop_over_fmpy(drawn: Drawn)
 
 @given(drawn_scenarios(), st.integers(1, 4))
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_a_system_that_is_stepped_by_a_program_follows_a_scenario_also_after_it_went_back(
-    drawn: Drawn, before: int
-) -> None:
+def test_system_stepped_by_program_follows_scenario_also_after_it_went_back(drawn: Drawn, before: int) -> None:
     mesh = mesh_of(drawn)
     wanted = mesh.run(record="memory", processes=False)
 

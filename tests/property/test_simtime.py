@@ -34,7 +34,7 @@ def assert_no_step_ends_after_the_told_stop_time(grid: TimeGrid, points: int) ->
 
 
 @pytest.mark.parametrize("stop", ROUND_STOPS)
-def test_no_step_of_a_round_size_ends_after_what_is_told_for_a_round_stop_time(stop: int) -> None:
+def test_no_step_of_a_round_size_ends_after_a_round_stop_time(stop: int) -> None:
     for text in ROUND_STEPS:
         count = int(Decimal(stop) / Decimal(text))
         assert steps_between(0.0, float(stop), float(text)) == count
@@ -63,7 +63,7 @@ def test_a_step_that_ends_in_time_keeps_its_size(time: float, size: float) -> No
 
 
 @pytest.mark.parametrize("end", [0.11, 0.25, 0.7, 1.3])
-def test_the_rest_of_a_step_ends_by_its_end_and_is_the_rest_but_for_rounding(end: float) -> None:
+def test_the_rest_of_a_step_is_the_rest_but_for_rounding(end: float) -> None:
     """From any hundredth before it: 0.04 + (0.11 - 0.04) is greater than 0.11, as many of these sums are."""
     for time in (hundredths / 100 for hundredths in range(-100, round(end * 100))):
         rest = step_within(time, end - time, end)
@@ -79,7 +79,7 @@ def test_round_times_are_as_many_steps_apart_as_on_paper(start: Decimal, step: D
 
 
 @given(round_numbers, round_steps, st.integers(0, 10_000), st.floats(0.01, 0.99))
-def test_a_duration_that_ends_within_a_step_is_no_whole_number_of_them(
+def test_a_duration_that_ends_within_step_is_no_whole_number_of_them(
     start: Decimal, step: Decimal, count: int, part: float
 ) -> None:
     stop = float(start) + (count + part) * float(step)

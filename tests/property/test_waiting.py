@@ -373,7 +373,7 @@ def test_a_burst_may_miss_a_sleeper_until_it_looks_again() -> None:
 
 
 @pytest.mark.parametrize(("name", "most"), [("a writer is killed", 2), ("a sleeper is killed", 0)])
-def test_after_a_kill_no_more_sleeps_end_by_their_limit_than_there_are_sleepers(name: str, most: int) -> None:
+def test_after_a_kill_at_most_each_sleeper_ends_by_its_limit(name: str, most: int) -> None:
     found = explored(name, Machine.WEAK)
 
     assert found.ended_by_limit == most

@@ -66,7 +66,7 @@ def run(program: Path, job: Job, points: int, mode: str, seconds: int = SECONDS)
 
 @pytest.mark.parametrize("mode", ["quiet", "disturbed"])
 @pytest.mark.parametrize("job", JOBS, ids=str)
-def test_every_float_is_that_of_a_plain_loop_and_no_wake_up_is_lost(build: Build, job: Job, mode: str) -> None:
+def test_every_float_equals_a_plain_loop_and_no_wake_up_is_lost(build: Build, job: Job, mode: str) -> None:
     done = run(build("", BURST), job, 500, mode)
 
     assert done.returncode == 0, done.stdout + done.stderr
@@ -85,7 +85,7 @@ def test_a_sanitizer_finds_nothing(build: Build, job: Job, sanitizer: str) -> No
 
 
 @pytest.mark.parametrize("job", [("chain", 3, 4), ("cycle", 3, 4)], ids=str)
-def test_processes_that_are_stopped_or_killed_at_any_moment_go_on_where_their_rings_end(build: Build, job: Job) -> None:
+def test_processes_stopped_or_killed_at_any_moment_resume_at_their_rings_end(build: Build, job: Job) -> None:
     done = run(build("", BURST), job, 20_000, "killed")
 
     assert done.returncode == 0, done.stdout + done.stderr

@@ -70,7 +70,7 @@ def run(*arguments: str | Path) -> None:
 # ---- recording ----
 
 
-def test_an_mcap_has_the_floats_of_the_csv_at_the_times_of_their_points(tmp_path: Path) -> None:
+def test_an_mcap_has_the_floats_of_csv_at_times_of_their_points(tmp_path: Path) -> None:
     config = write_config(tmp_path, stop_time=0.5, simulation={"step_size": 0.002})
     run("launch", config, "--local", "--no-progress")
     run("launch", config, "--local", "--no-progress", "--output", tmp_path / "pair.mcap")
@@ -97,7 +97,7 @@ def test_real_processes_record_the_messages_of_one_process(place: Place) -> None
     assert bytes_of(place.folder / "pair.mcap") == bytes_of(place.folder / "local.mcap")
 
 
-def test_a_topic_of_the_ros_section_is_recorded_as_it_is_with_stamps_of_simulation_time(tmp_path: Path) -> None:
+def test_a_topic_of_the_ros_section_is_recorded_with_simulation_time(tmp_path: Path) -> None:
     config = write_config(tmp_path, stop_time=0.1, ros=TWIST)
     run("launch", config, "--local", "--no-progress")
     run("launch", config, "--local", "--no-progress", "--output", tmp_path / "pair.mcap")
@@ -240,7 +240,7 @@ def at(ms: float, value: float, instance: str = "gain") -> BagSample:
     ],
     ids=["on points", "in any order", "a nanosecond off", "between points", "the last of one point", "after the end"],
 )
-def test_a_sample_holds_from_the_first_point_that_is_not_before_its_stamp(
+def test_a_sample_holds_from_first_point_that_is_not_before_its_stamp(
     samples: list[BagSample], points: dict[int, float]
 ) -> None:
     moments, merged, beyond = schedule(samples, GRID, {"gain": 1}, start=None)
@@ -249,7 +249,7 @@ def test_a_sample_holds_from_the_first_point_that_is_not_before_its_stamp(
     assert len(moments) + merged + beyond == len(samples)
 
 
-def test_stamps_of_another_clock_are_moved_so_that_the_first_one_is_at_the_start() -> None:
+def test_stamps_of_another_clock_are_moved_to_begin_at_the_start() -> None:
     samples = [BagSample(1_700_000_000_000_000_000 + k * 10 * MS, "gain", "u", float(k)) for k in range(5)]
 
     moments, _, _ = schedule(samples, GRID, {"gain": 1}, start=0.02)
@@ -257,7 +257,7 @@ def test_stamps_of_another_clock_are_moved_so_that_the_first_one_is_at_the_start
     assert [(moment.point, moment.values["gain", "u"]) for moment in moments] == [(2 + k, float(k)) for k in range(5)]
 
 
-def test_an_instance_with_larger_steps_is_given_a_value_at_its_own_points() -> None:
+def test_an_instance_with_larger_steps_is_given_value_at_its_own_points() -> None:
     moments, merged, _ = schedule([at(10, 1.0), at(20, 2.0), at(50, 3.0)], GRID, {"gain": 4}, start=None)
 
     assert ([(m.point, m.values["gain", "u"]) for m in moments], merged) == ([(4, 2.0), (8, 3.0)], 1)
@@ -405,7 +405,7 @@ def test_messages_are_read_by_the_definitions_in_the_bag_without_running_them(de
 
 @pytest.mark.parametrize("start", [None, 0.013])
 @pytest.mark.parametrize("step_size", [0.001, 0.003], ids=["each step", "larger steps"])
-def test_a_bag_in_a_scenario_gives_the_floats_of_playing_it_into_a_mesh_that_is_paused(
+def test_bag_in_scenario_gives_floats_of_playing_it_into_mesh_paused(
     start: float | None, step_size: float, tmp_path: Path
 ) -> None:
     """The messages of the bag come every 2 ms, with stamps of simulation time from 0 s on."""

@@ -94,7 +94,7 @@ def test_a_thousand_samples_each_way_arrive_with_their_values_and_stamps(place: 
     assert "WARNING" not in mesh.errors
 
 
-def test_a_loop_at_500_hz_gives_the_numbers_of_one_process_while_ros_watches(place: Place, port: int) -> None:
+def test_loop_at_500_hz_gives_numbers_of_one_process_while_ros_watches(place: Place, port: int) -> None:
     def configured(name: str, **sections: Any) -> Path:  # noqa: ANN401 sections of a configuration
         return write_config(
             place.folder,

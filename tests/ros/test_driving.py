@@ -34,7 +34,7 @@ def y(driver: FmuDriver, time: int, *, restart: bool = True) -> float:
     return value
 
 
-def test_the_first_turn_is_the_time_zero_of_the_fmu_and_takes_no_step(gain: FmuDriver) -> None:
+def test_the_first_turn_is_time_zero_of_fmu_and_takes_no_step(gain: FmuDriver) -> None:
     turn = gain.update(UNIX_NS, ["y"], restart=True)
 
     assert (turn.time, turn.steps, turn.values) == (UNIX_NS, 0, {"y": 0.0})
@@ -59,7 +59,7 @@ def test_a_run_by_turns_gives_the_floats_of_a_loop_of_steps() -> None:
     assert [turn.time for turn in turns] == [UNIX_NS + k * 2 * MS for k in range(1, 201)]
 
 
-def test_an_input_holds_from_its_stamp_on_and_the_last_of_two_with_one_stamp_counts(gain: FmuDriver) -> None:
+def test_an_input_holds_from_its_stamp_and_the_last_equal_counts(gain: FmuDriver) -> None:
     y(gain, UNIX_NS)
 
     gain.set_input("u", UNIX_NS + 100 * MS, 1.0)
@@ -80,7 +80,7 @@ def test_catching_up_is_bounded_and_told_and_skips_no_step() -> None:
     assert [round(turn.behind, 6) for turn in turns] == [0.6, 0.2, 0.0, 0.0]
 
 
-def test_simulated_time_that_jumps_back_starts_the_fmu_again_with_the_values_it_was_given(gain: FmuDriver) -> None:
+def test_simulated_time_that_jumps_back_starts_the_fmu_again_with_its_values(gain: FmuDriver) -> None:
     y(gain, 5_000 * MS)
     gain.set_value("k", 3.0)
     gain.set_input("u", 5_000 * MS, 2.0)

@@ -102,9 +102,7 @@ def commanded(session: zenoh.Session, command: str, points: int = 0) -> bool:
     return any(reply.ok is not None for reply in session.get("fmu_mesh/lab/mesh/command", payload=payload))
 
 
-def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tells_every_point(
-    place: Place, ros: Ros
-) -> None:
+def test_every_sample_arrives_and_the_clock_shows_every_point(place: Place, ros: Ros) -> None:
     config = configured(place, ros, factor=3)
 
     mesh = place.run("launch", config, "--no-progress")
@@ -120,7 +118,7 @@ def test_every_sample_from_the_first_point_to_the_last_arrives_and_the_clock_tel
     place.assert_nothing_left()
 
 
-def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(place: Place, ros: Ros) -> None:
+def test_a_gateway_that_had_no_processor_at_end_still_carries_every_sample(place: Place, ros: Ros) -> None:
     with resting(place, ros, configured(place, ros, factor=3)) as (mesh, gateway, session):
         nodes = [mesh.child("pendulum"), mesh.child("gain")]
         gateway.suspend()
@@ -147,7 +145,7 @@ def test_a_gateway_that_had_no_processor_at_the_end_still_carries_every_sample(p
     ],
     ids=["at the end", "for longer than Zenoh's lease"],
 )
-def test_a_gateway_that_never_comes_back_ends_with_the_mesh_and_is_told(
+def test_a_gateway_that_never_comes_back_ends_with_mesh_and_is_told(
     place: Place, ros: Ros, *, away: bool, says: str
 ) -> None:
     config = configured(place, ros, factor=3, timeouts={"stop": 1.0, "link": 4.0})
@@ -165,7 +163,7 @@ def test_a_gateway_that_never_comes_back_ends_with_the_mesh_and_is_told(
     place.assert_nothing_left()
 
 
-def test_the_clock_stands_while_the_mesh_is_paused_and_goes_on_by_the_points_of_a_step(place: Place, ros: Ros) -> None:
+def test_the_clock_stands_in_a_pause_and_goes_on_by_steps(place: Place, ros: Ros) -> None:
     mesh = place.start("launch", configured(place, ros, factor=1, stop_time=60.0, clock_rate=50), "--no-progress")
     wait_until(lambda: len(ros.ticks()) > 3, "the clock")
 
@@ -186,7 +184,7 @@ def test_the_clock_stands_while_the_mesh_is_paused_and_goes_on_by_the_points_of_
     mesh.wait()
 
 
-def test_a_gateway_that_dies_ends_the_run_with_its_name_and_what_was_recorded(place: Place, ros: Ros) -> None:
+def test_gateway_that_dies_ends_run_with_its_name_and_what_was_recorded(place: Place, ros: Ros) -> None:
     mesh = place.start("launch", configured(place, ros, factor=1, stop_time=60.0), "--no-progress")
     wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
     [gateway] = place.processes("gateway")
@@ -199,9 +197,7 @@ def test_a_gateway_that_dies_ends_the_run_with_its_name_and_what_was_recorded(pl
     place.assert_nothing_left(2.0)
 
 
-def test_a_gateway_that_was_stopped_until_the_mesh_let_go_of_it_ends_the_run_with_its_name(
-    place: Place, ros: Ros
-) -> None:
+def test_a_gateway_that_was_stopped_too_long_ends_the_run_by_name(place: Place, ros: Ros) -> None:
     mesh = place.start("launch", configured(place, ros, factor=1, stop_time=600.0), "--no-progress")
     wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
     [gateway] = place.processes("gateway")
@@ -235,9 +231,7 @@ def test_a_mesh_runs_on_where_nobody_of_ros_is_there(place: Place, ros: Ros) -> 
     assert ros.samples == {}
 
 
-def test_transforms_go_out_and_an_element_comes_in_while_a_message_without_it_changes_nothing(
-    place: Place, ros: Ros
-) -> None:
+def test_transforms_go_out_an_element_comes_in_and_none_changes_nothing(place: Place, ros: Ros) -> None:
     store = MessageTypes("jazzy").store
     poses = Codec(MessageTypes("jazzy"), "geometry_msgs/msg/PoseArray")
     empty = poses.empty()

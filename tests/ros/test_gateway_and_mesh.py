@@ -48,7 +48,7 @@ def run_while_samples_come(*tokens: zenoh.SampleKind) -> bool:
 
 
 @pytest.mark.parametrize("tokens", [(THERE, GONE, THERE), (GONE, THERE)])
-def test_a_mesh_that_let_go_of_it_and_is_there_again_ends_it(tokens: tuple[zenoh.SampleKind, ...]) -> None:
+def test_mesh_that_let_go_of_it_and_is_there_again_ends_it(tokens: tuple[zenoh.SampleKind, ...]) -> None:
     assert run_while_samples_come(*tokens)
 
 

@@ -171,7 +171,7 @@ STATES: dict[str, Sequence[int]] = {
 
 
 @pytest.mark.parametrize("transitions", STATES.values(), ids=STATES)
-def test_ctrl_c_ends_it_in_every_state_with_exit_code_0_and_no_traceback(
+def test_ctrl_c_ends_it_in_every_state_without_error_or_traceback(
     ros: Ros, place: Place, transitions: Sequence[int]
 ) -> None:
     config = configured(place, "lab", "DampedPendulum")
@@ -203,7 +203,7 @@ sys.exit(entry.main())
 """
 
 
-def test_ros_that_is_shut_down_while_a_callback_uses_it_is_a_plain_end(ros: Ros) -> None:
+def test_ros_that_is_shut_down_while_callback_uses_it_is_plain_end(ros: Ros) -> None:
     """After Ctrl-C a thread of rclpy shuts ROS down; here a callback does, so the order is always this."""
     done = subprocess.run(
         [sys.executable, "-c", SHUT_DOWN_IN_A_CALLBACK],
@@ -218,7 +218,7 @@ def test_ros_that_is_shut_down_while_a_callback_uses_it_is_a_plain_end(ros: Ros)
 
 
 @pytest.mark.usefixtures("ros")
-def test_a_sample_that_comes_after_ros_was_shut_down_is_dropped_without_a_word() -> None:
+def test_sample_that_comes_after_ros_was_shut_down_is_dropped_without_word() -> None:
     import rclpy  # noqa: PLC0415 only where ROS is installed
     from rclpy.serialization import serialize_message  # noqa: PLC0415 as above
     from std_msgs.msg import Float64  # noqa: PLC0415 as above
@@ -267,7 +267,7 @@ def test_one_gateway_serves_one_run_after_another_and_another_mesh(ros: Ros, pla
     assert "rror" not in node.errors
 
 
-def test_a_node_whose_run_has_ended_says_so_and_is_configured_again_for_the_next(ros: Ros, place: Place) -> None:
+def test_a_node_whose_run_has_ended_is_configured_for_the_next(ros: Ros, place: Place) -> None:
     config = configured(place, "lab", "Gain")
     with gateway(ros, config=config) as node:
         with launched(place, config):
@@ -283,7 +283,7 @@ def test_a_node_whose_run_has_ended_says_so_and_is_configured_again_for_the_next
     assert "Traceback" not in node.errors
 
 
-def test_activated_in_the_middle_of_a_run_the_clock_never_tells_a_time_before_that(ros: Ros, place: Place) -> None:
+def test_activated_in_middle_of_a_run_clock_never_tells_time_before_that(ros: Ros, place: Place) -> None:
     from rosgraph_msgs.msg import Clock  # noqa: PLC0415 only where ROS is installed
 
     config = configured(place, "lab", "Gain")

@@ -41,7 +41,7 @@ def decoded(message: str, data: bytes) -> dict[str, Any]:
     return Codec(TYPES, message).decode(data)
 
 
-def test_a_message_of_two_variables_holds_values_of_one_point_whatever_comes_first() -> None:
+def test_message_of_two_variables_holds_values_of_one_point_whatever_comes_first() -> None:
     assembler = Assembler(topic(TWIST, port("twist.linear.x"), port("twist.angular.z")), TYPES)
 
     made = [
@@ -176,7 +176,7 @@ def test_a_message_without_the_element_that_a_variable_needs_is_refused() -> Non
         Disassembler(topic(name, port("data", shape=(2,)), direction="in"), TYPES).values(empty)
 
 
-def test_elements_of_an_array_of_messages_are_made_up_to_the_last_that_is_mapped() -> None:
+def test_elements_of_array_of_messages_are_made_up_to_last_mapped() -> None:
     ports = (port("transforms[2].transform.translation.x"), port("transforms[0].transform.rotation.w"))
     constants = (("transforms[2].child_frame_id", "tool"), ("transforms[2].header.frame_id", "arm"))
     assembler = Assembler(topic(TF, *ports, constants=constants), TYPES)
@@ -193,7 +193,7 @@ def test_elements_of_an_array_of_messages_are_made_up_to_the_last_that_is_mapped
     assert [own["header"]["stamp"] for own in transforms] == [{"sec": 1, "nanosec": 500_000_000}] * 3
 
 
-def test_an_element_of_an_array_of_messages_is_read_and_a_message_without_it_is_refused() -> None:
+def test_an_element_of_an_array_is_read_or_the_message_is_refused() -> None:
     disassembler = Disassembler(topic(TF, port("transforms[1].transform.rotation.w"), direction="in"), TYPES)
     codec = Codec(TYPES, TF)
     message = codec.empty()
@@ -219,7 +219,7 @@ def test_texts_and_numbers_fill_the_sequences_of_one_message() -> None:
     assert (message["velocity"].tolist(), message["effort"].tolist()) == ([], [2.0])
 
 
-def test_the_stamp_of_a_message_comes_with_its_values_and_zero_is_none() -> None:
+def test_the_stamp_of_message_comes_with_its_values_and_zero_is_none() -> None:
     own = topic(TWIST, port("twist.linear.x"), direction="in")
     codec = Codec(TYPES, TWIST)
     message = codec.empty()

@@ -42,7 +42,7 @@ def command(place: Place, *arguments: str | Path) -> None:
     assert done.wait() == 0, done.errors
 
 
-def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_watches(ros: Ros, place: Place) -> None:
+def test_a_feedback_loop_at_500_hz_gives_equal_floats_while_ros_watches(ros: Ros, place: Place) -> None:
     from geometry_msgs.msg import TwistStamped  # noqa: PLC0415 only where ROS is installed
     from rosgraph_msgs.msg import Clock  # noqa: PLC0415 as above
 
@@ -89,7 +89,7 @@ def test_a_feedback_loop_at_500_hz_gives_the_floats_of_one_process_while_ros_wat
     assert 2_000_000_000 in times
 
 
-def test_an_input_and_a_tunable_parameter_of_a_mesh_are_set_from_ros(ros: Ros, place: Place) -> None:
+def test_an_input_and_a_tunable_parameter_of_mesh_are_set_from_ros(ros: Ros, place: Place) -> None:
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: PLC0415 only where ROS is installed
     from rcl_interfaces.srv import SetParameters  # noqa: PLC0415 as above
     from std_msgs.msg import Float64  # noqa: PLC0415 as above
@@ -130,7 +130,7 @@ def test_an_input_and_a_tunable_parameter_of_a_mesh_are_set_from_ros(ros: Ros, p
     launched.wait()
 
 
-def test_without_its_mesh_a_gateway_stays_unconfigured_and_says_how_to_start_one(
+def test_without_its_mesh_gateway_stays_unconfigured_and_says_how_to_start_one(
     ros: Ros, place: Place, capfd: pytest.CaptureFixture[str]
 ) -> None:
     config = write_config(place.folder)

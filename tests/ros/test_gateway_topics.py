@@ -134,7 +134,7 @@ def test_an_array_of_which_one_element_is_connected_is_not_subscribed(tmp_path: 
     assert topics["/b/float32_array_in"].ports[0].variable.shape == (2, 5)
 
 
-def test_topics_are_set_by_hand_for_a_variable_an_instance_or_several_variables(tmp_path: Path) -> None:
+def test_topics_are_set_by_hand_for_a_variable_instance_or_several_variables(tmp_path: Path) -> None:
     fields = {"twist.linear.x": "pendulum.a", "twist.angular.z": "gain.y"}
 
     plan = planned(
@@ -274,7 +274,7 @@ def test_what_could_not_be_sent_or_received_is_told_by_check(tmp_path: Path, ros
     assert message in str(caught.value)
 
 
-def test_an_array_that_has_not_as_many_elements_as_its_field_is_told(tmp_path: Path) -> None:
+def test_array_that_has_not_as_many_elements_as_its_field_is_told(tmp_path: Path) -> None:
     fields = {"covariance": "a.float64_array_out"}
     path = write_config(
         tmp_path,
@@ -303,7 +303,7 @@ def test_elements_of_arrays_of_messages_are_topics_in_both_directions(tmp_path: 
     assert plan.topics[0].constants == tuple(names.items())
 
 
-def test_names_that_collide_or_start_with_a_digit_are_told_with_all_else_that_is_wrong(tmp_path: Path) -> None:
+def test_names_that_collide_or_start_with_a_digit_are_found_together(tmp_path: Path) -> None:
     loaded = examine_data(read_file(configured(tmp_path, topics=["pendulum", "delay.nothing"])))[0]
     variables = tuple(
         Variable(name=name, value_reference=number, type="Float64", causality="output", variability="continuous")

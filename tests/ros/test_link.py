@@ -63,7 +63,7 @@ def seen(place: Place, mesh: str) -> list[dict[str, Any]]:
     return ros
 
 
-def test_nobody_there_is_told_once_and_the_bridge_that_comes_later_and_goes_again_too(place: Place) -> None:
+def test_nobody_there_is_reported_once_and_a_late_bridge_as_well(place: Place) -> None:
     need("rclpy")
     bridge_binary()
     port = free_port()
@@ -104,7 +104,7 @@ def test_a_router_without_a_bridge_is_no_link_to_dds(place: Place) -> None:
         assert [(own["connected"], own["other_clocks"]) for own in seen(place, "lab")] == [(True, [])]
 
 
-def test_two_meshes_behind_one_bridge_name_each_other_and_a_ros_node_that_publishes_the_clock(place: Place) -> None:
+def test_two_meshes_behind_one_bridge_name_each_other_and_the_clock(place: Place) -> None:
     need("rclpy", "rosgraph_msgs")
     bridge_binary()
     port = free_port()
@@ -124,7 +124,7 @@ def test_two_meshes_behind_one_bridge_name_each_other_and_a_ros_node_that_publis
     assert one.errors.count("mesh 'two'") == 1
 
 
-def test_two_meshes_behind_one_router_of_rmw_zenoh_name_each_other_and_the_nodes(place: Place) -> None:
+def test_two_meshes_behind_one_router_of_rmw_zenoh_name_each_other(place: Place) -> None:
     need("zenoh_ros2_sdk", "rclpy")
     port = free_port()
     router = place.start("router", "--listen", f"tcp/127.0.0.1:{port}")

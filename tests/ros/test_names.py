@@ -56,7 +56,7 @@ def test_the_type_of_a_message_has_its_name_in_dds() -> None:
 
 
 @given(st.integers(-(2**31), 2**31 - 1), st.integers(0, 999_999_999))
-def test_a_stamp_becomes_the_nearest_float_and_comes_back_while_floats_are_that_fine(sec: int, nanosec: int) -> None:
+def test_stamp_becomes_nearest_float_and_comes_back_while_floats_are_that_fine(sec: int, nanosec: int) -> None:
     time = in_nanoseconds(sec, nanosec) / 10**9
 
     assert abs(nanoseconds(time) - (sec * 10**9 + nanosec)) <= math.ceil(math.ulp(time) / 2 * 1e9)

@@ -123,7 +123,7 @@ def test_outputs_are_publishers_and_inputs_subscriptions_of_float64(
     assert set(topics(peer.get_subscriber_names_and_types_by_node)) == subscriptions
 
 
-def test_every_variable_is_a_parameter_and_those_that_are_set_initialize_the_fmu(ros: Ros) -> None:
+def test_every_variable_is_a_parameter_and_those_that_are_set_initialize_fmu(ros: Ros) -> None:
     # A whole number for a Real is what a file that says `l: 2` gives.
     node = ros.fmu(fmu_path=PENDULUM, l=2, d=0.001, a=1.3)
 
@@ -162,7 +162,7 @@ def test_the_parameters_of_the_node_have_the_defaults_of_fmi_adapter(ros: Ros) -
     assert [node.get_parameter(name).value for name in ("fmu_path", "step_size", "update_period")] == ["", 0.0, 0.01]
 
 
-def test_a_run_gives_the_floats_of_a_loop_of_steps_and_one_message_per_update(ros: Ros) -> None:
+def test_run_gives_floats_of_loop_of_steps_and_one_message_per_update(ros: Ros) -> None:
     with FMIAdapter(PENDULUM) as pendulum:
         pendulum.exit_initialization_mode(0.0)
         expected = {0: float(pendulum.get_output_value("a"))}
@@ -264,7 +264,7 @@ def variables(tmp_path: Path, *names: str) -> str:
         (("update_period", "y", "z"), "names of parameters of this node: update_period", "update_period: period"),
     ],
 )
-def test_a_name_that_ros_cannot_have_is_refused_with_the_way_out_which_works(
+def test_name_that_ros_cannot_have_is_refused_with_way_out_which_works(
     ros: Ros, said: Said, tmp_path: Path, names: tuple[str, str, str], complaint: str, mended: str
 ) -> None:
     node = ros.fmu(fmu_path=variables(tmp_path, *names))
@@ -324,7 +324,7 @@ def test_simulated_time_that_jumps_back_starts_the_fmu_again(ros: Ros, said: Sai
     assert state_of(node) == "active"
 
 
-def test_an_input_holds_from_the_stamp_of_its_message_and_a_second_one_with_that_stamp_counts(ros: Ros) -> None:
+def test_an_input_holds_from_its_messages_stamp_and_the_second_equal_counts(ros: Ros) -> None:
     from geometry_msgs.msg import PointStamped  # noqa: PLC0415 only where ROS is installed
 
     node = ros.fmu(fmu_path=GAIN, step_size=0.1, use_sim_time=True, stamped=True, k=1.0)
@@ -407,7 +407,7 @@ def test_every_type_has_its_topic_and_its_parameter(ros: Ros, tmp_path: Path) ->
     assert [driver.get_value(name) for name in names] == [5, "x", 3]
 
 
-def test_a_tunable_parameter_changes_at_run_time_and_a_fixed_one_is_refused_with_the_reason(ros: Ros) -> None:
+def test_a_tunable_parameter_changes_at_run_time_and_a_fixed_is_refused(ros: Ros) -> None:
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: PLC0415 only where ROS is installed
     from rcl_interfaces.srv import SetParameters  # noqa: PLC0415 as above
 
@@ -464,7 +464,7 @@ def test_fields_of_one_message_are_variables_in_both_directions(ros: Ros) -> Non
     assert {name for name, _ in peer.get_topic_names_and_types()} & {"/u1", "/u2", "/y"} == set()
 
 
-def test_an_element_of_an_array_of_messages_is_a_variable_in_both_directions(ros: Ros) -> None:
+def test_an_element_of_an_array_of_messages_is_variable_in_both_directions(ros: Ros) -> None:
     from geometry_msgs.msg import Pose, PoseArray  # noqa: PLC0415 only where ROS is installed
 
     node = ros.fmu(
@@ -544,7 +544,7 @@ def test_what_is_wrong_is_told_and_leaves_the_node_unconfigured(
     assert state_of(node) == "unconfigured"
 
 
-def test_an_fmu_that_fails_is_told_and_the_node_can_be_configured_again(ros: Ros, said: Said, faulty: Path) -> None:
+def test_an_fmu_that_fails_is_told_and_node_can_be_configured_again(ros: Ros, said: Said, faulty: Path) -> None:
     node = ros.fmu(fmu_path=str(faulty), step_size=0.01, fail_at=0.05)
     start(node)
 
@@ -589,7 +589,7 @@ def process(ros: Ros, temporary: Path, **parameters: Any) -> subprocess.Popen[st
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
 
-def test_a_process_is_the_source_of_time_for_others_and_leaves_nothing_behind(ros: Ros, tmp_path: Path) -> None:
+def test_a_process_is_source_of_time_for_others_and_leaves_nothing_behind(ros: Ros, tmp_path: Path) -> None:
     import rclpy  # noqa: PLC0415 only where ROS is installed
 
     temporary = tmp_path / "temporary"
@@ -611,9 +611,7 @@ def test_a_process_is_the_source_of_time_for_others_and_leaves_nothing_behind(ro
     assert list(temporary.iterdir()) == []
 
 
-def test_while_an_fmu_hangs_the_node_answers_and_its_end_is_bounded_and_clean(
-    ros: Ros, tmp_path: Path, faulty: Path
-) -> None:
+def test_while_fmu_hangs_node_answers_and_its_end_is_bounded_and_clean(ros: Ros, tmp_path: Path, faulty: Path) -> None:
     from lifecycle_msgs.srv import GetState  # noqa: PLC0415 only where ROS is installed
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: PLC0415 as above
     from rcl_interfaces.srv import SetParameters  # noqa: PLC0415 as above
@@ -661,9 +659,7 @@ sys.exit(entry.main(["--ros-args", "-p", "fmu_path:=" + sys.argv[1], "-p", "auto
 """
 
 
-def test_a_middleware_that_does_not_shut_down_ends_with_a_message_and_the_code_of_the_node(
-    ros: Ros, tmp_path: Path
-) -> None:
+def test_a_middleware_that_hangs_at_shutdown_ends_with_the_nodes_code(ros: Ros, tmp_path: Path) -> None:
     environment = {**os.environ, **ros.environment, "TMPDIR": str(tmp_path)}
 
     done = subprocess.run(
@@ -720,7 +716,7 @@ def test_without_ros_the_module_says_how_to_get_it() -> None:
     assert "source /opt/ros/DISTRO/setup.bash" in done.stderr
 
 
-def test_an_array_in_a_field_of_one_value_is_refused_with_its_name(tmp_path: Path) -> None:
+def test_an_array_in_field_of_one_value_is_refused_with_its_name(tmp_path: Path) -> None:
     with FMIAdapter(find_fmu("AllTypes3", tmp_path), 0.01) as adapter:
         description = adapter.description
     [array, *_] = [v.name for v in description.with_causality("output") if v.shape]

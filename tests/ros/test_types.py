@@ -78,7 +78,7 @@ def test_a_field_that_is_not_there_is_told_with_those_that_are(path: str) -> Non
         ("std_msgs/msg/Float64", "data[0]", "it is no array"),
     ],
 )
-def test_an_index_that_is_none_of_the_array_is_told_with_those_that_are(message: str, path: str, reason: str) -> None:
+def test_index_that_is_none_of_array_is_told_with_those_that_are(message: str, path: str, reason: str) -> None:
     with pytest.raises(UnknownField) as caught:
         TYPES.field(message, path)
 

@@ -23,7 +23,7 @@ b: 1 -> 2 uses a@1
     cycle.assert_the_same_on_any_nodes()
 
 
-def test_with_gauss_seidel_only_the_connection_that_closes_the_cycle_brings_an_old_value() -> None:
+def test_with_gauss_seidel_only_connection_that_closes_cycle_brings_an_old_value() -> None:
     cycle = Scenario(("a -> b", "b -> c", "c -> a"))
 
     assert (
@@ -69,7 +69,7 @@ b: 1 -> 2 uses a@2
     loop.assert_the_same_on_any_nodes()
 
 
-def test_what_feeds_a_cycle_and_what_it_feeds_stay_in_step_with_it() -> None:
+def test_what_feeds_cycle_and_what_it_feeds_stay_in_step_with_it() -> None:
     system = Scenario(("source -> a", "a -> b", "b -> a", "b -> target"), points=2)
 
     assert (

@@ -19,7 +19,7 @@ def test_a_cycle_in_one_node_is_stepped_point_by_point() -> None:
     assert cycle.on_nodes(groups=dict.fromkeys("abc", "g"), window=64) == cycle.in_one_loop().splitlines()
 
 
-def test_a_cycle_of_two_rates_in_one_node_is_stepped_as_in_one_loop() -> None:
+def test_a_cycle_of_two_rates_is_stepped_as_in_one_loop() -> None:
     cycle = Scenario(("a -> b", "b -> a"), points=12, steps={"a": 3, "b": 2})
 
     assert cycle.grouped() == cycle.in_one_loop()

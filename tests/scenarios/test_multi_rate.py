@@ -8,7 +8,7 @@ from tests.scenarios.scenario import Counter, Scenario
 from tests.scenarios.simulated import SimulatedMesh
 
 
-def test_a_slow_target_uses_the_value_at_the_end_of_its_own_step() -> None:
+def test_a_slow_target_uses_the_value_at_end_of_its_own_step() -> None:
     system = Scenario(("fast -> slow",), points=7, steps={"slow": 3})
 
     assert (
@@ -28,7 +28,7 @@ fast: 6 -> 7
     system.assert_the_same_on_any_nodes()
 
 
-def test_with_jacobi_a_slow_target_uses_the_value_at_the_start_of_its_own_step() -> None:
+def test_with_jacobi_slow_target_uses_value_at_start_of_its_own_step() -> None:
     system = Scenario(("fast -> slow",), points=7, steps={"slow": 3}, algorithm="jacobi")
 
     assert (
@@ -68,7 +68,7 @@ fast: 6 -> 7 uses slow@6
     system.assert_the_same_on_any_nodes()
 
 
-def test_with_jacobi_a_new_value_of_a_slow_source_counts_from_the_next_point_on() -> None:
+def test_with_jacobi_new_value_of_slow_source_counts_from_next_point_on() -> None:
     system = Scenario(("slow -> fast",), points=7, steps={"slow": 3}, algorithm="jacobi")
 
     assert (
@@ -137,7 +137,7 @@ b: 4 -> 6 uses a@3
     cycle.assert_the_same_on_any_nodes()
 
 
-def test_a_step_that_does_not_fit_before_the_last_point_is_not_taken() -> None:
+def test_a_step_that_does_not_fit_before_last_point_is_not_taken() -> None:
     system = Scenario(("a -> b",), points=2, steps={"a": 3})
 
     assert (
@@ -150,7 +150,7 @@ b: 1 -> 2 uses a@0
     system.assert_the_same_on_any_nodes()
 
 
-def test_a_slow_member_of_a_cycle_does_not_stop_the_others_before_the_end_of_its_step() -> None:
+def test_a_slow_member_of_a_cycle_stops_others_only_at_its_end() -> None:
     """Otherwise its source, which may run one window ahead of the cycle, never reaches that end."""
     system = Scenario(("source -> slow", "slow -> fast", "fast -> slow"), points=6, steps={"slow": 5})
 

@@ -49,7 +49,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ("ship", "ship/VarB.ssd", "ship/results/Variant_B.csv"),
     ],
 )
-def test_a_package_runs_by_each_of_its_names_and_a_rerun_has_its_values(write: str, name: str, result: str) -> None:
+def test_package_runs_by_each_of_its_names_and_rerun_has_its_values(write: str, name: str, result: str) -> None:
     packed(write)
 
     assert main(["launch", name, "--local", "--no-progress"]) == 0
@@ -67,7 +67,7 @@ def test_a_link_to_a_package_has_its_result_where_the_link_is(tmp_path: Path) ->
     assert Path("results/DP_ship.csv").is_file()
 
 
-def test_a_result_of_a_package_that_was_moved_runs_again_from_the_yaml_file_that_was_made_of_it() -> None:
+def test_a_result_of_a_moved_package_runs_again_from_its_yaml_file() -> None:
     package = packed()
     assert main(["convert", package, "made/ship.yaml"]) == 2  # there is no such folder
     Path("made").mkdir()
@@ -207,7 +207,7 @@ def test_a_scenario_that_a_program_gives_a_package_is_exported_with_it() -> None
     )
 
 
-def test_a_result_that_cannot_be_written_beside_a_package_is_refused_with_the_way_out(
+def test_result_that_cannot_be_written_beside_package_is_refused_with_way_out(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     package = packed()
@@ -249,7 +249,7 @@ def test_a_result_file_inside_a_package_is_refused_with_the_way_out(capsys: pyte
         (["check", "mesh.yaml", "--ssd", "VarB"], "'mesh.yaml' is no package"),
     ],
 )
-def test_what_is_no_package_or_no_configuration_is_refused_with_the_way_out(
+def test_what_is_no_package_or_no_configuration_is_refused_with_way_out(
     arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     packed()
@@ -261,7 +261,7 @@ def test_what_is_no_package_or_no_configuration_is_refused_with_the_way_out(
     assert words in refused(capsys, *arguments).replace(f"{tmp_path}/", "")
 
 
-def test_a_mesh_that_was_loaded_from_a_package_is_changed_and_exported_again() -> None:
+def test_a_mesh_that_was_loaded_from_package_is_changed_and_exported_again() -> None:
     mesh = fmu_mesh.load(packed())
     mesh.add("extra", fmu=str(FMUS / "Gain.fmu"), start_values={"k": 7.0})
     mesh.connect(f"{INSTANCES[2]}.y", "extra.u")

@@ -316,7 +316,7 @@ def test_two_exports_have_the_same_bytes(tmp_path: Path) -> None:
         assert {entry.external_attr >> 16 for entry in archive.infolist()} == {0o100644}
 
 
-def test_fmus_with_equal_content_are_one_file_and_others_have_names_of_their_own(tmp_path: Path) -> None:
+def test_fmus_with_equal_content_are_one_file_and_others_have_names(tmp_path: Path) -> None:
     files = {"one": "Gain.fmu", "two": "Gain.fmu", "three": "GAIN.fmu", "four": "a b%.fmu"}
     places = {folder: tmp_path / folder / file for folder, file in files.items()}
     for path in places.values():
@@ -449,7 +449,7 @@ def test_what_needs_ssp_2_is_named_with_its_variable(tmp_path: Path) -> None:
     assert_equal(mesh, loaded(tmp_path / "system.ssp"), tmp_path)
 
 
-def test_an_fmu_of_fmi_3_whose_other_variables_are_not_used_goes_into_a_package_of_ssp_1(tmp_path: Path) -> None:
+def test_an_fmu_of_fmi_3_with_unused_variables_fits_ssp_1(tmp_path: Path) -> None:
     mesh = fmu_mesh.Mesh("types", step_size=0.1, stop_time=1.0)
     starts = {"float64_in": 1.5, "int32_in": -5, "boolean_in": True, "string_in": "x", "binary_in": "AQID"}
     mesh.add("a", fmu=find_fmu("AllTypes3", tmp_path), start_values=starts)

@@ -41,7 +41,7 @@ WRITTEN: dict[str, Callable[[str], str | bytes]] = {
 
 
 @pytest.mark.parametrize("way", WRITTEN)
-def test_a_document_is_read_however_it_is_written_and_its_lines_are_known(way: str, tmp_path: Path) -> None:
+def test_document_is_read_however_it_is_written_and_its_lines_are_known(way: str, tmp_path: Path) -> None:
     good = write_package(tmp_path / "good.ssp", edited(WRITTEN[way](TEXT)))
     wrong = write_package(tmp_path / "wrong.ssp", edited(WRITTEN[way](WRONG)))
 
@@ -82,7 +82,7 @@ def test_a_document_type_is_refused_with_its_line(way: str, tmp_path: Path) -> N
     assert [finding.line for finding in caught.value.findings] == [3]
 
 
-def test_a_name_with_line_breaks_and_signs_of_a_terminal_stays_in_one_line_of_a_message(tmp_path: Path) -> None:
+def test_a_name_with_line_breaks_and_control_signs_stays_in_one_line(tmp_path: Path) -> None:
     text = WRONG.replace('name="gain"', 'name="ga&#10;in\u202e\u009b"').replace('"gain"', '"ga&#10;in\u202e\u009b"')
     path = write_package(tmp_path / "bad.ssp", edited(text))
 
@@ -194,7 +194,7 @@ def test_a_damaged_package_is_refused_with_the_way_out(fault: str, tmp_path: Pat
     assert words in "\n".join(map(str, [caught.value, *caught.value.findings]))
 
 
-def test_a_file_of_a_package_that_cannot_be_unpacked_keeps_it_from_being_exported(tmp_path: Path) -> None:
+def test_file_of_package_that_cannot_be_unpacked_keeps_it_from_being_exported(tmp_path: Path) -> None:
     path = write_package(tmp_path / "odd.ssp", {**GOOD, "extra.bin": "?"})
     data = bytearray(path.read_bytes())
     data[data.rindex(b"extra.bin") - 46 + 10] = 99  # its compression, in the list of files

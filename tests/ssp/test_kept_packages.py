@@ -201,7 +201,7 @@ def test_keys_of_instances_and_connections_go_into_the_annotation_of_a_copy(fore
     assert loaded(tmp_path / "copy.ssp").configuration.data == data
 
 
-def test_another_description_of_a_package_is_copied_with_the_way_to_run_it(foreign: Path, tmp_path: Path) -> None:
+def test_another_description_of_a_package_is_copied_with_way_to_run_it(foreign: Path, tmp_path: Path) -> None:
     mesh = loaded(foreign, "variant")
     mesh.configure(simulation={"window": 4})
 
@@ -353,7 +353,7 @@ def test_another_version_of_ssp_is_a_new_description(foreign: Path, tmp_path: Pa
     assert loaded(foreign).to_ssp(tmp_path / "copy.ssp", version="1.0") == ()
 
 
-def test_a_version_that_only_one_document_of_a_package_does_not_have_is_a_new_description(tmp_path: Path) -> None:
+def test_a_version_that_one_document_lacks_is_a_new_description(tmp_path: Path) -> None:
     files = files_of_package()
     files["resources/first.ssv"] = files["resources/first.ssv"].replace(b'version="1.0"', b'version="2.0"')
     package = packed(tmp_path / "mixed.ssp", files)
@@ -456,7 +456,7 @@ def test_an_annotation_that_is_wrong_is_a_finding_with_its_line(
     assert finding.line is not None
 
 
-def test_a_value_of_an_annotation_is_checked_as_any_other_with_the_line_of_the_annotation(own: Path) -> None:
+def test_value_of_annotation_is_checked_as_any_other_with_line_of_annotation(own: Path) -> None:
     edited(own, lambda text: text.replace('"step_size": 0.1', '"step_size": "fast"'))
 
     (finding,) = loaded(own).check().findings

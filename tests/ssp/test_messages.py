@@ -52,7 +52,7 @@ def test_a_system_whose_only_component_cannot_be_read_has_one_finding(tmp_path: 
     ]
 
 
-def test_an_attribute_of_another_name_than_the_only_one_that_is_missing_is_meant_as_that(tmp_path: Path) -> None:
+def test_an_unknown_attribute_means_the_only_one_that_is_missing(tmp_path: Path) -> None:
     names = mapping_file(mapped("length", "pendulum.l").replace("target=", "destination="))
     root = system("root", component("pendulum", "DampedPendulum"), bindings=[bound("values.ssv", "names.ssm")])
     values = parameter_file(parameter("length", 1.5))
@@ -140,7 +140,7 @@ def test_the_command_that_runs_a_converted_package_chooses_its_description(
 
 
 @pytest.mark.parametrize("hint", ["1e300", "1.7e308"])
-def test_a_step_size_that_no_run_can_reach_is_told_and_ends_nothing(hint: str, tmp_path: Path) -> None:
+def test_step_size_that_no_run_can_reach_is_told_and_ends_nothing(hint: str, tmp_path: Path) -> None:
     def annotation(inside: str) -> str:
         return element("ssc:Annotation", inside, type="com.opensimulationplatform")
 

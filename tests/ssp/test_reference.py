@@ -33,7 +33,7 @@ def starts(system: FlatSystem) -> dict[str, Any]:
     return {name_of(path): fmu.start_values for path, fmu in system.fmus.items() if fmu.start_values}
 
 
-def test_connections_of_nested_systems_are_followed_from_output_to_input_whichever_end_is_their_start(
+def test_connections_of_nested_systems_are_followed_from_output_to_input(
     tmp_path: Path,
 ) -> None:
     system = flat("nested", tmp_path)
@@ -86,7 +86,7 @@ def test_the_connection_of_a_cycle_that_comes_last_is_the_delayed_one(tmp_path: 
     ]
 
 
-def test_units_are_converted_on_each_part_of_a_chain_and_before_its_transformation(tmp_path: Path) -> None:
+def test_units_are_converted_on_each_part_of_chain_and_before_its_transformation(tmp_path: Path) -> None:
     system = flat("units", tmp_path)
 
     # 20 degC are (20 + 273.15 - 255.37) / 0.5555 degF; times 1.5; to K; times 2, plus 1.
@@ -103,7 +103,7 @@ def test_units_are_converted_on_each_part_of_a_chain_and_before_its_transformati
     assert system.warnings == ["(('unknown',), 'u'): degC to furlong is not defined"]
 
 
-def test_a_higher_binding_beats_a_lower_one_and_a_later_one_an_earlier_one(tmp_path: Path) -> None:
+def test_a_higher_binding_beats_a_lower_one_and_later_one_earlier_one(tmp_path: Path) -> None:
     assert starts(flat("parameters", tmp_path)) == {
         "inner-low": {"k": 4.0, "u": -1.5},
         "inner-twice": {"k": 3.0, "u": 0.25},

@@ -15,7 +15,7 @@ def equal(one: Path, other: Path) -> bool:
     return bool(fmu_mesh.Result.read(one).compare(fmu_mesh.Result.read(other)))
 
 
-def test_a_package_that_runs_is_seen_and_steered_by_the_names_of_its_instances(place: Place) -> None:
+def test_package_that_runs_is_seen_and_steered_by_names_of_its_instances(place: Place) -> None:
     package = write_package(place.folder / "ship.ssp", SHIP)
     launched = place.start("launch", package, "--paused", "--no-progress")
     assert place.run("wait", "DP_ship", "--state", "paused").wait() == 0
@@ -32,7 +32,7 @@ def test_a_package_that_runs_is_seen_and_steered_by_the_names_of_its_instances(p
     assert place.run("rerun", "results/DP_ship.csv").wait() == 0
 
 
-def test_nodes_and_a_master_that_are_started_manually_give_the_result_of_launch(place: Place) -> None:
+def test_nodes_and_a_master_that_are_started_manually_give_result_of_launch(place: Place) -> None:
     package = write_package(place.folder / "ship.ssp", SHIP)
     parts = [place.start("node", package, "--ssd", "VarB", name) for name in INSTANCES]
     parts.append(place.start("master", package, "--ssd", "VarB", "--output", "own.csv", "--no-progress"))
@@ -43,7 +43,7 @@ def test_nodes_and_a_master_that_are_started_manually_give_the_result_of_launch(
     assert equal(place.folder / "own.csv", place.folder / "results/Variant_B.csv")
 
 
-def test_a_bag_is_played_into_a_package_whose_times_an_option_has_given(place: Place) -> None:
+def test_a_bag_is_played_into_a_package_whose_times_option_has_given(place: Place) -> None:
     package = write_package(place.folder / "ship.ssp", SHIP)
     assert place.run("launch", package, "--local", "--output", "bag.mcap").wait() == 0
     gain = component("the gain", "Gain", connector("u", "input"), connector("y", "output"))

@@ -44,7 +44,7 @@ def test_a_set_of_the_package_replaces_its_values_and_leaves_the_others(tmp_path
     }
 
 
-def test_of_several_sets_the_last_one_counts_and_one_may_be_on_the_disk(tmp_path: Path) -> None:
+def test_of_several_sets_last_one_counts_and_one_may_be_on_disk(tmp_path: Path) -> None:
     package, own = write_package(tmp_path / "good.ssp", FILES), tmp_path / "own.ssv"
     own.write_text(parameter_file(parameter("inner.gain.k", 5.0)))
 

@@ -297,7 +297,7 @@ def test_a_job_on_another_cluster_is_asked_for_and_cancelled_there(fake: Fake, f
     assert (folder / "cancelled").read_text() == "--clusters=north 17\n"
 
 
-def test_an_ended_task_is_told_with_its_state_and_the_last_line_of_its_log(fake: Fake, folder: Path) -> None:
+def test_an_ended_task_is_reported_with_its_state_and_last_log_line(fake: Fake, folder: Path) -> None:
     fake("squeue", "echo '1|COMPLETED'; echo '2|RUNNING'; echo '3|FAILED'; echo '4|TIMEOUT'; echo '5|NODE_FAIL'")
     job = job_in(folder, tasks=6)
     job.log(3).write_text("a line\n" * 10_000 + "MemoryError\n\n  \n")
@@ -445,7 +445,7 @@ def begun(folder: Path, tasks: int) -> dict[int, int]:
 
 
 @needs_slurm
-def test_the_tasks_of_an_array_run_at_the_same_time_on_several_hosts(cluster: SlurmCluster, folder: Path) -> None:
+def test_the_tasks_of_an_array_run_together_on_several_hosts(cluster: SlurmCluster, folder: Path) -> None:
     del cluster
 
     job = part_of_a_sweep(folder, "together", tasks=4, options=("--comment='a b'", "--partition=all"))
@@ -714,7 +714,7 @@ def test_a_command_that_does_not_wait_ends_without_an_error(cluster: SlurmCluste
 
 
 @needs_slurm
-def test_a_sweep_is_not_submitted_again_while_nobody_knows_whether_its_tasks_run(
+def test_sweep_is_not_submitted_again_while_nobody_knows_whether_its_tasks_run(
     cluster: SlurmCluster, shared: Place
 ) -> None:
     start_held_sweep(shared, "--no-wait")

@@ -41,7 +41,7 @@ def workers(launched: Launched) -> list[psutil.Process]:
     return psutil.Process(launched.pid).children(recursive=True)
 
 
-def test_a_sweep_prints_its_table_and_speed_and_leaves_no_process_and_no_file(place: Place, config: Path) -> None:
+def test_a_sweep_prints_its_table_and_leaves_no_process_or_file(place: Place, config: Path) -> None:
     done = place.run("sweep", config, *VARY, "--reduce", "max(pendulum.a)", "--reduce", "at(delay.y, 0.5)")
 
     assert done.wait() == 0

@@ -63,7 +63,7 @@ def executor_named(name: str) -> Iterator[Executor | None]:
 
 
 @pytest.mark.parametrize("name", ["workers", "threads", "processes"])
-def test_every_row_and_curve_is_that_of_a_run_alone_on_every_executor(config: Path, tmp_path: Path, name: str) -> None:
+def test_every_row_and_curve_is_that_of_run_alone_on_every_executor(config: Path, tmp_path: Path, name: str) -> None:
     mesh = fmu_mesh.load(config)
 
     with executor_named(name) as executor:
@@ -196,7 +196,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     assert [row.values for row in result] == [row.values for row in undisturbed]
 
 
-def test_a_job_whose_worker_is_lost_says_so_and_those_that_waited_for_it_run() -> None:
+def test_a_job_with_a_lost_worker_reports_it_and_waiting_jobs_run() -> None:
     with WorkerPool(1) as pool:
         assert pool.submit(os.getpid).result(DEADLINE_S) == pool.pids[0]
         lost = pool.submit(os.kill, pool.pids[0], signal.SIGSEGV)

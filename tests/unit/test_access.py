@@ -74,7 +74,7 @@ def test_a_token_opens_no_websocket() -> None:
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "", "192.168.1.2:8000", "[::1"])
-def test_a_name_that_is_none_of_this_host_is_forbidden_also_with_the_cookie(host: str) -> None:
+def test_name_that_is_none_of_this_host_is_forbidden_also_with_cookie(host: str) -> None:
     assert _status(host=host, cookie=COOKIE) == 403
     assert _status(f"token={TOKEN}", host=host) == 403
 

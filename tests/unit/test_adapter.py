@@ -86,7 +86,7 @@ def test_the_names_come_in_the_order_of_the_model_description() -> None:
         assert delay.input_variable_names == ("x",)
 
 
-def test_the_step_size_is_the_given_one_or_else_the_default_experiment_s() -> None:
+def test_the_step_size_is_the_given_one_or_else_default_experiment_s() -> None:
     with FMIAdapter(PENDULUM) as own, FMIAdapter(PENDULUM, 0.02) as other:
         assert (own.step_size, own.default_experiment_step) == (0.002, 0.002)
         assert (other.step_size, other.default_experiment_step) == (0.02, 0.002)
@@ -107,7 +107,7 @@ def test_two_adapters_of_one_fmu_do_not_know_of_each_other() -> None:
 # ---- initialization mode ----
 
 
-def test_start_values_are_taken_in_initialization_mode_before_and_after_the_first_look() -> None:
+def test_start_values_are_taken_in_initialization_mode_before_and_after_first_look() -> None:
     with FMIAdapter(PENDULUM) as pendulum:
         pendulum.set_initial_value("l", 2)
         pendulum.set_initial_value("a", 1.3)
@@ -122,7 +122,7 @@ def test_start_values_are_taken_in_initialization_mode_before_and_after_the_firs
         assert not pendulum.is_in_initialization_mode
 
 
-def test_a_guess_that_the_fmu_takes_before_initialization_mode_only_is_refused_after_the_first_look(
+def test_a_guess_for_an_early_fmu_is_refused_after_the_first_look(
     tmp_path: Path,
 ) -> None:
     text = (zipfile.ZipFile(PENDULUM).read("modelDescription.xml")).decode()
@@ -138,7 +138,7 @@ def test_a_guess_that_the_fmu_takes_before_initialization_mode_only_is_refused_a
             pendulum.set_initial_value("der(a)", 0.2)
 
 
-def test_an_input_that_is_known_at_the_start_is_there_when_initialization_mode_ends(gain: FMIAdapter) -> None:
+def test_input_that_is_known_at_start_is_there_when_initialization_mode_ends(gain: FMIAdapter) -> None:
     gain.set_input_value("u", 9.0, 1.0)
     gain.set_input_value("u", 10.0, 2.0)
     gain.set_input_value("u", 11.0, 4.0)
@@ -203,7 +203,7 @@ def test_a_clock_of_unix_time_changes_no_float_of_the_result() -> None:
 
 
 @pytest.mark.parametrize("start", [0.0, UNIX_TIME])
-def test_a_stamp_that_misses_the_start_of_a_step_by_rounding_only_is_in_time(start: float) -> None:
+def test_stamp_that_misses_start_of_step_by_rounding_only_is_in_time(start: float) -> None:
     with FMIAdapter(GAIN, 0.1, interpolate_input=False) as adapter:
         adapter.exit_initialization_mode(start)
         adapter.set_input_value("u", math.nextafter(start + 3 * 0.1, math.inf), 7.0)
@@ -290,7 +290,7 @@ def test_a_second_value_for_the_same_time_replaces_the_first(gain: FMIAdapter) -
     assert (first, inputs_seen(gain, 1)) == ([2.0], [4.0])
 
 
-def test_a_late_value_holds_from_the_next_step_unless_a_later_one_is_in_use() -> None:
+def test_late_value_holds_from_next_step_unless_later_one_is_in_use() -> None:
     with FMIAdapter(GAIN, 0.5, interpolate_input=False) as adapter:
         adapter.exit_initialization_mode(0.0)
         adapter.set_input_value("u", 1.0, 1.0)
@@ -326,7 +326,7 @@ def test_interpolation_never_leaves_the_range_of_the_two_values() -> None:
 # ---- types ----
 
 
-def test_every_type_can_be_set_and_read_and_only_a_real_is_interpolated(find: Find) -> None:
+def test_every_type_can_be_set_and_read_and_only_real_is_interpolated(find: Find) -> None:
     later: dict[str, Value] = {
         "real": 3.0,
         "integer": -7,
@@ -411,7 +411,7 @@ def test_a_tunable_parameter_changes_between_two_steps(gain: FMIAdapter) -> None
 # ---- wrong use ----
 
 
-def test_a_refusal_is_a_value_error_and_one_of_ours_and_names_the_instance() -> None:
+def test_a_refusal_is_value_error_and_one_of_ours_and_names_instance() -> None:
     with FMIAdapter(GAIN) as adapter, pytest.raises(ValueError, match=r"instance Gain@\d+") as caught:
         adapter.do_step()
 
@@ -622,7 +622,7 @@ def test_the_package_has_no_other_lazy_names() -> None:
         fmu_mesh.FmiAdapter  # noqa: B018 the look-up is what fails
 
 
-def test_an_array_of_fmi_3_is_an_input_with_a_line_between_its_times_and_one_of_another_shape_is_refused(
+def test_an_array_of_fmi_3_is_a_linear_input_by_shape(
     find: Find,
 ) -> None:
     with FMIAdapter(find("AllTypes3"), 0.5) as adapter:

@@ -36,7 +36,7 @@ def gain() -> Iterator[FMIAdapter]:
 
 
 @pytest.mark.parametrize("of", [Nanoseconds, stamp])
-def test_a_stamp_of_ros_is_met_to_the_nanosecond_whatever_its_clock_says(
+def test_a_stamp_of_ros_is_met_to_nanosecond_whatever_its_clock_says(
     gain: FMIAdapter, of: Callable[[int], Any]
 ) -> None:
     gain.exit_initialization_mode(of(UNIX_NS))
@@ -51,7 +51,7 @@ def test_a_stamp_of_ros_is_met_to_the_nanosecond_whatever_its_clock_says(
     assert seen == [(UNIX_NS + (k + 1) * 2 * MS, float(k)) for k in range(500)]
 
 
-def test_a_stamp_a_nanosecond_before_the_start_of_a_step_or_at_it_is_in_time_and_two_after_it_is_late() -> None:
+def test_a_stamp_is_late_from_two_nanoseconds_after_the_step_on() -> None:
     def first_step_of(late_ns: int) -> int:
         with FMIAdapter(FMUS / "Gain.fmu", 0.002, interpolate_input=False) as adapter:
             adapter.exit_initialization_mode(Nanoseconds(UNIX_NS))
@@ -94,7 +94,7 @@ def test_seconds_and_times_of_ros_are_not_mixed(
     assert gain.do_step() == (0.002000005 if start else 0.002)
 
 
-def test_an_input_of_the_other_kind_is_refused_at_the_start_which_can_be_tried_again(gain: FMIAdapter) -> None:
+def test_an_input_of_the_other_kind_is_refused_at_the_start(gain: FMIAdapter) -> None:
     gain.set_input_value("u", 0.0, 1.0)
 
     with pytest.raises(CallRefused, match="is a time in s"):

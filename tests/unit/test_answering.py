@@ -95,9 +95,7 @@ class Query:
 
 
 @pytest.mark.parametrize("state", ["waiting for the mesh", "initializing"])
-def test_a_query_before_the_first_point_waits_for_it_and_not_for_ever(
-    state: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_query_before_first_point_waits_for_it_and_not_for_ever(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(answering, "instance_info", lambda _plan, _runner: 5)
     ring = Ring(Layout.of([("y", "Float64")]), ROWS)
     ring.put(0, "y", 2.5)

@@ -69,7 +69,7 @@ HOSTILE: list[object] = [
 
 
 @pytest.mark.parametrize(("hostile", "says"), HOSTILE)
-def test_an_entry_that_would_leave_the_folder_is_refused_before_anything_is_written(
+def test_an_entry_that_would_leave_folder_is_refused_before_anything_is_written(
     hostile: zipfile.ZipInfo, says: str, tmp_path: Path
 ) -> None:
     path = repacked(tmp_path / "hostile.fmu", add={hostile: b"/etc/passwd"})
@@ -86,9 +86,7 @@ def test_an_entry_that_would_leave_the_folder_is_refused_before_anything_is_writ
 
 @pytest.mark.parametrize("before", ["", "./"], ids=["for the folder itself", "before every name, too"])
 @pytest.mark.parametrize("fmu", ["Gain", "AllTypes3"])
-def test_an_fmu_whose_tool_wrote_a_dot_as_a_folder_is_the_same_fmu_and_runs(
-    fmu: str, before: str, tmp_path: Path
-) -> None:
+def test_fmu_whose_tool_wrote_dot_as_folder_is_same_fmu_and_runs(fmu: str, before: str, tmp_path: Path) -> None:
     """`zip -r model.fmu .` and the tool of Vico write such entries."""
     plain = find_fmu(fmu, tmp_path / "built")
     path = tmp_path / "dotted.fmu"
@@ -163,7 +161,7 @@ def test_an_archive_that_cannot_be_unpacked_is_told_with_the_reason(
     assert list((tmp_path / "parent").glob("*")) == []
 
 
-def test_a_file_in_the_place_of_a_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
+def test_a_file_in_place_of_folder_is_told_and_nothing_is_left(tmp_path: Path) -> None:
     path = repacked(tmp_path / "odd.fmu", add={entry("resources"): b"a file", entry("resources/table.txt"): b"1"})
 
     with pytest.raises(LoadFailed, match=r"odd\.fmu"):
@@ -212,7 +210,7 @@ def test_an_entry_that_holds_more_than_it_announces_is_refused(tmp_path: Path) -
     assert list((tmp_path / "parent").glob("*")) == []
 
 
-def test_an_fmu_is_unpacked_into_a_private_folder_and_keeps_what_is_executable(tmp_path: Path) -> None:
+def test_an_fmu_is_unpacked_into_private_folder_and_keeps_what_is_executable(tmp_path: Path) -> None:
     helper = entry("resources/helper", stat.S_IFREG | 0o755)
     path = repacked(tmp_path / "some.name.fmu", add={helper: b"#!/bin/sh\n", "resources/table": b"1"})
 
@@ -225,7 +223,7 @@ def test_an_fmu_is_unpacked_into_a_private_folder_and_keeps_what_is_executable(t
     assert list(folder.parent.iterdir()) == [folder]  # nothing half done beside it
 
 
-def test_a_checksum_is_verified_when_an_fmu_is_read_and_when_it_is_unpacked(tmp_path: Path) -> None:
+def test_checksum_is_verified_when_fmu_is_read_and_when_it_is_unpacked(tmp_path: Path) -> None:
     right = hashlib.sha256(GAIN.read_bytes()).hexdigest()
     wrong = Terms(sha256="0" * 64)
 
@@ -237,7 +235,7 @@ def test_a_checksum_is_verified_when_an_fmu_is_read_and_when_it_is_unpacked(tmp_
     assert list((tmp_path / "parent").glob("*")) == []
 
 
-def test_an_fmu_that_was_prepared_is_not_opened_again_and_each_instance_has_its_own_files(tmp_path: Path) -> None:
+def test_a_prepared_fmu_is_opened_once_and_each_instance_has_its_files(tmp_path: Path) -> None:
     path = tmp_path / "Gain.fmu"
     path.write_bytes(GAIN.read_bytes())
     model, terms = read_description(path), Terms(content=sha256_of(path))

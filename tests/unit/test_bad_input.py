@@ -313,7 +313,7 @@ def no_binary(path: Path) -> None:
         (no_binary, "has no binary for this platform"),
     ],
 )
-def test_a_file_that_is_no_fmu_for_this_platform_is_told_with_the_reason(
+def test_file_that_is_no_fmu_for_this_platform_is_told_with_reason(
     refused: Callable[[str], str], tmp_path: Path, make: Callable[[Path], None], says: str
 ) -> None:
     make(tmp_path / "broken.fmu")
@@ -467,7 +467,7 @@ def test_a_wrong_value_of_an_option_is_told_in_words(
     assert "usage:" not in message
 
 
-def test_a_path_from_the_working_folder_is_told_to_be_relative_to_the_file(
+def test_a_path_from_working_folder_is_told_to_be_relative_to_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "configs").mkdir()
@@ -482,7 +482,7 @@ def test_a_path_from_the_working_folder_is_told_to_be_relative_to_the_file(
 
 
 @pytest.mark.parametrize("command", ["launch", "run"])
-def test_a_port_in_use_is_told_and_is_no_loss_of_the_master(
+def test_a_port_in_use_is_told_and_is_no_loss_of_master(
     command: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "mesh.yaml"

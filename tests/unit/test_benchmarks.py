@@ -108,7 +108,7 @@ def test_each_figure_of_a_target_is_the_median_of_what_was_measured(figure: Figu
     assert json.loads(report.json())["targets"][0]["value"] == value
 
 
-def test_a_target_without_figures_is_not_met_and_one_of_another_job_is_left_out() -> None:
+def test_a_target_without_figures_is_missed_and_another_jobs_is_left_out() -> None:
     target = Target("speed", "pair", "ours", "times as fast", 2, 3, "theirs")
     report, job = reported(target, {"ours": Measured(2, 4, [1e-6]), "theirs": Measured(2, 4, failure="no compiler")})
 
@@ -119,7 +119,7 @@ def test_a_target_without_figures_is_not_met_and_one_of_another_job_is_left_out(
     assert "speed" not in Report([job], {"pair": {}}, [], [elsewhere]).json()
 
 
-def test_a_row_of_another_checkout_is_compared_with_ours_of_the_same_label() -> None:
+def test_a_row_of_another_checkout_is_compared_with_ours_of_same_label() -> None:
     target = Target("speed", "pair", "ours", "points/s", 2, 3)
     first, ours, other = Measured(2, 4, [1e-6]), Measured(2, 4, [2e-6]), Measured(2, 4, [3e-6])
 

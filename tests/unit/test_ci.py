@@ -22,7 +22,7 @@ tests sh -c 'echo "some tests"; echo "== 3 tests in 1 s"; exit CODE'
 
 
 @pytest.mark.parametrize(("code", "verdict"), [(0, "ran      all tests (N s)"), (1, "FAILED   all tests (N s)")])
-def test_the_end_of_a_script_of_ci_names_the_stages_and_closes_with_the_line_of_pytest(code: int, verdict: str) -> None:
+def test_a_script_of_ci_ends_with_its_stages_and_pytests_line(code: int, verdict: str) -> None:
     script = SCRIPT.replace("CODE", str(code))
 
     done = subprocess.run(["bash", "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)

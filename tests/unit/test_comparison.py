@@ -273,7 +273,7 @@ def test_units_of_different_dimensions_are_never_equal() -> None:
 
 
 @pytest.mark.parametrize(("unit", "other"), [("m", None), (None, "rad"), (None, None), ("N.m", "kg.m2/s2")])
-def test_values_are_taken_as_they_are_where_a_unit_is_missing_or_the_same(unit: str | None, other: str | None) -> None:
+def test_values_are_taken_as_they_are_where_unit_is_missing_or_same(unit: str | None, other: str | None) -> None:
     assert compared(side([1.0], unit, "a"), side([1.0], other, "b"), ["a.u"]).equal
 
 
@@ -290,7 +290,7 @@ def pendulum(**options: Any) -> Result:  # noqa: ANN401  as `Mesh.run` has them
     return mesh.run(**{"stop_time": 1.0, "record": "memory", "processes": False, **options})
 
 
-def test_a_run_is_equal_to_itself_and_its_first_difference_has_its_point() -> None:
+def test_run_is_equal_to_itself_and_its_first_difference_has_its_point() -> None:
     one = pendulum()
     other = pendulum(start_values={"delay.d": 0.5})
 

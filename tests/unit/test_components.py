@@ -57,7 +57,7 @@ class Everything(Component):
         self.m = self.table
 
 
-def test_a_type_checker_sees_the_types_of_values_and_a_component_has_its_start_values() -> None:
+def test_type_checker_sees_types_of_values_and_component_has_its_start_values() -> None:
     own = Everything()
 
     assert_type(own.gain, float)
@@ -324,7 +324,7 @@ def test_a_state_is_restored_as_often_as_needed(tmp_path: Path) -> None:
         assert [bench.step(1, u=2.0), bench.step(2, u=3.0)] == after == [3.0, 6.0]
 
 
-def test_a_component_whose_attributes_cannot_be_copied_says_so_or_has_its_own_state(tmp_path: Path) -> None:
+def test_a_component_whose_attributes_cannot_be_copied_is_refused_or_helps_itself(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "Locked")
     bench.start()
     with pytest.raises(FmuError, match=r"instance c.*TypeError: cannot pickle"):
@@ -461,7 +461,7 @@ def test_an_interpreter_is_looked_for_beside_the_configuration(interpreter: str,
     assert PythonConfig(python="c.py:C", interpreter=interpreter).located(Path("/folder")).interpreter == found
 
 
-def test_a_class_of_a_file_is_named_by_it_and_described_without_another_process() -> None:
+def test_class_of_file_is_named_by_it_and_described_without_another_process() -> None:
     keys, description = component_section(Everything)
 
     assert keys == {"python": f"{Path(__file__).resolve()}:Everything"}
@@ -507,7 +507,7 @@ def test_only_the_thread_that_imports_a_component_is_refused_a_run(tmp_path: Pat
     instance.close()
 
 
-def test_runs_in_one_process_that_overlap_limit_the_threads_of_libraries_until_the_last_one_ends() -> None:
+def test_overlapping_local_runs_limit_threads_until_the_last_one_ends() -> None:
     def threads() -> set[int]:
         return {library["num_threads"] for library in threadpoolctl.threadpool_info()}
 

@@ -91,7 +91,7 @@ MOTOR = "actuators: [{name: m, joint: hip, instance: motor}]"
 PID = "controllers: [{name: c, joint: hip, instance: pid}]"
 
 
-def test_an_actuator_reads_its_joint_one_point_late_and_drives_it_at_once() -> None:
+def test_actuator_reads_its_joint_one_point_late_and_drives_it_at_once() -> None:
     assert shown(MOTOR) == [
         "world.hip.position -> motor.jointPosition 1",
         "world.hip.velocity -> motor.jointVelocity 1",

@@ -32,7 +32,7 @@ def write(path: Path, times: list[float], reals: list[float]) -> None:
         assert file.rows == count
 
 
-def test_a_row_is_the_time_and_the_values_as_short_as_they_read_back(tmp_path: Path) -> None:
+def test_a_row_is_time_and_values_as_short_as_they_read_back(tmp_path: Path) -> None:
     write(tmp_path / "a.csv", [0.0, 0.1, 1e-7, 1e15], [1.0, 0.1 + 0.2, -0.0, 5e-324])
 
     assert (tmp_path / "a.csv").read_text().splitlines() == [
@@ -56,7 +56,7 @@ def test_numbers_that_json_does_not_have_are_written_as_python_reads_them(tmp_pa
 
 
 @pytest.mark.parametrize("others", [[], [("p.n", "Int32")]])
-def test_every_float_reads_back_with_the_same_bits_and_is_as_short_as_repr(
+def test_every_float_reads_back_exactly_and_is_as_short_as_repr(
     tmp_path: Path, others: list[tuple[str, VariableType]]
 ) -> None:
     bits = np.random.default_rng(1).integers(0, 2**64, size=(3, 5_000), dtype=np.uint64)
@@ -163,7 +163,7 @@ def test_every_look_at_the_file_while_it_is_written_shows_whole_rows(tmp_path: P
         assert file.kept.rows > 0
 
 
-def test_what_a_full_disk_leaves_ends_with_a_whole_row_and_nothing_follows_when_there_is_room_again(
+def test_after_a_full_disk_a_file_ends_with_a_complete_row(
     tmp_path: Path,
 ) -> None:
     """The limit for the size of a file is the disk that a test can fill."""

@@ -34,7 +34,7 @@ def test_a_short_history_has_every_value() -> None:
     assert _points(curve.since(0)) == {*zip(times.tolist(), values.tolist(), strict=True)}
 
 
-def test_a_long_history_has_the_smallest_and_the_largest_values_and_no_more_intervals() -> None:
+def test_a_long_history_has_smallest_and_largest_values_and_no_more_intervals() -> None:
     curve = BoundedCurve(0.0, 1e-3)
     times = np.arange(1_000_000, dtype=np.float64) * 1e-3
     values = np.sin(times)

@@ -111,7 +111,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize(("write", "alter"), KINDS)
-def test_what_is_in_the_files_of_a_model_counts_and_where_they_lie_does_not(
+def test_the_files_of_a_model_count_by_content_and_not_by_place(
     tmp_path: Path, write: Callable[[Path], None], alter: Callable[[Path], None]
 ) -> None:
     if write in (mujoco, urdf):

@@ -121,7 +121,7 @@ def test_compose_has_a_router_a_node_per_instance_and_a_master(
     assert commands["master"][0] == "master"
 
 
-def test_the_router_is_the_official_image_of_the_series_that_the_nodes_speak(compose: dict[str, Any]) -> None:
+def test_the_router_is_the_official_image_of_the_series_that_nodes_speak(compose: dict[str, Any]) -> None:
     image, _, version = compose["services"]["router"]["image"].partition(":")
     pins = (DOCKER / "constraints.txt").read_text(encoding="utf-8")
 

@@ -36,7 +36,7 @@ def status(point: int) -> MeshStatus:
     )
 
 
-def test_a_master_whose_launcher_reads_nothing_goes_on_and_keeps_the_newest_status_and_the_end() -> None:
+def test_a_master_whose_launcher_reads_nothing_keeps_the_newest_status_and_end() -> None:
     reading, writing = os.pipe()
     fill(writing)
     emit = EventWriter(writing)

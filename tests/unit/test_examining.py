@@ -142,7 +142,7 @@ def config_with(path: Path, **more: object) -> Path:
 
 
 @pytest.mark.parametrize(("change", "says"), ODD)
-def test_what_is_odd_is_a_problem_of_the_description_and_an_error_where_the_configuration_is_strict(
+def test_an_oddity_is_a_problem_and_an_error_in_a_strict_configuration(
     change: tuple[str, str], says: str, tmp_path: Path
 ) -> None:
     def changed(text: str) -> str:
@@ -199,7 +199,7 @@ def test_the_limits_of_the_configuration_hold(tmp_path: Path) -> None:
         prepare(file)
 
 
-def test_a_model_for_the_other_kind_only_is_refused_with_the_way_out(tmp_path: Path) -> None:
+def test_a_model_for_the_other_kind_only_is_refused_with_way_out(tmp_path: Path) -> None:
     path = repacked(tmp_path / "odd.fmu", description=lambda text: text.replace("CoSimulation", "ModelExchange"))
 
     with pytest.raises(LoadFailed, match="is for model exchange only, not for co-simulation") as refused:

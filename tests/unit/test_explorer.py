@@ -53,7 +53,7 @@ def is_possible(*programs: Program, machine: Machine) -> bool:
         (WEAK, RELAXED, None, SEQ_CST, True),
     ],
 )
-def test_two_threads_that_write_and_then_read_may_miss_each_other_only_without_an_order(
+def test_two_threads_that_write_then_read_need_an_order_to_meet(
     machine: Machine, written: Order, between: Op | None, read: Order, *, possible: bool
 ) -> None:
     left = writes_and_reads(store(X, 1, written), between, load(Y, read), LEFT)

@@ -114,7 +114,7 @@ def test_the_schema_has_the_section_of_another_package(place: Place) -> None:
     assert "Between two rows" in definitions["TableConfig"]["properties"]["between"]["description"]
 
 
-def test_an_unknown_field_in_the_section_of_another_package_has_the_usual_finding(place: Place, mesh: Path) -> None:
+def test_an_unknown_field_in_the_section_of_another_package_has_usual_finding(place: Place, mesh: Path) -> None:
     changed(mesh, "between: linear", "between_: linear")
     assert (
         "mesh.yaml:4: instances.wave.between_: an unknown key; expected one of table, between, start_values, "
@@ -129,7 +129,7 @@ def test_a_slip_in_the_key_of_another_package_is_suggested(place: Place, mesh: P
     )
 
 
-def test_a_model_that_another_package_cannot_read_is_a_finding_about_the_file(place: Place, mesh: Path) -> None:
+def test_a_model_that_another_package_cannot_read_is_a_finding_about_file(place: Place, mesh: Path) -> None:
     changed(mesh, "steps: {table: wave", "steps: {table: waves")
     told = findings(place.run("check", mesh))
     assert "mesh.yaml:5: instances.steps.table: the table" in told
@@ -210,7 +210,7 @@ def test_other_packages_are_looked_for_only_where_a_key_is_not_ours(monkeypatch:
 
 
 @pytest.mark.usefixtures("forgotten")
-def test_an_installation_that_is_older_than_its_source_is_told_how_to_install_again(
+def test_installation_older_than_its_source_is_told_how_to_install_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(plugins, "_FILE", "no_such_package-*.dist-info/entry_points.txt")

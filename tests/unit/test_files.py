@@ -18,7 +18,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_stays_as_it_is_until_the_first_bytes_and_is_the_same_file_afterwards(tmp_path: Path) -> None:
+def test_a_file_stays_until_the_first_bytes_and_remains_the_same_file(tmp_path: Path) -> None:
     path, other, link = tmp_path / "a.csv", tmp_path / "hard", tmp_path / "soft"
     path.write_bytes(OLD)
     path.chmod(0o640)

@@ -86,7 +86,7 @@ def test_other_types_than_real_have_to_be_equal() -> None:
     assert point.update([True, 4, 0.5])
 
 
-def test_a_residual_that_does_not_end_is_told_for_each_connection_that_is_off() -> None:
+def test_residual_that_does_not_end_is_told_for_each_connection_off() -> None:
     point = FixedPoint(loop([0.0, False]), InitializationConfig(iterations=1))
 
     with pytest.raises(LoopNotConverged, match=r"residuals: b.y1 -> a.u1 \(from False to True\)"):

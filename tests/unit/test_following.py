@@ -21,7 +21,7 @@ AGAIN = cast("zenoh.Sample", SimpleNamespace(kind=zenoh.SampleKind.PUT))
 """What Zenoh tells a client a second time, now and then: that the token is there."""
 
 
-def test_a_mesh_that_is_announced_twice_has_not_ended_and_its_end_is_one(tmp_path: Path) -> None:
+def test_mesh_announced_twice_has_not_ended_and_its_end_is_one(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/mesh.sock"
     with open_session(Wiring(listen=(endpoint,))) as mesh, open_session(Wiring("client", connect=(endpoint,))) as tool:
         token = mesh.liveliness().declare_token(KEYS.master)

@@ -208,7 +208,7 @@ def test_an_initial_message_gives_the_values_of_its_level() -> None:
 
 
 @pytest.mark.parametrize(("step", "sent"), [(9, 0), (10, 11)], ids=["before", "at the end"])
-def test_rows_for_the_recorder_wait_for_more_rows_unless_no_more_will_come(step: int, sent: int) -> None:
+def test_rows_for_recorder_wait_for_more_rows_unless_no_more_will_come(step: int, sent: int) -> None:
     """Nothing wakes up a node that is done, so rows that wait there would delay the end of the run."""
     map_, places = map_memory(["left", MASTER], {"source": ("left", 1, LAYOUT, 16)})
     memory, place = HostMemory.private(map_, "left"), places["source"]

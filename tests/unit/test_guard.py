@@ -82,7 +82,7 @@ class Hanging:
         assert self._overruns.there.wait(DEADLINE_S)
 
 
-def test_a_call_that_meets_its_deadline_is_told_with_the_function_of_fmi(watch: CallWatch, overruns: Overruns) -> None:
+def test_a_call_that_meets_its_deadline_is_told_with_function_of_fmi(watch: CallWatch, overruns: Overruns) -> None:
     fmu = FmpyCalls(Hanging(overruns), "fmi2", {})
 
     with watch.calling("plant", InitializationFailed, "call", 0.05):
@@ -251,7 +251,7 @@ def test_a_call_that_sets_or_gets_values_has_its_name(tmp_path: Path, monkeypatc
     assert named == ["fmi2SetReal", "fmi2GetReal"]
 
 
-def test_threads_that_load_fmus_at_once_find_the_working_directory_as_it_was(tmp_path: Path) -> None:
+def test_threads_that_load_fmus_at_once_find_working_directory_as_it_was(tmp_path: Path) -> None:
     """FMPy changes the working directory while it loads a library, and the process has only one."""
     before, failures = Path.cwd(), list[Exception]()
     description = read_description(FMUS / "Gain.fmu")

@@ -85,7 +85,7 @@ def test_too_many_archives_in_one_another_are_refused(tmp_path: Path) -> None:
         ("broken.fmu", "'.*system.ssp/broken.fmu' is a damaged ZIP archive"),
     ],
 )
-def test_what_is_no_fmu_inside_an_archive_is_told_with_the_whole_path(name: str, says: str, tmp_path: Path) -> None:
+def test_what_is_no_fmu_inside_an_archive_is_told_with_whole_path(name: str, says: str, tmp_path: Path) -> None:
     data = GAIN.read_bytes()
     content: dict[str | zipfile.ZipInfo, bytes] = {
         "resources/a.fmu": data,
@@ -166,7 +166,7 @@ def test_limits_hold_for_every_archive_on_the_way(limits: LimitsConfig, says: st
     assert "raise `limits` in the configuration" in str(caught.value)
 
 
-def test_a_bomb_is_refused_in_every_archive_on_the_way_without_being_unpacked(tmp_path: Path) -> None:
+def test_a_bomb_is_refused_in_every_archive_on_way_without_being_unpacked(tmp_path: Path) -> None:
     zeros = bytes(65 * 2**20)
     bomb = package(tmp_path / "bomb.ssp", {"a.fmu": zeros})
     inner = package(tmp_path / "outer.ssp", {"b.fmu": package(tmp_path / "b.fmu", {"zeros": zeros}).read_bytes()})
@@ -187,7 +187,7 @@ def test_an_entry_that_holds_more_than_it_announces_is_refused(tmp_path: Path) -
         read_description(path / "a.fmu")
 
 
-def test_a_checksum_is_that_of_the_fmu_and_not_of_the_archive_around_it(tmp_path: Path) -> None:
+def test_a_checksum_is_that_of_fmu_and_not_of_archive_around_it(tmp_path: Path) -> None:
     path = package(tmp_path / "system.ssp") / "resources/a.fmu"
 
     assert read_description(path, Terms(sha256=sha256_of(GAIN))).model_name == "Gain"
@@ -197,7 +197,7 @@ def test_a_checksum_is_that_of_the_fmu_and_not_of_the_archive_around_it(tmp_path
         extract(path, tmp_path / "parent", Terms(content="0" * 64))
 
 
-def test_the_hash_of_an_inner_fmu_is_calculated_once_unless_the_archive_changes(
+def test_the_hash_of_an_inner_fmu_is_calculated_once_unless_archive_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     outer = package(tmp_path / "system.ssp")
@@ -257,7 +257,7 @@ def test_sources_inside_an_archive_are_compiled(tmp_path: Path, monkeypatch: pyt
     assert (folder / "binaries/linux64/Gain.so").is_file()
 
 
-def test_any_file_of_an_fmu_can_be_read_within_the_limit_of_descriptions(tmp_path: Path) -> None:
+def test_any_file_of_an_fmu_can_be_read_within_limit_of_descriptions(tmp_path: Path) -> None:
     outer = package(tmp_path / "system.ssp", {"a/table.txt": b"1,2", "large.txt": bytes(300)})
     (tmp_path / "folder" / "a").mkdir(parents=True)
     (tmp_path / "folder" / "a" / "table.txt").write_bytes(b"1,2")

@@ -55,7 +55,7 @@ def test_the_page_says_what_an_fmu_is(capsys: pytest.CaptureFixture[str]) -> Non
         assert f"{line}\n" in page
 
 
-def test_the_page_says_all_kinds_what_they_can_and_how_many_states_there_are(
+def test_the_page_says_what_all_kinds_support_and_counts_the_states(
     event_fmu: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = " ".join(inspected(capsys, event_fmu("Ball", 3)).split())
@@ -89,7 +89,7 @@ def test_the_json_has_everything(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_a_page_about_a_thousand_variables_is_short_and_keeps_to_the_width(
+def test_a_page_about_a_thousand_variables_is_short_and_keeps_to_width(
     width: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
@@ -106,7 +106,7 @@ def test_a_page_about_a_thousand_variables_is_short_and_keeps_to_the_width(
     assert len(inspected(capsys, path, "--all").splitlines()) > 1000
 
 
-def test_variables_are_found_by_name_and_an_unknown_one_is_told_with_the_nearest(
+def test_variables_are_found_by_name_and_unknown_one_is_told_with_nearest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = many_variables(tmp_path / "many.fmu", 30)

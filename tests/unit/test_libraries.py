@@ -115,14 +115,14 @@ def test_of_several_libraries_with_other_names_none_is_taken(tmp_path: Path) -> 
     )
 
 
-def test_a_library_with_the_right_name_is_taken_among_others_and_is_no_problem(tmp_path: Path) -> None:
+def test_library_with_right_name_is_taken_among_others_and_is_no_problem(tmp_path: Path) -> None:
     description = read_description(renamed(tmp_path / "right.fmu", "Gain.so", "solver.so"))
 
     assert description.library == "binaries/linux64/Gain.so"
     assert description.problems == ()
 
 
-def test_inspect_shows_the_only_library_as_a_problem_of_an_fmu_that_runs(
+def test_inspect_shows_only_library_as_a_problem_of_an_fmu_that_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fmu = renamed(tmp_path / "odd.fmu", "exported_v2.so", description=without_identifier)
@@ -136,7 +136,7 @@ def test_inspect_shows_the_only_library_as_a_problem_of_an_fmu_that_runs(
     assert "The attribute 'modelIdentifier' is required but missing" in page
 
 
-def test_an_fmu_without_model_identifier_and_library_is_shown_and_refused_with_the_reason(
+def test_fmu_without_model_identifier_and_library_is_shown_and_refused_with_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fmu = renamed(tmp_path / "odd.fmu", description=without_identifier)
@@ -168,7 +168,7 @@ KINDS = [
 
 @pytest.mark.parametrize("command", ["inspect", "check", "launch"])
 @pytest.mark.parametrize(("name", "instead", "says"), KINDS)
-def test_an_fmu_that_is_of_no_kind_that_runs_is_told_what_it_is(
+def test_fmu_of_no_kind_that_runs_is_told_what_it_is(
     name: str, instead: str, says: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def changed(text: str) -> str:

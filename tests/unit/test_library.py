@@ -60,7 +60,7 @@ def built_by_the_pinned_compiler() -> bool:
 needs_the_compiler = pytest.mark.skipif(not built_by_the_pinned_compiler(), reason="`make library` installs ziglang")
 
 
-def test_the_library_in_the_tree_was_built_from_the_sources_in_the_tree() -> None:
+def test_the_library_in_the_tree_was_built_from_the_sources_in_tree() -> None:
     assert build_library.manifest().encode() in LIBRARY.read_bytes(), "make library"
 
 
@@ -138,7 +138,7 @@ def test_a_variable_of_the_environment_switches_the_library_off(monkeypatch: pyt
     assert not library_missed()
 
 
-def test_on_a_platform_that_was_never_tried_a_library_is_used_only_if_it_is_named(
+def test_on_platform_never_tried_library_is_used_only_if_it_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     named = tmp_path / "named.so"
@@ -182,7 +182,7 @@ def test_a_library_of_somebody_else_is_an_error(monkeypatch: pytest.MonkeyPatch)
         load_library()
 
 
-def test_a_library_of_older_sources_is_an_error_that_says_how_to_build_it(clone: Path) -> None:
+def test_library_of_older_sources_is_error_that_says_how_to_build_it(clone: Path) -> None:
     with (clone / "fmu_mesh" / "rings" / "burst.c").open("a") as source:
         source.write("/* changed */\n")
     command = [sys.executable, "-m", "fmu_mesh", "launch", str(write_config(clone))]
@@ -255,7 +255,7 @@ def test_a_wheel_that_is_built_on_another_system_has_no_library(
 
 
 @pytest.mark.parametrize("change", ["missing", "stale"])
-def test_no_wheel_is_built_with_a_library_that_is_not_that_of_its_sources(clone: Path, change: str) -> None:
+def test_no_wheel_is_built_with_a_library_of_other_sources(clone: Path, change: str) -> None:
     if change == "missing":
         (clone / NAME).unlink()
     else:
@@ -274,7 +274,7 @@ def test_the_source_distribution_has_the_library_and_what_builds_it(tmp_path: Pa
 
 
 @pytest.mark.parametrize("chosen", [False, True], ids=["missing", "switched off"])
-def test_a_mesh_without_the_library_is_told_so_by_check_and_if_nobody_chose_it_by_launch(
+def test_a_mesh_without_the_library_is_reported_by_check_and_launch(
     clone: Path,
     chosen: bool,  # noqa: FBT001 a parameter of a test
 ) -> None:

@@ -39,7 +39,7 @@ def limited(mib: int, *arguments: str | Path) -> subprocess.CompletedProcess[str
     ],
     ids=lambda value: str(value) if isinstance(value, int) else " ".join(map(str, value[::2])),
 )
-def test_too_little_address_space_is_told_with_the_limit_and_the_way_out(
+def test_too_little_address_space_is_told_with_the_limit_and_way_out(
     mib: int, arguments: tuple[str | Path, ...]
 ) -> None:
     done = limited(mib, *arguments)

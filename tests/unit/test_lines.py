@@ -140,7 +140,7 @@ def test_columns_are_read_where_they_lie() -> None:
 
 
 @needs_library
-def test_a_value_that_holds_is_written_in_each_row_and_after_each_look() -> None:
+def test_value_that_holds_is_written_in_each_row_and_after_each_look() -> None:
     lines = NativeLines(3, 4)
     columns = [np.array([0.0, 1.0]), np.array([math.nan, math.nan]), np.array([-0.0, 0.0])]
 

@@ -283,7 +283,7 @@ TEXTS = [
     ),
     pytest.param(
         GOOD + "mesh: again\n",
-        "mesh.yaml:9: mesh: a second time, first in line 1; expected every key at most once",
+        "mesh.yaml:9: mesh: duplicate key (first in line 1)",
         id="a duplicate key",
     ),
     pytest.param(
@@ -351,7 +351,7 @@ def test_aliases_that_explode_are_refused() -> None:
     assert finding.found == "more than 200000 values"
 
 
-def test_all_findings_of_a_file_are_shown_in_the_order_of_the_lines() -> None:
+def test_all_findings_of_a_file_are_shown_in_the_order_of_lines() -> None:
     text = """\
 mesh: 1
 simulation: {stop_time: x, step_size: .inf, windows: 3}

@@ -114,7 +114,7 @@ def test_the_version_imports_this_much_of_the_package_and_little_else() -> None:
         (("--json", "launch", "a.yaml"), "It comes after the command: `fmu-mesh launch --json`."),
     ],
 )
-def test_a_wrong_usage_is_an_object_for_programs_and_a_sentence_for_people(
+def test_a_wrong_usage_is_an_object_for_programs_and_sentence_for_people(
     arguments: Sequence[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = main(arguments)

@@ -165,7 +165,7 @@ def test_all_functions_are_called_in_their_order_on_their_memory(kind: StepKind)
         ("get_real", 4, Stage.GETTING, 4, 0),
     ],
 )
-def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage(
+def test_first_status_above_warning_ends_step_and_is_told_with_its_stage(
     kind: StepKind, name: str, status: int, stage: Stage, calls: int, number: int | None
 ) -> None:
     recorded = Recorded(kind, **{name: status})
@@ -177,7 +177,7 @@ def test_the_first_status_above_warning_ends_the_step_and_is_told_with_its_stage
 
 
 @pytest.mark.parametrize("flag", [0, 1, 2])
-def test_a_step_of_fmi_3_ends_where_the_fmu_says_more_than_its_status(flag: int) -> None:
+def test_step_of_fmi_3_ends_where_fmu_says_more_than_its_status(flag: int) -> None:
     recorded = Recorded(StepKind.FMI3)
     recorded.flag = flag
 
@@ -188,7 +188,7 @@ def test_a_step_of_fmi_3_ends_where_the_fmu_says_more_than_its_status(flag: int)
 
 
 @pytest.mark.parametrize("kind", DO_STEP)
-def test_a_step_that_ends_where_python_is_needed_or_later_is_left_to_it_with_its_inputs(kind: StepKind) -> None:
+def test_a_step_with_events_is_left_to_python_with_its_inputs(kind: StepKind) -> None:
     recorded = Recorded(kind)
     given, taken = ctypes.c_double(0.7), ctypes.c_double()
     move = Move(RowBase.FIXED, ctypes.addressof(given), RowBase.FIXED, ctypes.addressof(taken), 1, factor=1.0)
@@ -302,7 +302,7 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
         ("AllTypes1", "integer_in", "integer_opposite", -(2**31), "-2147483648 has no opposite in its type"),
     ],
 )
-def test_a_number_that_the_type_of_the_fmu_cannot_hold_is_told_with_its_variable(
+def test_number_that_type_of_fmu_cannot_hold_is_told_with_its_variable(
     model: str, given: str, read: str, value: int, says: str, way: str, tmp_path: Path
 ) -> None:
     with closing(opened(find_fmu(model, tmp_path), tmp_path)) as instance:
@@ -411,7 +411,7 @@ def stairs(tmp_path: Path) -> Iterator[Callable[..., tuple[FmuInstance, Ring]]]:
         instance.close()
 
 
-def test_a_node_gives_the_steps_with_time_events_to_python_and_takes_all_others(
+def test_node_gives_steps_with_time_events_to_python_and_takes_all_others(
     stairs: Callable[..., tuple[FmuInstance, Ring]],
 ) -> None:
     instance, outputs = stairs(3, period=0.5)
@@ -429,7 +429,7 @@ def test_a_node_gives_the_steps_with_time_events_to_python_and_takes_all_others(
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_after_the_last_step_that_an_fmu_wants_a_node_hears_that_it_ends(
+def test_after_last_step_that_an_fmu_wants_node_hears_that_it_ends(
     version: Version, stairs: Callable[..., tuple[FmuInstance, Ring]]
 ) -> None:
     instance, outputs = stairs(version, period=1.0, end=2)

@@ -100,7 +100,7 @@ def answer(observation: Sequence[float]) -> float:
     ],
     ids=str,
 )
-def test_a_dynamic_batch_is_one_and_leading_dimensions_of_one_are_left_out(
+def test_dynamic_batch_is_one_and_leading_dimensions_of_one_are_left_out(
     sizes: list[int | str | None], shape: tuple[int, ...], tmp_path: Path
 ) -> None:
     variables = variables_of(write_identity(tmp_path / "it.onnx", "DOUBLE", sizes))
@@ -147,7 +147,7 @@ def test_a_value_of_every_type_goes_through(kind: str, taken: str, given: str, v
     assert stepped.instance.get_values(["y"]) == [[value, value]]
 
 
-def test_a_float64_is_rounded_by_the_model_and_kept_as_it_is_outside(tmp_path: Path) -> None:
+def test_a_float64_is_rounded_by_model_and_kept_as_it_is_outside(tmp_path: Path) -> None:
     stepped = Stepped(opened(write_identity(tmp_path / "it.onnx")))
 
     stepped.step(0, x=0.1)
@@ -215,7 +215,7 @@ def _keeper(instance: Instance) -> KeepsState:
     return instance  # type: ignore[return-value]  # as its description says
 
 
-def test_a_model_is_computed_on_one_thread_and_nothing_is_sent_or_left_elsewhere(tmp_path: Path) -> None:
+def test_a_model_is_computed_on_one_thread_and_sends_nothing(tmp_path: Path) -> None:
     random = np.random.default_rng(1)
     constants = {"w": random.standard_normal((2000, 2000)).astype(np.float32)}
     sizes = {"x": ("FLOAT", [1, 2000])}
@@ -250,7 +250,7 @@ print(len(os.listdir("/proc/self/task")) - before)
 # ---- failing
 
 
-def test_an_input_that_is_no_number_fails_even_where_the_model_hides_it(tmp_path: Path) -> None:
+def test_an_input_that_is_no_number_fails_even_where_model_hides_it(tmp_path: Path) -> None:
     sizes = {"x": ("FLOAT", [3])}
     path = write_model(tmp_path / "relu.onnx", [("Relu", ["x"], ["y"])], sizes, {"y": ("FLOAT", [3])})
 

@@ -190,7 +190,7 @@ def test_arrays_are_arrays_of_the_caller(tmp_path: Path) -> None:
             system.set("it.float64_array_in[1,1]", 1.0)
 
 
-def test_a_slower_instance_uses_a_value_in_the_step_that_is_not_complete_yet(tmp_path: Path) -> None:
+def test_a_slower_instance_uses_value_in_step_that_is_not_complete_yet(tmp_path: Path) -> None:
     instances = {"slow": {"fmu": "Integrator", "step_size": 0.004}, "gain": {"fmu": "Gain"}}
     with opened(tmp_path, instances=instances, connections=["slow.y -> gain.u"]) as system:
         system.step(3)
@@ -217,7 +217,7 @@ def test_a_state_holds_what_was_set(system: System) -> None:
         assert system.get("free.y") == 3.0
 
 
-def test_what_follows_from_a_value_that_was_set_is_back_with_the_state(tmp_path: Path) -> None:
+def test_what_follows_from_a_value_that_was_set_is_back_with_state(tmp_path: Path) -> None:
     controller = {"controller": "position_pid", "start_values": {"p": 2.0}}
     config = write_config(tmp_path, **PENDULUM_AND_GAIN)
     content = yaml.safe_load(config.read_text(encoding="utf-8"))
@@ -369,7 +369,7 @@ def test_each_thread_may_have_a_system_of_its_own(tmp_path: Path, temporary: Pat
     assert not list(temporary.iterdir())
 
 
-def test_a_failed_step_has_instance_point_and_time_and_only_close_is_allowed(
+def test_failed_step_has_instance_point_and_time_and_only_close_is_allowed(
     tmp_path: Path, faulty: Path, temporary: Path
 ) -> None:
     instances = {
@@ -403,7 +403,7 @@ def test_what_cannot_be_opened_leaves_nothing_behind(tmp_path: Path, faulty: Pat
     assert failed.value.instance == "faulty"
 
 
-def test_an_fmu_that_asks_to_end_ends_the_steps_but_not_the_looking(tmp_path: Path, event_fmu: EventFmu) -> None:
+def test_an_fmu_that_asks_to_end_ends_the_steps_but_not_looking(tmp_path: Path, event_fmu: EventFmu) -> None:
     stairs = {"fmu": str(event_fmu("Stairs", 3)), "start_values": {"period": 0.125, "end": 3}}
     instances = {"stairs": stairs, "free": {"fmu": "Gain"}}
     with opened(tmp_path, instances=instances, connections=[]) as system:
@@ -422,7 +422,7 @@ def test_an_fmu_that_asks_to_end_ends_the_steps_but_not_the_looking(tmp_path: Pa
         assert (system.point, system.get("stairs.counter")) == (200, 1)
 
 
-def test_ctrl_c_ends_a_step_and_the_system_can_go_back_to_a_state(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_step_and_system_can_go_back_to_state(tmp_path: Path) -> None:
     with opened(tmp_path, stop_time=None) as system:
         system.step(50)
         angle, state = system.get("pendulum.a"), system.save()

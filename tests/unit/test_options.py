@@ -174,7 +174,7 @@ def test_options_that_are_not_given_leave_the_configuration_as_it_is() -> None:
     assert with_options(plain, PlanOptions()) == plain
 
 
-def test_a_value_that_its_key_does_not_allow_is_a_finding_that_names_the_option() -> None:
+def test_value_that_its_key_does_not_allow_is_finding_that_names_option() -> None:
     assert replaced(PlanOptions(update_period=-1.0, catch_up=np.float64(-2.0)))[1] == [
         "one.yaml: `update_period=-1.0`: -1.0; expected a finite number >= 0",
         "one.yaml: `catch_up=-2.0`: -2.0; expected a finite number >= 0 or null",
@@ -217,7 +217,7 @@ def test_any_key_is_replaced_by_its_path() -> None:
         ("instances.gain.start_values.k", "a start value; expected `start_values={'gain.k': 2}`"),
     ],
 )
-def test_a_key_that_cannot_be_replaced_is_a_finding_that_names_the_option(path: str, words: str) -> None:
+def test_a_key_that_cannot_be_replaced_is_a_finding_that_names_option(path: str, words: str) -> None:
     plain = with_options(
         read_text(f"{TEXT}connections: [a.y -> b.u]\n", Path("one.yaml")), PlanOptions(config_values={path: 2})
     )

@@ -46,7 +46,7 @@ def mesh(**parts: Any) -> fmu_mesh.Mesh:  # noqa: ANN401  as above
     return fmu_mesh.Mesh.from_configuration(package(**parts))
 
 
-def test_a_finding_about_a_start_value_has_the_file_and_the_line_in_which_it_was_written() -> None:
+def test_a_finding_about_a_start_value_has_its_file_and_line() -> None:
     check = mesh(start_values={"k": "two", "kk": 1.0}).check()
 
     assert [(one.file, one.line, one.path) for one in check.findings] == [
@@ -97,7 +97,7 @@ def test_check_shows_where_each_start_value_was_written() -> None:
     assert (origins["u"].file, origins["u"].line, origins["u"].text) == (None, None, "`start_values={'gain.u': 4.0}`")
 
 
-def test_a_value_that_the_scenario_prescribes_from_the_start_is_that_of_the_scenario() -> None:
+def test_a_value_that_the_scenario_prescribes_from_start_is_that_of_scenario() -> None:
     made = mesh(start_values={"u": 1.0})
     made.scenario({"gain.k": 5.0, "gain.u": {"times": [0.5, 1.0], "values": [1.0, 2.0]}})
 
@@ -122,7 +122,7 @@ def test_warnings_of_the_file_are_warnings_of_the_mesh() -> None:
 
 
 @pytest.mark.parametrize("given", [{}, {"start_time": 1.0}], ids=["no key", "another key"])
-def test_what_the_package_does_not_say_is_asked_for_by_name_and_once(given: dict[str, Any]) -> None:
+def test_what_package_does_not_say_is_asked_for_by_name_and_once(given: dict[str, Any]) -> None:
     check = mesh(simulation=given, needed=NEEDED).check()
 
     assert [str(one) for one in check.findings] == [
@@ -161,9 +161,7 @@ def test_a_key_that_is_set_by_its_path_is_there_as_well() -> None:
         ({"algorithm": "jacobi", "step_size": 0.3}, "`stop_time=1.0`: 1 s between start_time and stop_time"),
     ],
 )
-def test_a_wrong_value_of_such_an_option_is_one_finding_that_names_the_option(
-    options: dict[str, Any], says: str
-) -> None:
+def test_a_wrong_value_of_such_option_is_one_finding_that_names_option(options: dict[str, Any], says: str) -> None:
     check = mesh(simulation={}, needed=NEEDED).check(stop_time=1.0, **options)
 
     assert len(check.findings) == 1
@@ -209,7 +207,7 @@ def test_a_section_that_is_no_mapping_stays_the_error_that_it_is(tmp_path: Path)
     assert [(one.path, one.found) for one in findings] == [("simulation", "3")]
 
 
-def test_an_option_and_another_one_for_the_same_key_do_not_go_together(tmp_path: Path) -> None:
+def test_an_option_and_another_one_for_same_key_do_not_go_together(tmp_path: Path) -> None:
     path = tmp_path / "bare.yaml"
     path.write_text(YAML, encoding="utf-8")
     options = {"step_size": 0.1, "stop_time": 1.0, "config_values": {"simulation.step_size": 0.2}}

@@ -45,7 +45,7 @@ def test_without_a_factor_nothing_is_held_back(tmp_path: Path, wall: Wall) -> No
     assert wall.now == 100.0
 
 
-def test_a_step_may_be_taken_when_the_wall_clock_is_at_its_start(tmp_path: Path, wall: Wall) -> None:
+def test_a_step_may_be_taken_when_wall_clock_is_at_its_start(tmp_path: Path, wall: Wall) -> None:
     paced = pacer(tmp_path, 2.0)
 
     assert paced.limit(1000, 0) == (1, 0.25)
@@ -98,16 +98,14 @@ def test_a_run_that_keeps_up_has_no_overruns(tmp_path: Path, wall: Wall) -> None
 @pytest.mark.parametrize(
     ("points_per_s", "expected"), [(10.0, 1024), (20_000.0, 1024), (50_000.0, 2500), (1_000_000.0, 50_000)]
 )
-def test_the_grant_reaches_as_far_as_50_ms_at_the_speed_of_late_or_1024_points(
-    points_per_s: float, expected: int
-) -> None:
+def test_the_grant_reaches_50_ms_at_the_present_speed_or_1024_points(points_per_s: float, expected: int) -> None:
     reach = Reach(4096)
     reach.points(0, 1000.0)
 
     assert reach.points(round(points_per_s), 1001.0) == expected
 
 
-def test_a_fast_start_is_not_held_up_until_the_speed_is_measured_the_next_time() -> None:
+def test_fast_start_is_not_held_up_until_speed_is_measured_next_time() -> None:
     reach = Reach(4096)
 
     assert reach.points(0, 1000.0) == 1024

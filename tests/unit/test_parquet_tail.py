@@ -57,7 +57,7 @@ def _numbers(tail: ParquetTail) -> list[float]:
     return numbers
 
 
-def test_rows_come_once_while_the_file_grows_and_none_is_missing_at_its_end(path: Path) -> None:
+def test_rows_come_once_while_the_file_grows_and_none_is_missing(path: Path) -> None:
     file = _begun(path)
     _add(file, 0, 2)
     tail = _opened(path)

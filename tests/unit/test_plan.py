@@ -41,7 +41,7 @@ def test_a_delay_that_is_set_closes_the_cycle_alone() -> None:
     assert plan.order == ("b", "c", "a")
 
 
-def test_an_algebraic_loop_is_refused_with_the_instances_on_it_and_its_place() -> None:
+def test_an_algebraic_loop_is_refused_with_instances_on_it_and_its_place() -> None:
     connections = ("x -> a", "a -> b (delay 0)", "b -> c (delay 0)", "c -> a (delay 0)")
 
     with pytest.raises(ConfigurationError) as caught:
@@ -138,7 +138,7 @@ def test_the_automatic_window_of_many_instances_is_smaller() -> None:
 
 
 @pytest.mark.parametrize("window", [1, 4, 5, 12, 13, 100, 1024])
-def test_a_ring_has_a_power_of_two_of_rows_and_some_to_spare(window: int) -> None:
+def test_a_ring_has_power_of_two_of_rows_and_some_to_spare(window: int) -> None:
     rows = rows_for(window)
 
     assert rows & (rows - 1) == 0

@@ -62,7 +62,7 @@ def legend_of(axes: Axes) -> list[str]:
 
 @pytest.mark.skipif(shutil.which("prlimit") is None, reason="needs prlimit")
 @pytest.mark.parametrize("format_", ["png", "svg", "pdf"])
-def test_a_plot_for_which_the_disk_has_no_room_leaves_the_last_one(results: Path, format_: str) -> None:
+def test_a_plot_for_which_the_disk_has_no_room_leaves_last_one(results: Path, format_: str) -> None:
     plot = results.with_suffix(f".{format_}")
     plot.write_bytes(b"the last one")
     python = [sys.executable, "-B"]  # otherwise half of a module stays in its cache
@@ -246,7 +246,7 @@ def with_unit(plan: Plan, instance: str, name: str, unit: str) -> Plan:
     return replace(plan, system=replace(plan.system, instances={**plan.system.instances, instance: own}))
 
 
-def test_what_an_fmu_only_passes_on_shares_the_axes_of_what_it_gets(tmp_path: Path) -> None:
+def test_what_an_fmu_only_passes_on_shares_axes_of_what_it_gets(tmp_path: Path) -> None:
     drawn = plotted(prepare(CONFIGS / "pendulum_delay.yaml"), tmp_path)
 
     assert drawn.count(" in rad -->") == 1

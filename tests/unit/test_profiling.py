@@ -66,7 +66,7 @@ def slow_controller() -> MeshProfile:
     )
 
 
-def test_the_table_has_a_row_for_every_unit_and_the_path_leads_to_the_node_that_sets_the_pace(plan: Plan) -> None:
+def test_the_table_has_every_unit_and_the_path_finds_the_slowest_node(plan: Plan) -> None:
     page = "\n".join(profile_page(plan, slow_controller()))
 
     assert (
@@ -142,7 +142,7 @@ def test_what_the_time_lines_leave_out_is_said(plan: Plan) -> None:
     )
 
 
-def test_the_trace_has_one_process_per_node_and_slices_that_follow_one_another(plan: Plan) -> None:
+def test_trace_has_one_process_per_node_and_slices_that_follow_one_another(plan: Plan) -> None:
     document = json.loads(json.dumps(trace(plan, slow_controller(), seconds=1.25)))
 
     events = document["traceEvents"]
@@ -203,7 +203,7 @@ def test_the_time_of_a_grant_belongs_to_what_held_it() -> None:
     watch = GrantWatch()
 
     for holder in ("a", "a", "b", None, "a"):
-        watch.look(holder)
+        watch.note(holder)
 
     assert set(watch.held_s) == {"a", "b"}
     assert all(seconds >= 0.0 for seconds in watch.held_s.values())

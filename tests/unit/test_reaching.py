@@ -21,7 +21,7 @@ def reachable(silent: frozenset[str]) -> tuple[Meshes, Any]:
     return Meshes((), 1.0), question
 
 
-def test_a_mesh_that_is_lost_meanwhile_keeps_nobody_from_the_answers_of_the_others() -> None:
+def test_a_mesh_that_is_lost_meanwhile_keeps_nobody_from_answers_of_others() -> None:
     meshes, question = reachable(frozenset({"two"}))
     clients: Any = ["one", "two", "three"]
 

@@ -143,7 +143,7 @@ def test_a_buffer_of_single_values_writes_all_files() -> None:
     assert buffer.counted == (("a.csv", 7), ("b.csv", 3))
 
 
-def test_a_buffer_whose_disk_gets_full_keeps_the_rows_of_the_other_files() -> None:
+def test_a_buffer_whose_disk_gets_full_keeps_the_rows_of_other_files() -> None:
     files = [ListFile("a.csv", room=2), ListFile("b.csv")]
     buffer = RowBuffer(files, GRID, [RecordPlan(file.path.name, (("i", "x"),)) for file in files], ["Float64"])
     for point in range(4):

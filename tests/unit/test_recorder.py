@@ -111,7 +111,7 @@ def assert_has_ended(recorder: Recorder) -> None:
     assert len(Path(recorder.files[0][0]).read_text().splitlines()) == 1 + ROWS
 
 
-def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
+def test_a_waiting_recorder_ends_with_a_failed_run_and_writes_its_rows(
     mesh: Mesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_REST_S", DEADLINE_S)
@@ -127,7 +127,7 @@ def test_a_recorder_at_rest_ends_with_a_run_that_fails_and_writes_what_has_come(
     assert not mesh.reported.is_set()
 
 
-def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_more(mesh: Mesh) -> None:
+def test_recorder_that_reports_ends_with_master_that_takes_no_reports_any_more(mesh: Mesh) -> None:
     with suppress(MeshLost), Recorder(mesh.plan, mesh.session, [mesh.file()]) as recorder:
         mesh.put_rows()
         mesh.put(HEADER.pack(FINISH, 0, 0, 0))
@@ -138,7 +138,7 @@ def test_a_recorder_that_reports_ends_with_a_master_that_takes_no_reports_any_mo
 
 
 @pytest.mark.parametrize(("lost", "sends_last"), [("a, b", False), (None, True)])
-def test_a_recorder_waits_for_no_rows_of_a_node_that_is_lost_or_has_sent_its_last(
+def test_a_recorder_waits_for_no_rows_of_a_lost_or_finished_node(
     mesh: Mesh, monkeypatch: pytest.MonkeyPatch, *, lost: str | None, sends_last: bool
 ) -> None:
     monkeypatch.setattr(module, "_LAST_S", DEADLINE_S)

@@ -79,7 +79,7 @@ def test_only_our_own_entry_points_are_read_for_a_format_of_ours(monkeypatch: py
         result_format("a.table")
 
 
-def test_an_ending_that_nobody_offers_is_a_finding_that_lists_what_is_installed(
+def test_an_ending_that_nobody_offers_is_finding_that_lists_what_is_installed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], offer: Offer
 ) -> None:
     offer("tables", "table", "fmu_mesh.results.csv_file:CsvFile")
@@ -121,7 +121,7 @@ def test_a_format_of_ours_cannot_be_replaced(offer: Offer) -> None:
     assert result_format("a.csv") is CsvFile
 
 
-def test_an_installation_that_is_older_than_its_source_says_how_to_install_again() -> None:
+def test_installation_that_is_older_than_its_source_says_how_to_install_again() -> None:
     with pytest.raises(ConfigurationError, match="older than its source") as raised:
         plugins.plugin("fmu_mesh.not_yet", "csv")
 
@@ -142,7 +142,7 @@ def test_a_package_that_reads_a_file_at_once_is_still_understood(tmp_path: Path,
 
 
 @pytest.mark.parametrize(("noted", "rows"), [((2, 3), 2), ((2, 1000), 0), (None, 0)])
-def test_rows_of_a_killed_process_count_only_in_the_file_that_it_has_written(
+def test_rows_of_killed_process_count_only_in_file_that_it_has_written(
     tmp_path: Path, noted: tuple[int, int] | None, rows: int
 ) -> None:
     result = tmp_path / "a.csv"
@@ -161,7 +161,7 @@ def test_a_device_keeps_no_rows(tmp_path: Path) -> None:
     assert rows_left([os.devnull], tmp_path) == ((os.devnull, 0),)
 
 
-def test_what_follows_the_rows_that_are_known_is_no_more_than_what_is_told(tmp_path: Path) -> None:
+def test_no_more_rows_follow_the_known_rows_than_are_reported(tmp_path: Path) -> None:
     """The writer was killed after it wrote more than it had noted, perhaps within a row."""
     path = tmp_path / "killed"
     whole = b"time,a.x\n0.0,1.0\n0.5,2.0\n"

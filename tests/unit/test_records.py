@@ -59,7 +59,7 @@ def test_a_variable_of_any_causality_and_type_is_recorded_by_its_name() -> None:
     assert columns(str(names)) == names
 
 
-def test_what_several_patterns_and_a_name_stand_for_is_recorded_once_at_its_first_place() -> None:
+def test_what_several_patterns_match_is_recorded_once_at_its_first_place() -> None:
     assert columns("[delay.y, '*.a', 'p*.a', 'delay.*', pendulum.a, pendulum.l]") == [
         "delay.y",
         "pendulum.a",
@@ -143,7 +143,7 @@ def test_an_empty_list_records_nothing() -> None:
 @pytest.mark.parametrize(
     ("start", "first"), [(-1.0, 0), (0.0, 0), (0.05, 1), (0.1, 1), (0.3, 3), (0.30000001, 4), (1.0, 10)]
 )
-def test_the_first_row_is_that_of_the_first_point_that_is_not_before_its_time(start: float, first: int) -> None:
+def test_the_first_row_is_at_the_first_point_from_its_time_on(start: float, first: int) -> None:
     assert built(text(rest=f"record: {{from: {start}}}")).records[0].first == first
 
 

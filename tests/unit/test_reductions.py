@@ -124,7 +124,7 @@ def test_values_keep_their_types() -> None:
     assert type(value("max(a.y)", np.array([1, 2, 3, 4], np.float32))) is float
 
 
-def test_texts_and_bytes_have_a_first_a_last_and_a_value_at_a_time() -> None:
+def test_texts_and_bytes_have_a_first_a_last_and_value_at_time() -> None:
     texts, data = np.array(["p", "q", "r", "s"], object), np.array([b"\0", b"\1", b"\2", b"\xff"], object)
 
     assert [value(text, texts) for text in ("first(a.y)", "last(a.y)", "at(a.y, 0.5)")] == ["p", "s", "q"]

@@ -307,9 +307,7 @@ def test_nothing_may_be_recorded(tmp_path: Path) -> None:
 @ENGINES
 @RESETS
 @pytest.mark.usefixtures("_engine")
-def test_a_failed_run_ends_as_a_single_one_and_the_next_is_not_affected(
-    tmp_path: Path, faulty: Path, *, reset: bool
-) -> None:
+def test_a_failed_run_ends_as_single_one_and_next_is_not_affected(tmp_path: Path, faulty: Path, *, reset: bool) -> None:
     """The delay comes after the FMU that fails: within a burst it is behind."""
     config = write_config(
         tmp_path,
@@ -385,7 +383,7 @@ def test_an_fmu_may_ask_to_end_the_simulation(
 
 
 @RESETS
-def test_an_instance_that_cannot_be_made_is_told_and_the_next_run_makes_it(
+def test_instance_that_cannot_be_made_is_told_and_next_run_makes_it(
     tmp_path: Path, faulty: Path, *, reset: bool
 ) -> None:
     config = write_config(tmp_path, instances={"faulty": {"fmu": str(faulty)}}, connections=[])
@@ -585,7 +583,7 @@ def test_the_memory_stays_the_same(tmp_path: Path) -> None:
     assert after - before < 8 * 2**20
 
 
-def test_a_second_plan_of_a_mesh_reads_a_model_again_only_if_it_has_changed(tmp_path: Path) -> None:
+def test_second_plan_of_mesh_reads_model_again_only_if_it_has_changed(tmp_path: Path) -> None:
     fmu = repacked(tmp_path / "gain.fmu")
     mesh = fmu_mesh.load(write_config(tmp_path, instances={"gain": {"fmu": str(fmu)}}, connections=[]))
 

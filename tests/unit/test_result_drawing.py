@@ -84,7 +84,7 @@ def test_what_holds_is_drawn_in_steps() -> None:
     assert [line.get_drawstyle() for line in lines] == ["default", "steps-post", "steps-post"]
 
 
-def test_several_results_have_one_colour_per_variable_and_one_kind_of_line_per_result() -> None:
+def test_several_results_have_one_colour_per_variable_and_lines_per_result() -> None:
     one = result("one", {"a.x": TIMES, "a.y": TIMES * 2})
     two = result("two", {"a.x": TIMES + 1, "a.y": TIMES, "a.z": TIMES})
 

@@ -599,7 +599,7 @@ def test_a_draft_that_a_killed_run_has_left_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["result.parquet", "result.csv"])
-def test_a_run_of_an_fmu_of_all_types_gives_the_same_from_its_file_as_in_memory(tmp_path: Path, name: str) -> None:
+def test_a_run_of_all_types_gives_the_same_from_file_and_memory(tmp_path: Path, name: str) -> None:
     mesh = fmu_mesh.Mesh("types", step_size=0.1, stop_time=2.0)
     mesh.add("it", fmu=find_fmu("AllTypes3", tmp_path))
     memory = mesh.run(record="memory", processes=False)

@@ -76,7 +76,7 @@ def test_all_findings_of_a_scenario_stand_together_with_those_of_the_rest(tmp_pa
     assert [finding.line for finding in fmu_mesh.load(path).check().findings] == [5, 10, 10]
 
 
-def test_a_scenario_of_its_own_is_told_by_its_own_file_and_lines(tmp_path: Path) -> None:
+def test_scenario_of_its_own_is_told_by_its_own_file_and_lines(tmp_path: Path) -> None:
     (tmp_path / "drive.yaml").write_text("values:\n  gain.u: 1.0\nevents:\n  - {at: 0.5, set: {gain.q: 2}}\n")
     path = tmp_path / "mesh.yaml"
     path.write_text(f"{BASE}scenario: drive.yaml\n", encoding="utf-8")

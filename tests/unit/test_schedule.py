@@ -16,19 +16,19 @@ def values(course: Course, steps: int) -> list[object]:
     return [course.value(step) for step in range(steps)]
 
 
-def test_a_value_holds_from_the_first_step_that_begins_at_its_time_or_later() -> None:
+def test_value_holds_from_first_step_that_begins_at_its_time_or_later() -> None:
     course = Course([1.0, 1.3, 1.55], [1.0, 2.0, 3.0], GRID, 1)  # 1.0 + 3 * 0.1 is not 1.3
 
     assert values(course, 8) == [1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 3.0, 3.0]
 
 
-def test_an_instance_with_a_step_size_of_its_own_looks_at_the_starts_of_its_own_steps() -> None:
+def test_instance_with_step_size_looks_at_starts_of_its_own_steps() -> None:
     course = Course([1.1, 1.35], [1.0, 2.0], GRID, 2)
 
     assert values(course, 4) == [None, 1.0, 2.0, 2.0]
 
 
-def test_a_linear_value_is_on_the_line_between_two_times_and_on_the_last_one_after_them() -> None:
+def test_a_linear_value_is_on_the_line_and_ends_on_the_last() -> None:
     course = Course([0.9, 1.1, 1.25], [0.0, 4.0, 10.0], GRID, 1, linear=True)
 
     assert values(course, 5) == pytest.approx([2.0, 4.0, 8.0, 10.0, 10.0], rel=1e-12)
@@ -61,7 +61,7 @@ def test_what_was_no_start_value_is_set_in_the_first_step() -> None:
     assert (course.change(0), course.next_change(0), course.next_change(1)) == (5.0, 0, ENDLESS)
 
 
-def test_nan_is_no_change_of_nan_and_a_zero_with_another_sign_is_one() -> None:
+def test_nan_after_nan_is_no_change_and_another_sign_of_zero_is() -> None:
     course = Course([1.0, 1.1, 1.2, 1.3], [math.nan, math.nan, 0.0, -0.0], GRID, 1)
 
     assert [str(course.change(step)) for step in range(5)] == ["None", "None", "0.0", "-0.0", "None"]

@@ -27,7 +27,7 @@ class Slow:
         self.closed.set()
 
 
-def test_nobody_waits_for_a_session_that_waits_for_somebody_who_does_not_answer() -> None:
+def test_nobody_waits_for_session_that_waits_for_somebody_who_does_not_answer() -> None:
     session = Slow()
 
     close_session(cast("zenoh.Session", session))
@@ -57,7 +57,7 @@ def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
     close_session(session)
 
 
-def test_what_is_no_key_expression_is_told_without_places_in_the_sources_of_zenoh() -> None:
+def test_a_bad_key_expression_is_reported_without_the_sources_of_zenoh() -> None:
     with pytest.raises(ConfigurationError) as caught:
         key_expression("a//b")
 

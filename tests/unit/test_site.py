@@ -106,13 +106,14 @@ def test_the_reference_describes_every_type_that_a_public_call_returns() -> None
     assert {name: place for name, place in returned_types().items() if name not in names} == {}
 
 
-def test_a_link_to_a_file_or_a_folder_leads_to_a_page_that_shows_it(site: ModuleType) -> None:
+def test_a_link_to_file_or_folder_leads_to_page_that_shows_it(site: ModuleType) -> None:
     pages = site.site_pages()
 
     assert "](configs/README.md)" in pages["README.md"]
     assert "* [`cycle2.yaml`](cycle2.yaml.md)" in pages["configs/README.md"]
     assert (ROOT / "configs/cycle2.yaml").read_text(encoding="utf-8") in pages["configs/cycle2.yaml.md"]
-    assert "* [1. A frame is addressed to the node that consumes it](0001-" in pages["docs/adr/README.md"]
+    assert "* [CartPole](CartPole.md)" in pages["docs/models/README.md"]
+    assert "| [0001](0001-" in pages["docs/adr/README.md"]
 
 
 def test_a_page_of_the_site_differs_from_its_source_in_links_only(site: ModuleType) -> None:

@@ -87,7 +87,7 @@ def test_other_sources_are_compiled_anew(tmp_path: Path, cache: Path) -> None:
     assert len(libraries(cache)) == 2
 
 
-def test_an_unpacked_source_fmu_is_compiled_into_the_cache_and_not_into_its_folder(tmp_path: Path, cache: Path) -> None:
+def test_unpacked_source_fmu_is_compiled_into_cache_and_not_into_its_folder(tmp_path: Path, cache: Path) -> None:
     source = unpacked(tmp_path / "gain", source=without_binaries(tmp_path / "sources.fmu"))
     before = sorted(source.rglob("*"))
 
@@ -230,7 +230,7 @@ def test_sources_are_listed_as_openmodelica_does_it(listed: str, tmp_path: Path)
     ],
     ids=["a missing file", "a file outside", "a file outside on a detour", "an undefined symbol"],
 )
-def test_sources_that_do_not_compile_are_told_with_the_reason_and_leave_nothing(
+def test_sources_that_do_not_compile_are_told_with_reason_and_leave_nothing(
     change: tuple[str, str], says: str, tmp_path: Path, cache: Path
 ) -> None:
     sources = without_binaries(tmp_path / "sources.fmu")
@@ -293,7 +293,7 @@ def test_a_source_fmu_for_model_exchange_only_is_compiled_and_runs(version: Vers
 
 
 @pytest.mark.parametrize("name", ["AllTypes1", "AllTypes3"])
-def test_a_source_fmu_for_co_simulation_is_compiled_in_fmi_1_and_3(name: str, tmp_path: Path) -> None:
+def test_source_fmu_for_co_simulation_is_compiled_in_fmi_1_and_3(name: str, tmp_path: Path) -> None:
     fmu = without_binaries(tmp_path / "sources.fmu", source=find_fmu(name, tmp_path))
     description = read_description(fmu)
 
@@ -304,7 +304,7 @@ def test_a_source_fmu_for_co_simulation_is_compiled_in_fmi_1_and_3(name: str, tm
 
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize(("kind", "library"), [("model_exchange", "Ball_me.so"), ("co_simulation", "Ball_cs.so")])
-def test_of_two_kinds_with_libraries_of_their_own_that_of_the_kind_that_runs_is_compiled(
+def test_of_two_kinds_with_libraries_that_of_kind_that_runs_is_compiled(
     kind: Kind, library: str, version: Version, tmp_path: Path, cache: Path
 ) -> None:
     fmu = event_source_fmu("Ball", version, tmp_path / "ball.fmu", two_libraries)
@@ -314,7 +314,7 @@ def test_of_two_kinds_with_libraries_of_their_own_that_of_the_kind_that_runs_is_
     assert [one.name for one in libraries(cache)] == [library]
 
 
-def test_each_kind_is_compiled_from_the_files_that_fmi_2_lists_for_it(tmp_path: Path) -> None:
+def test_each_kind_is_compiled_from_files_that_fmi_2_lists_for_it(tmp_path: Path) -> None:
     files = "".join(f'<File name="{name}"/>' for name in ("fmi2.c", "stepping.c", "Ball.c"))
     lists = {"ModelExchange": files, "CoSimulation": '<File name="other.c"/>'}
 
@@ -330,7 +330,7 @@ def test_each_kind_is_compiled_from_the_files_that_fmi_2_lists_for_it(tmp_path: 
         extract(fmu, tmp_path / "parent", model=read_description(fmu, kind="co_simulation"))
 
 
-def test_of_the_build_configurations_of_fmi_3_that_of_the_kind_that_runs_is_taken(tmp_path: Path, cache: Path) -> None:
+def test_of_the_build_configurations_that_of_the_running_kind_is_taken(tmp_path: Path, cache: Path) -> None:
     def configuration(identifier: str, *files: str) -> str:
         names = "".join(f'<SourceFile name="{name}"/>' for name in files)
         definition = f'<PreprocessorDefinition name="MODEL_IDENTIFIER" value="{identifier}"/>'
@@ -358,7 +358,7 @@ def test_a_library_of_the_other_kind_is_no_reason_not_to_compile(tmp_path: Path,
     assert [one.name for one in libraries(cache)] == ["Ball_me.so"]
 
 
-def test_a_library_of_the_other_kind_without_sources_is_told_with_the_way_out(tmp_path: Path) -> None:
+def test_a_library_of_other_kind_without_sources_is_told_with_way_out(tmp_path: Path) -> None:
     sources = event_source_fmu("Ball", 2, tmp_path / "sources.fmu", two_libraries)
     library: dict[str | zipfile.ZipInfo, bytes] = {"binaries/linux64/Ball_cs.so": b"not looked at"}
     fmu = repacked(tmp_path / "ball.fmu", source=sources, keep=lambda name: "sources/" not in name, add=library)

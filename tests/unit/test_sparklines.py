@@ -18,13 +18,13 @@ def histories(name: str, *values: object, unit: str | None = None) -> Histories:
     return found
 
 
-def test_the_least_value_has_the_lowest_block_and_the_greatest_one_the_highest() -> None:
+def test_the_least_value_has_the_lowest_block_and_the_greatest_one_highest() -> None:
     assert sparkline([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]) == BLOCKS
     assert sparkline([-1e308, 1e308]) == "▁█"
     assert sparkline([5.0, 0.0], PLAIN) == "#_"
 
 
-def test_equal_values_are_in_the_middle_and_what_is_not_finite_is_blank() -> None:
+def test_equal_values_are_in_middle_and_what_is_not_finite_is_blank() -> None:
     assert sparkline([2.0, 2.0]) == "▄▄"
     assert sparkline([0.0, math.nan, math.inf, 1.0]) == "▁  █"
     assert sparkline([math.nan, math.nan]) == "  "

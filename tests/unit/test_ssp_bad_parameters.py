@@ -114,7 +114,7 @@ PACKAGES = [
 
 
 @pytest.mark.parametrize("bad", PACKAGES, ids=lambda bad: bad.what)
-def test_a_package_with_wrong_parameters_is_refused_with_the_line_and_the_element(bad: Bad, tmp_path: Path) -> None:
+def test_a_package_with_wrong_parameters_is_refused_with_the_line_and_element(bad: Bad, tmp_path: Path) -> None:
     findings = read_system(_package(tmp_path, bad)).findings
 
     assert len(findings) == 1, [str(one) for one in findings]

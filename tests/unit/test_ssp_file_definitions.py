@@ -67,7 +67,7 @@ def test_a_unit_is_read_with_its_exponents_its_factor_and_its_offset() -> None:
     assert not problems.findings
 
 
-def test_of_two_units_with_one_name_the_second_is_a_finding_with_both_lines() -> None:
+def test_of_two_units_with_one_name_second_is_finding_with_both_lines() -> None:
     _, problems = _set("", f"<ssv:Units>\n{METRE}\n{METRE}</ssv:Units>")
 
     assert _one(problems.findings) == "x.ssv:6: Unit 'm': a second unit 'm'; expected one of this name (first: line 5)"
@@ -89,7 +89,7 @@ def test_a_unit_into_which_nothing_can_be_converted_is_a_finding(base: str, foun
     assert _one(problems.findings) == f"x.ssv:6: BaseUnit of Unit 'x': {found}"
 
 
-def test_a_unit_that_the_file_does_not_define_has_one_warning_and_no_base_units() -> None:
+def test_an_undefined_unit_has_one_warning_and_no_base_units() -> None:
     length = '<ssv:Parameter name="{}">\n<ssv:Real value="1" unit="mm"/></ssv:Parameter>\n'
 
     values, problems = _set(length.format("a") + length.format("b"), f"<ssv:Units>{METRE}</ssv:Units>")
@@ -102,7 +102,7 @@ def test_a_unit_that_the_file_does_not_define_has_one_warning_and_no_base_units(
     )
 
 
-def test_an_empty_unit_is_no_unit_and_without_the_attribute_nothing_is_said() -> None:
+def test_an_empty_unit_is_no_unit_and_without_attribute_nothing_is_said() -> None:
     values, problems = _set(
         '<ssv:Parameter name="a"><ssv:Real value="1" unit=""/></ssv:Parameter>'
         '<ssv:Parameter name="b"><ssv:Real value="1"/></ssv:Parameter>'
@@ -113,7 +113,7 @@ def test_an_empty_unit_is_no_unit_and_without_the_attribute_nothing_is_said() ->
     assert unit_named("", {}) == Unit("")
 
 
-def test_all_units_that_a_file_uses_and_does_not_define_are_one_warning() -> None:
+def test_all_units_that_file_uses_and_does_not_define_are_one_warning() -> None:
     parameter = '<ssv:Parameter name="{}"><ssv:Real value="1" unit="{}"/></ssv:Parameter>\n'
     units = {"a": "m", "b": "[m]", "c": "[rad]", "d": "[m]"}
 
@@ -203,7 +203,7 @@ def _transformation(inside: str) -> tuple[Transformation | None, Problems]:
     return mapping.entries[0].transformation, problems
 
 
-def test_a_linear_transformation_has_the_factor_1_and_the_offset_0_where_none_are_given() -> None:
+def test_linear_transformation_has_factor_1_and_offset_0_where_none_are_given() -> None:
     found, problems = _transformation('<ssc:LinearTransformation factor="2.5"/>')
 
     assert found is not None
@@ -316,7 +316,7 @@ def test_a_value_of_its_type_is_kept_as_it_is_written(type_: str, text: str) -> 
         ("Binary", "0af", "the value '0af'; expected an even number of hexadecimal digits"),
     ],
 )
-def test_a_value_that_is_none_of_its_type_is_a_finding_with_its_line(type_: str, text: str, found: str) -> None:
+def test_value_that_is_none_of_its_type_is_finding_with_its_line(type_: str, text: str, found: str) -> None:
     values, problems = _set(f'<ssv:Parameter name="a">\n<ssv:{type_} value="{text}"/></ssv:Parameter>')
 
     assert _one(problems.findings).startswith(f"x.ssv:4: {type_} of Parameter 'a': {found}")
@@ -363,9 +363,7 @@ def test_a_parameter_that_is_wrong_is_a_finding_with_its_line(inside: str, messa
 
 
 @pytest.mark.parametrize(("other", "ambiguous"), [("1", {}), ("2", {"a": 4})])
-def test_a_second_parameter_of_one_name_is_a_warning_and_ambiguous_if_its_value_is_another(
-    other: str, ambiguous: dict[str, int]
-) -> None:
+def test_a_second_parameter_of_one_name_is_a_warning_or_ambiguous(other: str, ambiguous: dict[str, int]) -> None:
     parameter = '<ssv:Parameter name="a"><ssv:Real value="{}"/></ssv:Parameter>\n'
 
     values, problems = _set(parameter.format(1) + parameter.format(other))
@@ -413,7 +411,7 @@ def test_an_array_has_its_values_row_by_row_and_its_dimensions() -> None:
     assert not problems.warnings
 
 
-def test_an_array_in_a_file_of_1_0_and_one_without_dimensions_are_warnings() -> None:
+def test_array_in_file_of_1_0_and_one_without_dimensions_are_warnings() -> None:
     array = '<ssv:Parameter name="m"><ssv:Real value="1 2"/>{}</ssv:Parameter>'
 
     old, of_old = _set(array.format('\n<ssc:Dimension size="2"/>'), version="1.0")
@@ -425,7 +423,7 @@ def test_an_array_in_a_file_of_1_0_and_one_without_dimensions_are_warnings() -> 
     assert not of_old.findings + of_without.findings
 
 
-def test_of_two_entries_with_one_target_the_second_is_a_finding_but_one_source_may_have_several_targets() -> None:
+def test_two_entries_with_one_target_are_a_finding_and_two_targets_none() -> None:
     entry = '<ssm:MappingEntry source="{}" target="{}"/>\n'
 
     mapping, problems = _mapping(entry.format("a", "x") + entry.format("b", "x") + entry.format("a", "y"))

@@ -203,7 +203,7 @@ def _single(folder: Path, parameters: str, mapping: str | None = None, connector
 # --- names and precedence
 
 
-def test_a_name_in_a_component_is_that_of_a_variable_and_needs_no_connector(tmp_path: Path) -> None:
+def test_a_name_in_component_is_that_of_variable_and_needs_no_connector(tmp_path: Path) -> None:
     resolved = _single(tmp_path, _real("k", "1e-3") + _real("u", -2))
 
     assert _values(resolved) == {"g.k": 0.001, "g.u": -2.0}
@@ -262,7 +262,7 @@ def _k(value: int, name: str = "k") -> str:
         (_k(5, "S.g.gain"), _k(3, "g.k"), "", 5.0),
     ],
 )
-def test_a_higher_level_beats_a_lower_one_and_at_one_level_the_later_binding_counts(
+def test_higher_level_beats_lower_one_and_at_one_level_later_binding_counts(
     tmp_path: Path, of_root: str, of_system: str, of_component: str, expected: float
 ) -> None:
     system = _system("S", _component("g", of_component), of_system)
@@ -343,7 +343,7 @@ def test_connectors_of_systems_have_values_of_their_own(tmp_path: Path) -> None:
     assert not problems.warnings
 
 
-def test_a_name_may_be_a_connector_of_a_system_and_a_variable_at_once(tmp_path: Path) -> None:
+def test_a_name_may_be_a_connector_of_system_and_variable_at_once(tmp_path: Path) -> None:
     root = _system("A", _component("g"), _binding(_real("g.k", 3)), _connector("g.k"))
 
     resolved, _ = _resolve(tmp_path, root)
@@ -387,7 +387,7 @@ def test_a_name_that_matches_nothing_is_a_warning_with_the_nearest_name(tmp_path
     )
 
 
-def test_of_many_names_that_match_nothing_the_first_ones_have_a_warning_each(tmp_path: Path) -> None:
+def test_of_many_names_that_match_nothing_first_ones_have_a_warning_each(tmp_path: Path) -> None:
     names = "".join(_real(f"x{number}", 1) for number in range(30))
 
     _, problems = _resolve(tmp_path, _system("root", _component("g", _binding(names))))
@@ -396,7 +396,7 @@ def test_of_many_names_that_match_nothing_the_first_ones_have_a_warning_each(tmp
     assert "22 more values for names that Component 'g' of System 'root' does not have" in problems.warnings[-1].found
 
 
-def test_a_target_and_a_source_of_a_mapping_that_are_nowhere_are_warnings_at_the_entry(tmp_path: Path) -> None:
+def test_target_and_source_of_mapping_that_are_nowhere_are_warnings_at_entry(tmp_path: Path) -> None:
     mapping = "\n" + _entry("a", "g.kk") + "\n" + _entry("b", "g.k")
 
     resolved, problems = _resolve(tmp_path, _system("root", _component("g"), _binding(_real("a", 1), mapping)))
@@ -409,7 +409,7 @@ def test_a_target_and_a_source_of_a_mapping_that_are_nowhere_are_warnings_at_the
 
 
 @pytest.mark.parametrize("name", ["c", "time"])
-def test_a_value_for_a_constant_or_the_time_has_no_effect_and_is_a_warning(tmp_path: Path, name: str) -> None:
+def test_a_value_for_constant_or_time_has_no_effect_and_is_warning(tmp_path: Path, name: str) -> None:
     resolved, problems = _resolve(tmp_path, _system("root", _component("g", _binding(_real(name, 1)))))
 
     assert not resolved.of_components
@@ -441,7 +441,7 @@ def test_to_apply_a_parameter_that_has_two_values_is_a_finding(tmp_path: Path, s
         )
 
 
-def test_a_parameter_that_has_two_values_and_is_not_applied_is_a_warning(tmp_path: Path) -> None:
+def test_a_parameter_that_has_two_values_and_is_not_applied_is_warning(tmp_path: Path) -> None:
     both = _real("a", 1) + _real("a", 2) + _real("b", 3)
 
     resolved, problems = _resolve(tmp_path, _system("root", _component("g", _binding(both, _entry("b", "k")))))
@@ -479,7 +479,7 @@ def test_a_parameter_that_has_two_values_and_is_not_applied_is_a_warning(tmp_pat
         ("size", "Integer", "5", 5),
     ],
 )
-def test_a_value_becomes_one_of_the_type_of_the_variable_where_nothing_is_lost(
+def test_a_value_becomes_one_of_type_of_variable_where_nothing_is_lost(
     tmp_path: Path, variable: str, type_: str, text: str, expected: PlainValue
 ) -> None:
     value = _values(_single(tmp_path, _typed(variable, type_, text)))[f"g.{variable}"]
@@ -518,7 +518,7 @@ def test_a_value_becomes_one_of_the_type_of_the_variable_where_nothing_is_lost(
         ("gear", "String", "first", "the String value 'first' for the Enumeration 'gear' of 'g'; expected one of"),
     ],
 )
-def test_a_value_that_the_variable_cannot_have_is_a_finding_with_its_line(
+def test_a_value_that_variable_cannot_have_is_a_finding_with_its_line(
     tmp_path: Path, variable: str, type_: str, text: object, message: str
 ) -> None:
     resolved, problems = _resolve(tmp_path, _system("root", _component("g", _binding(_typed(variable, type_, text)))))
@@ -528,7 +528,7 @@ def test_a_value_that_the_variable_cannot_have_is_a_finding_with_its_line(
     assert not resolved.of_components.get(("g",))
 
 
-def test_an_item_means_the_number_that_the_variable_gives_it_and_not_that_of_the_file(tmp_path: Path) -> None:
+def test_item_means_number_that_variable_gives_it_and_not_that_of_file(tmp_path: Path) -> None:
     named = '<ssv:Parameter name="gear"><ssv:Enumeration name="Gear" value="first"/></ssv:Parameter>'
 
     assert _values(_single(tmp_path, named)) == {"g.gear": "first"}  # 5 in the file, 1 in the FMU
@@ -657,7 +657,7 @@ def test_the_unit_of_the_connector_counts_where_it_has_one(tmp_path: Path, conne
     assert _values(resolved) == {"g.l": expected}
 
 
-def test_the_value_of_a_connector_of_a_system_has_its_unit_or_else_that_of_the_file(tmp_path: Path) -> None:
+def test_a_connector_has_its_unit_or_that_of_the_file(tmp_path: Path) -> None:
     connectors = _connector("p", type_='<ssc:Real unit="m"/>') + _connector("q", type_="<ssc:Real/>") + _connector("r")
     bindings = _binding(_real("p", 5, "mm") + _real("q", 5, "mm") + _typed("r", "Enumeration", "any"))
 
@@ -736,7 +736,7 @@ def test_a_value_goes_through_the_transformation_of_its_mapping(
         (_typed("a", "Enumeration", "x"), "gear", _map("Enumeration", ("x", "y")), "one of reverse (-1), neutral (0)"),
     ],
 )
-def test_a_transformation_that_does_not_fit_the_value_or_the_variable_is_a_finding(
+def test_a_transformation_that_does_not_fit_value_or_variable_is_a_finding(
     tmp_path: Path, parameter: str, target: str, mapping: str, expected: str
 ) -> None:
     root = _system("root", _component("g", _binding(parameter, _entry("a", target, mapping))))
@@ -791,7 +791,7 @@ def test_the_value_of_a_connector_becomes_that_of_a_variable(
         (_applied(1.5, "Float64"), PathChange(), "v", "the Float64 value 1.5 for the Float64[3] 'v' of 'g'"),
     ],
 )
-def test_the_value_of_a_connector_that_a_variable_cannot_have_is_a_finding_at_the_value(
+def test_the_value_of_connector_that_variable_cannot_have_is_finding_at_value(
     value: AppliedValue, change: PathChange, target: str, message: str
 ) -> None:
     problems = Problems()

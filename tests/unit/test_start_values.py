@@ -90,7 +90,7 @@ ALL_KINDS = [
 @needs_compiler
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 @pytest.mark.parametrize(("version", "kind"), ALL_KINDS)
-def test_an_output_with_initial_calculated_takes_a_start_value_as_one_with_initial_exact_does(
+def test_an_output_with_initial_calculated_takes_a_start_value_as_with_exact(
     version: Version, kind: Kind, options: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     allowed = config_with(ball(version, tmp_path, calculated=False), {"h": HEIGHT}, kind=kind)
@@ -161,7 +161,7 @@ def test_the_values_are_those_of_fmpy(version: Version, tmp_path: Path) -> None:
 
 
 @needs_compiler
-def test_a_variable_without_start_value_takes_one_in_co_simulation_of_fmi_1(tmp_path: Path) -> None:
+def test_variable_without_start_value_takes_one_in_co_simulation_of_fmi_1(tmp_path: Path) -> None:
     plain = find_fmu("AllTypes1", tmp_path)
     fmu = repacked(tmp_path / "odd.fmu", source=plain, description=lambda text: text.replace(' start="2.5"', ""))
     variable = read_description(fmu).variable("real_parameter")
@@ -198,7 +198,7 @@ def test_the_adapter_warns_in_its_log(version: Version, tmp_path: Path, caplog: 
 
 
 @needs_compiler
-def test_a_start_value_of_the_command_line_is_taken_as_one_of_the_file_is(
+def test_start_value_of_command_line_is_taken_as_one_of_file_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fmu = ball(2, tmp_path, calculated=True)
@@ -230,7 +230,7 @@ def test_where_the_configuration_is_strict_it_is_refused(
     assert "`strict: false` leaves it to the FMU" in said
 
 
-def test_check_shows_the_warning_and_a_refusal_of_the_fmu_is_told_as_such(
+def test_check_shows_warning_and_a_refusal_of_fmu_is_told_as_such(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fmu = repacked(tmp_path / "gain.fmu")
@@ -250,7 +250,7 @@ def test_check_shows_the_warning_and_a_refusal_of_the_fmu_is_told_as_such(
 
 
 @needs_compiler
-def test_the_adapter_refuses_what_no_fmu_can_take_and_what_comes_too_late(tmp_path: Path) -> None:
+def test_adapter_refuses_what_no_fmu_can_take_and_what_comes_too_late(tmp_path: Path) -> None:
     with FMIAdapter(ball(3, tmp_path, calculated=True), STEP) as adapter:
         with pytest.raises(CallRefused, match="time: this continuous independent is not settable before the start"):
             adapter.set_initial_value("time", 1.0)

@@ -129,7 +129,7 @@ def test_another_guarded_instance_goes_on_from_a_serialized_state(
         other.instance.free_state(state)
 
 
-def test_an_fmu_of_fmi_1_has_no_state_and_says_so_by_its_name(event_fmu: EventFmu, tmp_path: Path) -> None:
+def test_an_fmu_of_fmi_1_without_a_state_is_refused_by_name(event_fmu: EventFmu, tmp_path: Path) -> None:
     with (
         stepped_fmu(event_fmu("Ball", 1), tmp_path, "model_exchange") as one,
         pytest.raises(FmuError, match="cannot get and set its state, as its model description says") as raised,
@@ -140,7 +140,7 @@ def test_an_fmu_of_fmi_1_has_no_state_and_says_so_by_its_name(event_fmu: EventFm
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_a_model_that_has_asked_to_end_is_not_stepped_again_after_its_state_was_taken(
+def test_a_model_that_asked_to_end_is_not_stepped_after_its_state(
     version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     with stepped_fmu(event_fmu("Stairs", version), tmp_path, "model_exchange", end=2) as one:
@@ -160,7 +160,7 @@ def test_what_is_no_state_is_refused(event_fmu: EventFmu, tmp_path: Path) -> Non
             one.instance.deserialize_state(b"no state")
 
 
-def test_inputs_over_time_are_no_part_of_a_state_so_there_is_none() -> None:
+def test_inputs_over_time_are_no_part_of_state_so_there_is_none() -> None:
     timed = TimedInputs(cast("Instance", FmuInstance), "hold")
 
     with pytest.raises(FmuError, match="the state of an instance with inputs over time cannot be kept"):

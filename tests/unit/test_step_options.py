@@ -39,7 +39,7 @@ def refused(folder: Path, instances: dict[str, Any], connections: list[Any] | No
     return str(caught.value)
 
 
-def test_auto_takes_co_simulation_if_the_fmu_has_both_and_model_exchange_if_it_has_nothing_else(
+def test_auto_prefers_co_simulation_and_takes_model_exchange_only_without_it(
     event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     plan = planned(

@@ -74,7 +74,7 @@ def outputs_after(instance: FmuInstance, steps: range) -> list[Value]:
 # ---- sub-steps
 
 
-def test_a_step_is_halved_until_it_is_taken_and_its_parts_fill_it() -> None:
+def test_step_is_halved_until_it_is_taken_and_its_parts_fill_it() -> None:
     taken: list[tuple[float, float]] = []
 
     def attempt(time: float, size: float) -> int:
@@ -100,7 +100,7 @@ def test_a_step_that_is_discarded_down_to_the_smallest_part_is_discarded() -> No
 
 
 @pytest.mark.parametrize(("version", "kind"), CO_SIMULATION)
-def test_a_discarded_step_is_taken_in_parts_if_the_fmu_can_and_may(
+def test_a_discarded_step_is_taken_in_parts_if_fmu_can_and_may(
     version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     options = StepOptions(retry_discarded_steps=True)
@@ -135,9 +135,7 @@ def test_without_the_wish_a_discarded_step_of_fmi_2_is_a_failure(event_fmu: Even
         stairs.do_step(0)
 
 
-def test_an_fmu_of_fmi_3_with_a_fixed_step_size_is_not_asked_for_another_one(
-    event_fmu: EventFmu, tmp_path: Path
-) -> None:
+def test_an_fmu_of_fmi_3_with_a_fixed_step_size_keeps_it(event_fmu: EventFmu, tmp_path: Path) -> None:
     fmu = event_fmu("Stairs", 3, canHandleVariableCommunicationStepSize="false", hasEventMode="false")
 
     with (
@@ -147,7 +145,7 @@ def test_an_fmu_of_fmi_3_with_a_fixed_step_size_is_not_asked_for_another_one(
         stairs.do_step(0)
 
 
-def test_the_rest_of_a_step_after_an_early_return_ends_where_the_step_does() -> None:
+def test_the_rest_of_a_step_after_early_return_ends_where_step_does() -> None:
     """0.11 - 0.04 is rounded up, so that 0.04 and it are more than 0.11."""
     calls: list[tuple[float, float]] = []
 
@@ -177,7 +175,7 @@ def test_the_rest_of_a_step_after_an_early_return_ends_where_the_step_does() -> 
 
 @pytest.mark.parametrize(("version", "kind"), ALL)
 @pytest.mark.parametrize(("period", "last_step"), [(1.0, 8), (0.3, 2)], ids=["at a point", "between points"])
-def test_an_fmu_that_asks_to_end_is_heard_before_the_step_that_it_does_not_finish(
+def test_an_fmu_that_asks_to_end_ends_before_its_unfinished_step(
     version: Version, kind: Kind, period: float, last_step: int, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     with running(event_fmu("Stairs", version), tmp_path, kind, period=period, end=2) as stairs:
@@ -267,7 +265,7 @@ def test_euler_takes_as_many_steps_at_late_times_as_at_early_ones(
 
 @pytest.mark.parametrize(("version", "kind"), WITH_STATE)
 @pytest.mark.parametrize("model", ["Ball", "Stairs"])
-def test_an_instance_goes_on_bit_by_bit_from_a_state_that_it_was_in(
+def test_instance_goes_on_bit_by_bit_from_state_that_it_was_in(
     version: Version, kind: Kind, model: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     with running(event_fmu(model, version), tmp_path, kind, 0.1) as instance:
@@ -320,7 +318,7 @@ def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
     ],
     ids=["constant", "fraction", "by the FMU", "countdown"],
 )
-def test_a_time_based_input_clock_ticks_when_it_is_time_also_between_points(
+def test_time_based_input_clock_ticks_when_it_is_time_also_between_points(
     clock: str, ticks: list[float], kind: Kind, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     fmu = event_fmu("Stairs", 3, clocks=clock)
@@ -336,7 +334,7 @@ def test_a_time_based_input_clock_ticks_when_it_is_time_also_between_points(
     assert sorted(seen - {0.0}) == pytest.approx(ticks, rel=1e-12)
 
 
-def test_an_fmu_with_a_fixed_step_size_takes_its_ticks_at_the_points(event_fmu: EventFmu, tmp_path: Path) -> None:
+def test_an_fmu_with_a_fixed_step_size_takes_its_ticks_at_points(event_fmu: EventFmu, tmp_path: Path) -> None:
     clock = 'intervalVariability="constant" intervalDecimal="0.4" shiftDecimal="0.2"'
     fmu = event_fmu("Stairs", 3, clocks=clock, canHandleVariableCommunicationStepSize="false")
 
@@ -366,9 +364,7 @@ def test_clocks_and_linear_inputs_go_on_from_a_state_too(kind: Kind, event_fmu: 
 
 @pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 @pytest.mark.parametrize("causality", ["input", "parameter"])
-def test_an_event_that_follows_from_a_value_after_a_state_was_set_has_its_own_time(
-    causality: str, event_fmu: EventFmu, tmp_path: Path
-) -> None:
+def test_an_event_after_a_restored_state_has_its_own_time(causality: str, event_fmu: EventFmu, tmp_path: Path) -> None:
     with running(event_fmu("Stairs", 3), tmp_path, "co_simulation", increment=1) as stairs:
         inputs: Ring = vars(stairs)["_keep"][0]
         stairs.do_step(0)
@@ -419,7 +415,7 @@ def test_linear_inputs_are_part_of_the_state(version: Version, kind: Kind, event
 
 
 @pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
-def test_an_fmu_of_fmi_3_that_has_asked_to_end_is_not_stepped_again(tmp_path: Path) -> None:
+def test_an_fmu_of_fmi_3_that_asked_to_end_is_not_stepped(tmp_path: Path) -> None:
     with running(build_test_fmu("Events3", tmp_path), tmp_path, "co_simulation", last=0.5) as instance:
         instance.do_step(0)
         instance.do_step(1)  # it asks at the end of this one, which is complete

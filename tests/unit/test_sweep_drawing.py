@@ -75,7 +75,7 @@ def test_numbers_spread_by_ratio_over_a_decade_have_a_logarithmic_colour_bar() -
     assert drawn(curves(np.linspace(-1.0, 1.0, 20).tolist())).axes[1].get_yscale() == "linear"
 
 
-def test_a_darker_colour_is_a_smaller_number_whatever_the_order_of_the_variants() -> None:
+def test_a_darker_colour_is_a_smaller_number_whatever_the_order_of_variants() -> None:
     figure = drawn(curves([0.9, 0.1, 0.5, *np.linspace(0.11, 0.8, 9)]))
 
     brightness = [sum(int(colour[i : i + 2], 16) for i in (1, 3, 5)) for colour in colours_of(figure)]
@@ -220,7 +220,7 @@ def shades_of(figure: Figure) -> list[float | None]:
     return values
 
 
-def test_each_cell_of_a_grid_is_around_its_values_and_has_its_colour() -> None:
+def test_each_cell_of_grid_is_around_its_values_and_has_its_colour() -> None:
     figure = grid_of(D, L, [float(number) for number in range(15)])
 
     corners = np.asarray(cells_of(figure).get_coordinates())

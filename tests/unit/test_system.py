@@ -555,7 +555,7 @@ def test_a_zenoh_configuration_exists(tmp_path: Path) -> None:
     ]
 
 
-def test_all_findings_are_shown_together_with_earlier_ones_and_those_without_a_description() -> None:
+def test_all_findings_are_shown_together_with_earlier_ones_and_those_without_description() -> None:
     loaded = parse(
         text(
             simulation="stop_time: 1, step_size: 0",
@@ -581,7 +581,7 @@ def test_all_findings_are_shown_together_with_earlier_ones_and_those_without_a_d
     ]
 
 
-def test_what_a_wrong_structure_leaves_is_checked_too_without_findings_that_only_follow(tmp_path: Path) -> None:
+def test_what_wrong_structure_leaves_is_checked_too_without_findings_that_only_follow(tmp_path: Path) -> None:
     file = tmp_path / "mesh.yaml"
     file.write_text(
         """\
@@ -623,6 +623,6 @@ record: {variables: [3, pendulum.a]}
     ]
 
 
-def test_a_description_that_is_missing_without_a_finding_is_an_error_of_the_caller() -> None:
+def test_a_description_that_is_missing_without_a_finding_is_error_of_caller() -> None:
     with pytest.raises(ValueError, match=r"no model description and no finding for \['delay'\]"):
         build(parse(text(), FILE), {"pendulum": SOURCE})

@@ -48,7 +48,7 @@ def test_the_libraries_of_c_are_on_every_system(name: str) -> None:
 
 
 @needs_compiler
-def test_a_missing_library_is_named_with_its_package_before_and_after_a_run(tmp_path: Path) -> None:
+def test_a_missing_library_is_named_with_its_package_before_and_after_run(tmp_path: Path) -> None:
     built(tmp_path, "libgfortran.so.4")
     built(tmp_path, "libnobody_has.so.7")
     path = fmu_of(tmp_path / "gain.fmu", built(tmp_path, "Gain.so", "libgfortran.so.4", "libnobody_has.so.7"))
@@ -95,7 +95,7 @@ def test_a_library_in_a_run_path_inside_the_fmu_is_there(tmp_path: Path) -> None
 
 
 @needs_compiler
-def test_a_library_of_the_system_that_is_too_old_is_told_with_the_version(tmp_path: Path) -> None:
+def test_a_library_of_system_that_is_too_old_is_told_with_version(tmp_path: Path) -> None:
     built(tmp_path, "libm.so.6", version="GLIBC_9.99")
     path = fmu_of(tmp_path / "gain.fmu", built(tmp_path, "Gain.so", "libm.so.6"))
 

@@ -97,7 +97,7 @@ def test_values_count_by_their_times_and_not_by_their_arrival(hold: Steps) -> No
     assert hold.go(5) == [5.0, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_a_value_whose_time_is_past_holds_unless_a_later_one_is_in_use(hold: Steps) -> None:
+def test_value_whose_time_is_past_holds_unless_later_one_is_in_use(hold: Steps) -> None:
     hold.go(5)
     hold.inputs.add("u", 8.0, 1.2)
     assert hold.go(1) == [8.0]
@@ -120,7 +120,7 @@ def runner_of(instance: Instance) -> tuple[Runner, MemberTable]:
     return runner, position
 
 
-def test_a_parameter_without_a_time_is_set_at_once_and_with_one_holds_from_it_on(linear: Steps) -> None:
+def test_a_parameter_with_a_time_holds_from_it_and_otherwise_at_once(linear: Steps) -> None:
     runner, position = runner_of(linear.inputs)
 
     assert set_input(runner, "k", 2.0, None) == 0

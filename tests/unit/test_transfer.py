@@ -214,7 +214,7 @@ def test_a_number_that_the_target_cannot_hold_is_no_value_in_c(
     assert outcome == Stage.SETTING << STAGE_BITS | OUT_OF_RANGE
 
 
-def test_a_reader_and_a_writer_of_a_column_do_what_value_and_put_do() -> None:
+def test_a_reader_and_writer_of_column_do_what_value_and_put_do() -> None:
     layout = Layout.of([("a", "Float64"), ("f", "Float64", (2, 2)), ("g", "Float32"), ("n", "Int64"), ("s", "String")])
     written, put = Ring(layout, 4), Ring(layout, 4)
     values: dict[str, Value] = {"a": 0.1, "f[2,1]": 2.5, "g": 0.1, "n": 2**63 - 1, "s": "text"}

@@ -157,7 +157,7 @@ def test_every_type_of_fmi_1_goes_through_in_all_values(opened: FmuInstance) -> 
 
 
 @of("AllTypes1")
-def test_an_alias_of_fmi_1_has_the_value_and_a_negated_one_its_opposite(opened: FmuInstance) -> None:
+def test_an_alias_of_fmi_1_has_value_and_negated_one_its_opposite(opened: FmuInstance) -> None:
     opened.enter_initialization(0.0, 2.0, {"boolean_in": True, "integer_in": 5})
     opened.exit_initialization()
     names = ["real_same", "real_opposite", "integer_same", "integer_opposite", "boolean_same", "boolean_opposite"]
@@ -235,7 +235,7 @@ def test_a_step_ends_at_an_event_that_was_announced(opened: FmuInstance) -> None
 
 
 @of("Events3")
-def test_an_fmu_that_wants_to_end_the_simulation_is_heard_before_the_next_step(opened: FmuInstance) -> None:
+def test_an_fmu_that_wants_to_end_simulation_is_heard_before_next_step(opened: FmuInstance) -> None:
     opened.enter_initialization(0.0, 2.0, {"last": 0.5})
     opened.exit_initialization()
     opened.advance(0.0, 0.25)

@@ -166,7 +166,7 @@ def test_ignore_units_switches_it_off_for_one_connection(tmp_path: Path) -> None
     assert "Warnings" not in plan_page(prepare(path))
 
 
-def test_where_one_end_has_no_unit_nothing_is_converted_and_check_says_so(tmp_path: Path) -> None:
+def test_where_one_end_has_no_unit_nothing_is_converted_and_check_warns(tmp_path: Path) -> None:
     path = config(tmp_path, "pendulum.a -> gain.u", DEGREES)
 
     [connection] = prepare(path).connections
@@ -175,7 +175,7 @@ def test_where_one_end_has_no_unit_nothing_is_converted_and_check_says_so(tmp_pa
     assert connection_line(path).endswith("not converted: gain.u has no unit")
 
 
-def test_where_a_unit_is_not_defined_nothing_is_converted_and_a_warning_says_so(tmp_path: Path) -> None:
+def test_where_unit_is_not_defined_nothing_is_converted_and_warning_says_so(tmp_path: Path) -> None:
     path = config(tmp_path, "pendulum.a -> gain.u", DEGREES, u="furlong")
 
     [warning] = prepare(path).system.warnings

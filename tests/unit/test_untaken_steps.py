@@ -46,9 +46,7 @@ def without(flag: str, fmu: Path, target: Path) -> Path:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_discarded_step_is_taken_in_smaller_ones_if_the_fmu_can_and_may(
-    version: int, steps: Steps, tmp_path: Path
-) -> None:
+def test_discarded_step_is_taken_in_smaller_ones_if_fmu_can_and_may(version: int, steps: Steps, tmp_path: Path) -> None:
     with running(steps(version), tmp_path, "co_simulation", 0.25, RETRY, longest_step=0.0625, polls=0) as instance:
         instance.do_step(0)
         instance.do_step(1)
@@ -56,7 +54,7 @@ def test_a_discarded_step_is_taken_in_smaller_ones_if_the_fmu_can_and_may(
         assert instance.get_values(["reached", "attempts"]) == [0.5, 2 * (2 + 4)]
 
 
-def test_what_fmi_1_repeats_it_repeats_without_a_wish_because_it_costs_nothing(steps: Steps, tmp_path: Path) -> None:
+def test_what_fmi_1_repeats_it_repeats_without_wish_because_it_costs_nothing(steps: Steps, tmp_path: Path) -> None:
     with running(steps(1), tmp_path, "co_simulation", 0.25, longest_step=0.2) as instance:
         instance.advance(0.0, 0.25)
 
@@ -64,7 +62,7 @@ def test_what_fmi_1_repeats_it_repeats_without_a_wish_because_it_costs_nothing(s
 
 
 @pytest.mark.parametrize("flag", ["canRejectSteps", "canHandleVariableCommunicationStepSize"])
-def test_a_discarded_step_that_fmi_1_cannot_repeat_fails_with_the_last_successful_time(
+def test_discarded_step_that_fmi_1_cannot_repeat_fails_with_last_successful_time(
     flag: str, steps: Steps, tmp_path: Path
 ) -> None:
     fmu = without(flag, steps(1), tmp_path / "fixed.fmu")
@@ -78,9 +76,7 @@ def test_a_discarded_step_that_fmi_1_cannot_repeat_fails_with_the_last_successfu
         instance.do_step(0)
 
 
-def test_a_discarded_step_of_fmi_2_fails_with_the_last_successful_time_and_the_way_out(
-    steps: Steps, tmp_path: Path
-) -> None:
+def test_a_discarded_step_of_fmi_2_fails_with_its_time_and_advice(steps: Steps, tmp_path: Path) -> None:
     with (
         running(steps(2), tmp_path, "co_simulation", 0.25, longest_step=0.2) as instance,
         pytest.raises(StepFailed) as caught,
@@ -94,9 +90,7 @@ def test_a_discarded_step_of_fmi_2_fails_with_the_last_successful_time_and_the_w
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_an_fmu_that_does_not_tell_how_far_it_got_fails_all_the_same(
-    version: int, steps: Steps, tmp_path: Path
-) -> None:
+def test_fmu_that_does_not_tell_how_far_it_got_fails_all_same(version: int, steps: Steps, tmp_path: Path) -> None:
     fmu = without("canHandleVariableCommunicationStepSize", steps(version), tmp_path / "fixed.fmu")
 
     with (
@@ -117,7 +111,7 @@ def test_a_step_that_is_always_discarded_says_how_small_it_was_tried(
         instance.do_step(0)
 
 
-def test_retrying_is_refused_by_check_if_an_fmu_of_fmi_1_cannot_repeat_a_step(
+def test_check_refuses_retrying_if_an_fmu_of_fmi_1_cannot_repeat(
     steps: Steps, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fmu = without("canRejectSteps", steps(1), tmp_path / "fixed.fmu")
@@ -128,7 +122,7 @@ def test_retrying_is_refused_by_check_if_an_fmu_of_fmi_1_cannot_repeat_a_step(
     assert "true, but the FMU cannot repeat a step (canRejectSteps); expected false" in capsys.readouterr().err
 
 
-def test_a_message_that_comes_at_every_step_is_shown_a_few_times_and_counted(
+def test_message_that_comes_at_every_step_is_shown_few_times_and_counted(
     steps: Steps, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fmu = {"fmu": str(steps(1)), "start_values": {"longest_step": 0.0005}}
@@ -224,7 +218,7 @@ def test_a_pending_step_is_waited_for(version: int, options: StepOptions, steps:
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_pending_step_may_be_discarded_in_the_end_and_is_taken_in_smaller_ones(
+def test_a_pending_step_may_be_discarded_later_and_is_taken_in_parts(
     version: int, steps: Steps, tmp_path: Path
 ) -> None:
     with running(steps(version), tmp_path, "co_simulation", 0.25, RETRY, polls=2, longest_step=0.2) as instance:

@@ -139,6 +139,6 @@ def test_another_attachment_is_refused(data: bytes) -> None:
         decode_json(data, Stamp)
 
 
-def test_what_is_not_finite_is_a_float_for_a_program_in_every_version_of_fmi() -> None:
+def test_what_is_not_finite_is_a_float_in_every_version_of_fmi() -> None:
     assert [from_plain("INF", name) for name in ("Float64", "Float32", "Real")] == [math.inf] * 3
     assert from_plain("INF", "String") == "INF"

@@ -111,7 +111,7 @@ def test_a_logarithmic_range_has_its_exact_ends_and_stays_between_them(low: floa
     assert all(min(low, high) <= value <= max(low, high) for value in values)
 
 
-def test_a_range_of_whole_numbers_has_whole_numbers_if_all_of_them_are_whole() -> None:
+def test_a_range_of_integers_has_integers_if_all_of_them_are_integers() -> None:
     def values(text: str) -> list[Any]:
         return [variant["a.n"] for variant in grid(dict([read_values(text)]))]
 
@@ -158,7 +158,7 @@ def test_the_same_seed_samples_the_same_variants(sampler: str) -> None:
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_a_sampler_stays_in_the_ranges_and_takes_all_values_of_a_list(sampler: str) -> None:
+def test_a_sampler_stays_in_ranges_and_takes_all_values_of_a_list(sampler: str) -> None:
     vary: dict[str, Values] = {"a.d": Range(0.01, 10.0, None, "log"), "a.l": Range(2, -1)}
     vary |= {"a.n": Range(1, 4, 4), "a.s": ["x", True]}
 
@@ -181,7 +181,7 @@ def test_a_stratified_sampler_has_one_value_in_each_of_its_64_sections(sampler: 
     assert sorted(int(math.log2(variant["a.d"])) for variant in made) == list(range(64))
 
 
-def test_lists_that_are_sampled_more_often_than_they_have_combinations_have_each_once() -> None:
+def test_lists_sampled_more_often_than_they_have_combinations_have_each_once() -> None:
     made = sampled({"a.b": [1, 2], "a.c": ["x", "y"]}, "random:200")
 
     pairs = [(variant["a.b"], variant["a.c"]) for variant in made]

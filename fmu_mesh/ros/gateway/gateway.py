@@ -305,7 +305,7 @@ class _SubscribedTopic(_WarnOnce):
         self._who = f"ros {disassembler.topic.name}"
 
     def attachment(self, stamp: float | None) -> bytes:
-        """Who sends a value, and from which time on it holds: its stamp in s; None: as soon as it arrives."""
+        """Who sends a value, and from which time on it holds: its stamp in s; None: it takes effect at once."""
         if stamp is not None and self._stop_time is not None and stamp > self._stop_time:
             self.warn(
                 "its stamps are after the end of the simulation, so its messages hold as soon as they arrive; "

@@ -1,0 +1,30 @@
+"""How many files and functions a reader meets who follows one value; `python -m tests.walks --names` lists them."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.walks import WALKS, walked
+
+# They only get smaller. The error takes a few functions more if the recorder hears of it before it has ended.
+MOST = {
+    "start value": (36, 102),
+    "SSP parameter": (45, 121),
+    "error of a component": (28, 70),
+}
+
+
+@pytest.mark.parametrize("name", WALKS)
+def test_the_way_of_a_value_does_not_get_longer(name: str) -> None:
+    files, functions = walked(name)
+
+    most_files, most_functions = MOST[name]
+    assert len(files) <= most_files, "\n".join(files)
+    assert len(functions) <= most_functions, "\n".join(functions)
+
+
+def test_a_walk_begins_with_the_file_and_ends_at_the_fmu() -> None:
+    functions = walked("start value").functions
+
+    assert "config/loading.py: read_text" in functions
+    assert [name for name in functions if name.startswith("instances/fmi/") and name.endswith("enter_initialization")]
