@@ -26,7 +26,7 @@ import zenoh
 
 from ...errors import FmuMeshError
 from ...installing import importing
-from ...system.settable import why_not_settable
+from ...system.start_values import why_not_settable
 from ...variables.model_description import Value, Variable
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
