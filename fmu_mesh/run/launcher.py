@@ -39,7 +39,7 @@ from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
-from .child import Child, Process, is_other_python
+from .child import Child, Process
 from .events import Event, OutputLine, Reachable, decode_event
 from .fork_server import ForkServer, executed, fork_server
 from .launcher_states import (
@@ -55,7 +55,7 @@ from .launcher_states import (
     Start,
 )
 from .outcome import Outcome, outcome_at
-from .run_plan import RunPlan
+from .run_plan import RunPlan, is_other_python
 
 __all__ = ["Launcher"]
 

@@ -10,7 +10,7 @@ from ..errors import NotInOneProcess
 from ..instances.registry import claims
 from ..system.plan import Plan
 from ..system.process_sharing import Claims, ClaimsOf, SharedProcess
-from .child import is_other_python
+from .run_plan import is_other_python
 
 __all__ = ["OneProcess", "apart", "claims_in"]
 
