@@ -22,6 +22,7 @@ __all__ = [
     "listed",
     "matched",
     "matching",
+    "meant",
     "nearest",
     "nearest_file",
     "option_text",
@@ -84,6 +85,11 @@ def nearest_file(path: Path) -> str | None:
     if name is None or likeness(name) < _LIKE:
         name = nearest(path.name, names)
     return str(path.with_name(name)) if name is not None else None
+
+
+def meant(near: str | None, otherwise: str | None = None) -> str | None:
+    """The question whether a name was meant, as a hint; ``otherwise`` if no name is near."""
+    return f"Did you mean '{near}'?" if near is not None else otherwise
 
 
 def listed(names: Sequence[str], *, nothing: str = "none") -> str:

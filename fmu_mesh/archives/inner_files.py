@@ -17,7 +17,7 @@ from typing import IO, Final, NamedTuple
 from .. import files
 from ..config.mesh import LimitsConfig
 from ..errors import LoadFailed
-from ..text import nearest
+from ..text import meant, nearest
 from .archive_entries import checked_archive, entry_name, reading
 
 __all__ = ["InnerFile", "inner_file", "inner_sha256", "inner_size"]
@@ -112,8 +112,7 @@ def _entry_towards(path: Path, here: Path, archive: zipfile.ZipFile) -> tuple[st
             return name, entries[name]
     if any(name.startswith(f"{wanted}/") for name in entries):
         raise LoadFailed(f"'{path}' is a folder inside '{here}'.", hint="Name a file in it.")
-    near = _nearest(wanted, entries)
-    hint = f"Did you mean '{near}'?" if near is not None else None
+    hint = meant(_nearest(wanted, entries))
     raise LoadFailed(f"'{path}' does not exist: '{here}' has no file '{wanted}'.", hint=hint)
 
 

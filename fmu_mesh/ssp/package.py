@@ -21,7 +21,7 @@ from ..archives.archive_entries import LIMITS_HINT
 from ..config.mesh import LimitsConfig, RecordConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import OpenFmu, opened
-from ..text import listed, nearest, nearest_file
+from ..text import listed, meant, nearest, nearest_file
 from .problems import Problems
 from .system_structure import FilePlace
 
@@ -67,7 +67,7 @@ class Package:
         self._open = ExitStack()
         self._containers: dict[str, OpenFmu] = {}
         if is_ssd and not files.is_file(path):
-            raise _no_such_file(path)
+            raise ConfigurationError(f"{path}: no such file", hint=meant(nearest_file(path)))
         if is_ssd and beginning(path) == ARCHIVE:
             raise ConfigurationError(f"'{path}' is a ZIP archive, and no description", hint="Name it .ssp.")
         self._container("")
@@ -91,9 +91,9 @@ class Package:
         names = [name for name in self.names() if name.lower().endswith(".ssd") and "/" not in name]
         return sorted(names, key=lambda name: (name != DEFAULT, name))
 
-    def names(self, container: str = "") -> list[str]:
-        """The names of all files of the package, or of an archive inside it."""
-        return sorted(self._container(container).contents().names)
+    def names(self) -> list[str]:
+        """The names of all files of the package."""
+        return sorted(self._container("").contents().names)
 
     def shown(self, name: str) -> str:
         """A file as messages name it."""
@@ -114,8 +114,7 @@ class Package:
         """
         owner = self._owner(name)
         if owner is None:
-            near = nearest(name, self.names())
-            hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(self.names())}."
+            hint = meant(nearest(name, self.names()), f"It has {listed(self.names())}.")
             raise ConfigurationError(f"'{self.root}' has no file '{name}'", hint=hint)
         try:
             if owner[1].startswith("../"):
@@ -131,8 +130,7 @@ class Package:
             ConfigurationError: there is no such file, or it cannot be read.
         """
         if not files.is_file(path):
-            near = nearest(str(path), self.names()) or nearest_file(path)
-            hint = f"Did you mean '{near}'?" if near is not None else None
+            hint = meant(nearest(str(path), self.names()) or nearest_file(path))
             raise ConfigurationError(f"'{path}': there is no such file, nor is it in '{self.root}'", hint=hint)
         try:
             size, limit = path.stat().st_size, LimitsConfig().description_bytes
@@ -180,22 +178,13 @@ class Package:
         """The container that has a file (empty: the package itself), and the name of the file in it."""
         container, rest = "", name
         if name.startswith("../"):  # beside the folder of the package
-            parts = PurePosixPath(name).parts
-            whole = ["/".join(parts[: count + 1]) for count in range(len(parts))]
+            whole = [*_around(name), name]
             container = next((one for one in whole if files.is_file(self.root / one)), "")
             if container in ("", name):
                 return ("", name) if container else None
             rest = name[len(container) + 1 :]
-        while rest not in self._container(container).contents().names:
-            parts = PurePosixPath(rest).parts
-            inner = next(
-                (
-                    joined
-                    for count in range(1, len(parts))
-                    if (joined := "/".join(parts[:count])) in self._container(container).contents().names
-                ),
-                None,
-            )
+        while rest not in (names := self._container(container).contents().names):
+            inner = next((one for one in _around(rest) if one in names), None)
             if inner is None:
                 return None
             container, rest = posixpath.join(container, inner), rest[len(inner) + 1 :]
@@ -206,13 +195,18 @@ class Package:
         if name not in self._containers:
             path = self.root / name if name else self.root
             if not name and not files.exists(path):
-                raise _no_such_file(path)
+                raise ConfigurationError(f"{path}: no such file", hint=meant(nearest_file(path)))
             try:
                 self._containers[name] = self._open.enter_context(opened(path))
             except LoadFailed as error:
                 text = error.message.replace(", so it is no FMU", "")
                 raise ConfigurationError(text, hint=_way_out(path, error)) from error
         return self._containers[name]
+
+
+def _around(name: str) -> list[str]:
+    """What a file may lie in: the beginnings of its name that end before a `/`, the shortest first."""
+    return [str(path) for path in reversed(PurePosixPath(name).parents)]
 
 
 def _way_out(path: Path, error: LoadFailed) -> str | None:
@@ -238,8 +232,3 @@ def beginning(path: Path) -> bytes:
             return file.read(len(ARCHIVE))
     except OSError:
         return b""
-
-
-def _no_such_file(path: Path) -> ConfigurationError:
-    near = nearest_file(path)
-    return ConfigurationError(f"{path}: no such file", hint=f"Did you mean '{near}'?" if near is not None else None)

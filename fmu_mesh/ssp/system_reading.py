@@ -23,7 +23,7 @@ from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
 from ..system.graph import feedback_edges, fewest_feedback_edges
-from ..text import listed, nearest
+from ..text import listed, meant, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable
 from .flattening import FlatConnection, flatten
 from .grammar import PATTERNS, number_of
@@ -113,7 +113,7 @@ def chosen_description(package: Package, ssd: str | None) -> str:
     if ssd in titles:
         return titles[ssd]
     near = nearest(ssd, [*names, *(posixpath.splitext(name)[0] for name in names), *titles])
-    hint = f"Did you mean '{near}'?" if near is not None else f"It has {listed(names)}."
+    hint = meant(near, f"It has {listed(names)}.")
     raise ConfigurationError(f"'{package.root}' has no description '{ssd}'", hint=hint)
 
 
