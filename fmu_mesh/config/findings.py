@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
+
+import msgspec
 
 from fmu_mesh.errors import ConfigurationError, Finding
+from fmu_mesh.files import beside
 
-__all__ = ["CONTAINERS", "Findings", "ValueOrigin", "located"]
+__all__ = ["CONTAINERS", "Findings", "ValueOrigin", "Written", "located"]
+
+C = TypeVar("C")
 
 CONTAINERS = re.compile(
     r"|simulation|connections|initialization|record|zenoh|timeouts|limits|(scenario\.)?(values|events)|scenario"
@@ -129,6 +135,32 @@ class Findings:
             by_line = sorted(self._items, key=lambda one: (files.index(one.file), one.line is None, one.line or 0))
             text = f"{self._file}: {len(by_line)} problems" if len(by_line) > 1 else str(by_line[0])
             raise ConfigurationError(text, findings=tuple(by_line), plan=plan)
+
+
+class Written(msgspec.Struct, Generic[C], frozen=True):
+    """What a file says, and where each part of it stands.
+
+    Attributes:
+        config: what it says, overrides included.
+        file: the file as the user named it; relative paths in it refer to its folder.
+        lines: line numbers, counted from 1, by path in the file.
+        overrides: the option (`start_values={'pendulum.l': 2}`) that replaced a value, by path in the file.
+        origins: where a value was written, by path in the file, if that is another file.
+    """
+
+    config: C
+    file: Path
+    lines: dict[str, int] = {}
+    overrides: dict[str, str] = {}
+    origins: dict[str, ValueOrigin] = {}
+
+    def findings(self) -> Findings:
+        """An empty collection of findings about this file."""
+        return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
+
+    def resolve(self, relative: str) -> Path:
+        """The absolute path for a path in the file, which is relative to the folder of the file."""
+        return beside(self.file, relative)
 
 
 def located(

@@ -19,14 +19,14 @@ from typing import Final, NamedTuple
 import msgspec
 from msgspec import inspect, structs
 
-from fmu_mesh.config.findings import CONTAINERS, Findings, ValueOrigin, located
+from fmu_mesh.config.findings import CONTAINERS, Findings, ValueOrigin, Written, located
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, Kinds, keys_of
 from fmu_mesh.config.mesh import Config, config_type
 from fmu_mesh.config.scenario_section import ScenarioConfig, ScenarioSource
 from fmu_mesh.config.structure import check
 from fmu_mesh.config.yaml_text import Plain, read
 from fmu_mesh.errors import Finding
-from fmu_mesh.files import archive_on_the_way, beside, opened
+from fmu_mesh.files import archive_on_the_way, opened
 from fmu_mesh.text import listed, nearest, nearest_file, option_text, shown
 
 __all__ = [
@@ -89,30 +89,16 @@ class PlainConfig(NamedTuple):
     foreign: str = ""
 
 
-class LoadedConfig(msgspec.Struct, frozen=True):
+class LoadedConfig(Written[Config], frozen=True):
     """A configuration with a valid structure, and the line of each of its parts.
 
     Attributes:
-        config: the configuration, overrides included.
-        file: the file as the user named it.
-        lines: line numbers, counted from 1, by path in the file.
-        overrides: the option (`start_values={'pendulum.l': 2}`) that replaced a value, by path in the file.
-        origins: where a value was written, by path in the file, if that is another file.
         warnings: findings of the file that do not prevent a run.
         foreign: as in `PlainConfig`.
     """
 
-    config: Config
-    file: Path
-    lines: dict[str, int] = {}
-    overrides: dict[str, str] = {}
-    origins: dict[str, ValueOrigin] = {}
     warnings: tuple[Finding, ...] = ()
     foreign: str = ""
-
-    def findings(self) -> Findings:
-        """An empty collection of findings about this file."""
-        return Findings(str(self.file), self.lines, self.overrides, origins=self.origins)
 
     def origin(self, path: str) -> ValueOrigin:
         """Where the value at ``path`` comes from: a file and a line of it, or an option."""
@@ -128,10 +114,6 @@ class LoadedConfig(msgspec.Struct, frozen=True):
         """A finding with the file and the line of ``path``."""
         origin = self.origin(path)
         return Finding(origin.file or str(self.file), path, found, expected, suggestion, origin.line)
-
-    def resolve(self, relative: str) -> Path:
-        """The absolute path for a path in the file, which is relative to the folder of the file."""
-        return beside(self.file, relative)
 
 
 def read_file(path: Path) -> PlainConfig:
@@ -174,7 +156,7 @@ def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | 
     if section is None:
         return None
     if isinstance(section, ScenarioConfig):
-        return ScenarioSource(section, "scenario.", loaded.file, loaded.lines, loaded.overrides)
+        return ScenarioSource(section, loaded.file, loaded.lines, loaded.overrides, prefix="scenario.")
     path = loaded.resolve(section)
     if not section or not path.is_file():
         found, expected = f"no such file '{section}'", "a file with values and events"
@@ -189,7 +171,7 @@ def read_scenario(loaded: LoadedConfig, findings: Findings) -> ScenarioSource | 
     config = _partial_scenario(plain.data, own.places)
     findings.merge(own)
     wrong = frozenset(place for place in own.places if not CONTAINERS.fullmatch(place))
-    return ScenarioSource(config, "", plain.file, plain.lines, {}, wrong) if config is not None else None
+    return ScenarioSource(config, plain.file, plain.lines, wrong=wrong) if config is not None else None
 
 
 def examine_data(plain: PlainConfig, overrides: Mapping[str, Plain], kinds: Kinds) -> tuple[LoadedConfig, Findings]:

@@ -5,14 +5,12 @@ Owns the keys. What the names in them mean, and the files with values, are `fmu_
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from fmu_mesh.config.base import Base
-from fmu_mesh.config.findings import Findings
-from fmu_mesh.files import beside
+from fmu_mesh.config.findings import Findings, Written
 
 __all__ = ["ScenarioConfig", "ScenarioEvent", "ScenarioSource", "ScenarioValues"]
 
@@ -85,31 +83,19 @@ class ScenarioConfig(Base, frozen=True, kw_only=True):
         return not self.values and not self.events
 
 
-class ScenarioSource(NamedTuple):
-    """A scenario, and where it stands.
+class ScenarioSource(Written[ScenarioConfig], frozen=True):
+    """A scenario, and where it stands: in a configuration, or in a file of its own.
 
     Attributes:
-        config: what it says.
         prefix: in front of each of its paths in the file: `scenario.` in a configuration, nothing in a file of its own.
-        file: the file that it stands in; relative paths in it refer to the folder of this file.
-        lines: line numbers, counted from 1, by path in the file.
-        overrides: the option that replaced a value, by path in the file.
         wrong: the places in a file of its own for which there are findings already.
     """
 
-    config: ScenarioConfig
-    prefix: str
-    file: Path
-    lines: dict[str, int]
-    overrides: dict[str, str]
+    prefix: str = ""
     wrong: frozenset[str] = frozenset()
 
     def findings(self) -> Findings:
         """An empty collection of findings about this file."""
-        made = Findings(str(self.file), self.lines, self.overrides)
+        made = super().findings()
         made.explain(self.wrong)
         return made
-
-    def resolve(self, relative: str) -> Path:
-        """The absolute path for a path in the file."""
-        return beside(self.file, relative)

@@ -8,7 +8,7 @@ levels in the torn graph. These levels are repeated until the torn connections h
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 
 import msgspec
@@ -188,19 +188,20 @@ def _reached(system: ResolvedSystem, connections: Sequence[Connection]) -> dict[
         outputs.setdefault(c.source_instance, {})[c.source.name] = c.source
         if c.initial_only:
             parameters.setdefault(c.target_instance, []).append(c.target.name)
-    dependents = {
-        instance: _Dependents(
-            (output, _dependencies(output, parameters.get(instance, []), system.instances[instance].description))
-            for output in own.values()
-        )
-        for instance, own in outputs.items()
-    }
-    return {
-        id(c): [(c.target_instance, name) for name in dependents[c.target_instance].of(c.target.name)]
-        if c.target_instance in dependents
-        else []
-        for c in connections
-    }
+    # By instance and known: the outputs that depend on it, with their places; those that may depend on all by None.
+    dependents: dict[tuple[str, str | None], list[tuple[int, str]]] = {}
+    for instance, own in outputs.items():
+        for number, output in enumerate(own.values()):
+            description = system.instances[instance].description
+            declared = _dependencies(output, parameters.get(instance, []), description)
+            for known in dict.fromkeys(declared) if declared is not None else (None,):
+                dependents.setdefault((instance, known), []).append((number, output.name))
+    reached = {}
+    for c in connections:
+        target = c.target_instance
+        both = dependents.get((target, None), []) + dependents.get((target, c.target.name), [])
+        reached[id(c)] = [(target, name) for _, name in sorted(both)]
+    return reached
 
 
 def _dependencies(source: Variable, parameters: Sequence[str], description: ModelDescription) -> tuple[str, ...] | None:
@@ -218,23 +219,6 @@ def _dependencies(source: Variable, parameters: Sequence[str], description: Mode
     if declared is None or version in ("2", "3") or (given and version != "1"):
         return declared
     return (*declared, *parameters)
-
-
-class _Dependents:
-    """Which of the outputs of an instance depend on an input, in the order of the outputs."""
-
-    def __init__(self, outputs: Iterable[tuple[Variable, tuple[str, ...] | None]]) -> None:
-        self._on_all: list[tuple[int, str]] = []
-        self._on: dict[str, list[tuple[int, str]]] = {}
-        for number, (output, dependencies) in enumerate(outputs):
-            if dependencies is None:
-                self._on_all.append((number, output.name))
-            for known in dict.fromkeys(dependencies or ()):
-                self._on.setdefault(known, []).append((number, output.name))
-
-    def of(self, known: str) -> list[str]:
-        """The names of the outputs that depend on ``known``."""
-        return [name for _, name in sorted(self._on_all + self._on.get(known, []))]
 
 
 def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list[list[list[Key]]]:
