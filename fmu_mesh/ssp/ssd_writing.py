@@ -6,7 +6,6 @@ into the package is `exporting`, and what no version can say is `own_annotation`
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
@@ -20,7 +19,7 @@ from ..system.system import Connection, ResolvedSystem
 from ..system.value_map import map_words
 from ..variables.model_description import Kind, ModelDescription, Value, Variable
 from ..variables.units import BaseUnit
-from ..variables.value_conversion import to_value
+from ..variables.value_conversion import to_plain, to_value
 from ..variables.value_types import FMI2_TYPES, flattened
 from .grammar import NAMESPACES
 from .own_annotation import ANNOTATION_ELEMENT, ANNOTATION_TYPE
@@ -330,10 +329,8 @@ def _text_of(value: Value, variable: Variable) -> str:
 
 
 def _number_text(value: float) -> str:
-    """A number as xs:double, which gives back the same one."""
-    if math.isfinite(value):
-        return repr(float(value))
-    return "NaN" if math.isnan(value) else "INF" if value > 0.0 else "-INF"
+    """A number as xs:double, which gives back the same one: its words for NaN and infinity are those of FMI."""
+    return str(to_plain(float(value)))
 
 
 def _tag_of(name: str) -> str:
