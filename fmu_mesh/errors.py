@@ -183,16 +183,8 @@ class FmuMeshError(Exception):
 
     def report(self) -> ErrorReport:
         """Convert this error to a value that can be sent to another process."""
-        return ErrorReport(
-            kind=type(self).__name__,
-            message=self.message,
-            exit_code=self.exit_code,
-            instance=self.instance,
-            variable=self.variable,
-            point=self.point,
-            time=self.time,
-            hint=self.hint,
-        )
+        fields = ErrorReport.__struct_fields__[1:]  # all but the kind have the names of our attributes
+        return ErrorReport(type(self).__name__, **{name: getattr(self, name) for name in fields})
 
 
 class Finding(msgspec.Struct, frozen=True):

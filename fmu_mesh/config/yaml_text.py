@@ -273,13 +273,7 @@ class _Reader:
 
 
 class _SyntaxProblem(msgspec.Struct, frozen=True):
-    """An error of syntax in plain words.
-
-    Attributes:
-        line: the line of the cause, counted from 1.
-        found: what the text has there.
-        expected: what would be valid.
-    """
+    """An error of syntax in plain words, with the line of its cause, counted from 1."""
 
     line: int
     found: str

@@ -230,13 +230,7 @@ def _to_package(file: Path) -> Callable[[str], str]:
 
 
 class _KeptPackage(NamedTuple):
-    """A package on the disk.
-
-    Attributes:
-        root: the archive or the folder.
-        name: the file of the description that was read.
-        document: its bytes.
-    """
+    """A package on the disk, an archive or a folder, with the name and the bytes of the description that was read."""
 
     root: Path
     name: str
@@ -291,11 +285,7 @@ class _KeptPackage(NamedTuple):
         return path
 
     def lost(self, kept_units: set[str]) -> tuple[Finding, ...]:
-        """What a new description does not have, each with its first line.
-
-        Args:
-            kept_units: the names of the units that the new one defines.
-        """
+        """What a new description, which defines the units ``kept_units``, does not have; each with its first line."""
         root = self._tree()
         found = [*_lost_elements(root, kept_units), *self._lost_files(root)]
         return tuple(Finding(self.shown, "", f"not in the new package: {text}", "", line=line) for line, text in found)

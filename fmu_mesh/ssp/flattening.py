@@ -110,8 +110,9 @@ def flatten(
 
 class _Flattening:
     def __init__(self, describe: Describe, problems: Problems, units: Mapping[tuple[Path, str], Unit]) -> None:
+        self._describe = describe
         self._problems = problems
-        self._ends = _ConnectionEnds(describe, problems, units)
+        self._units = units
         self._inbound: dict[tuple[Path, str], _Segment] = {}
 
     def collect(self, system: StructureSystem, path: Path) -> None:
@@ -120,9 +121,9 @@ class _Flattening:
             if isinstance(element, StructureSystem):
                 self.collect(element, (*path, element.name))
             else:
-                self._ends.check(element, (*path, element.name))
+                self._check(element, (*path, element.name))
         for connection in system.connections:
-            segment = self._ends.segment(system, path, connection)
+            segment = self._segment(system, path, connection)
             if segment is None:
                 continue
             other = self._inbound.get(segment.target.node)
@@ -221,65 +222,9 @@ class _Flattening:
             self._problems.add(segment.connection.place, found, expected)
         return change
 
+    # --- ends
 
-def _by_variables(source: _ConnectionEnd, target: _ConnectionEnd, own: Linear, *, relative: bool) -> Linear | None:
-    """What a connection does by the units of the two variables alone; None if it would be refused."""
-    have, want = source.variable, target.variable
-    if have is None or want is None or have.base_unit is None or want.base_unit is None:
-        return own
-    change = conversion(have.base_unit, want.base_unit, relative=relative)
-    return change.then(own) if change is not None else None
-
-
-class _ConnectionEnd(msgspec.Struct, frozen=True):
-    """One end of a connection.
-
-    Attributes:
-        owner: whose connector it is, as seen from the system with the connection.
-        variable: that of an FMU; None for a connector of a system.
-    """
-
-    path: Path
-    name: str
-    owner: _Owner
-    kind: str
-    unit: Unit | None
-    variable: Variable | None = None
-    index: tuple[int, ...] = ()
-    is_component: bool = False
-
-    @property
-    def node(self) -> tuple[Path, str]:
-        """What it is connected by: the variable, or an element of it."""
-        return self.path, element_name(self.name, tuple(one - 1 for one in self.index)) if self.index else self.name
-
-    def __str__(self) -> str:
-        return ".".join((*self.path, self.node[1]))
-
-
-class _Segment(msgspec.Struct, frozen=True):
-    """A connection with its direction."""
-
-    source: _ConnectionEnd
-    target: _ConnectionEnd
-    connection: StructureConnection
-
-
-class _ConnectionEnds:
-    """Finds the two ends of connections; ``units`` are those of connectors of systems that have none of their own."""
-
-    def __init__(self, describe: Describe, problems: Problems, units: Mapping[tuple[Path, str], Unit]) -> None:
-        self._describe = describe
-        self._problems = problems
-        self._units = units
-
-    def segment(self, system: StructureSystem, path: Path, connection: StructureConnection) -> _Segment | None:
-        """A connection of a system with its direction; None after a finding."""
-        first = self._end(system, path, connection, "start")
-        second = self._end(system, path, connection, "end")
-        return self._directed(first, second, connection) if first is not None and second is not None else None
-
-    def check(self, component: StructureComponent, path: Path) -> None:
+    def _check(self, component: StructureComponent, path: Path) -> None:
         """Check that the connectors of a component are what its FMU has."""
         description = self._describe(path)
         if description is None:
@@ -315,10 +260,12 @@ class _ConnectionEnds:
         found = f"the unit '{unit.name}', while the FMU has '{variable.unit}'; that of the connector counts"
         self._problems.warn(connector.place, found)
 
-    def _directed(
-        self, first: _ConnectionEnd, second: _ConnectionEnd, connection: StructureConnection
-    ) -> _Segment | None:
-        """A connection with its direction; None after a finding."""
+    def _segment(self, system: StructureSystem, path: Path, connection: StructureConnection) -> _Segment | None:
+        """A connection of a system with its direction; None after a finding."""
+        first = self._end(system, path, connection, "start")
+        second = self._end(system, path, connection, "end")
+        if first is None or second is None:
+            return None
         forwards, backwards = _may_flow(first, second), _may_flow(second, first)
         if forwards and not backwards:
             return _Segment(first, second, connection)
@@ -411,6 +358,49 @@ class _ConnectionEnds:
         if unit is None and variable is not None and variable.unit:
             unit = Unit(variable.unit, variable.base_unit)
         return _ConnectionEnd(path, name, "element", kind or "unspecified", unit, variable, index, is_component=True)
+
+
+def _by_variables(source: _ConnectionEnd, target: _ConnectionEnd, own: Linear, *, relative: bool) -> Linear | None:
+    """What a connection does by the units of the two variables alone; None if it would be refused."""
+    have, want = source.variable, target.variable
+    if have is None or want is None or have.base_unit is None or want.base_unit is None:
+        return own
+    change = conversion(have.base_unit, want.base_unit, relative=relative)
+    return change.then(own) if change is not None else None
+
+
+class _ConnectionEnd(msgspec.Struct, frozen=True):
+    """One end of a connection.
+
+    Attributes:
+        owner: whose connector it is, as seen from the system with the connection.
+        variable: that of an FMU; None for a connector of a system.
+    """
+
+    path: Path
+    name: str
+    owner: _Owner
+    kind: str
+    unit: Unit | None
+    variable: Variable | None = None
+    index: tuple[int, ...] = ()
+    is_component: bool = False
+
+    @property
+    def node(self) -> tuple[Path, str]:
+        """What it is connected by: the variable, or an element of it."""
+        return self.path, element_name(self.name, tuple(one - 1 for one in self.index)) if self.index else self.name
+
+    def __str__(self) -> str:
+        return ".".join((*self.path, self.node[1]))
+
+
+class _Segment(msgspec.Struct, frozen=True):
+    """A connection with its direction."""
+
+    source: _ConnectionEnd
+    target: _ConnectionEnd
+    connection: StructureConnection
 
 
 def _may_flow(source: _ConnectionEnd, target: _ConnectionEnd) -> bool:

@@ -88,7 +88,6 @@ class Merged(NamedTuple):
     """A configuration with what an annotation says.
 
     Attributes:
-        data: the values of the configuration.
         paths: what the annotation says of it, such as `simulation.step_size`.
         gone: what the annotation says about instances and connections that there are not.
     """

@@ -39,7 +39,6 @@ class FixedPoint:
 
     Attributes:
         assumed: by (instance, input).
-        sweeps: number of sweeps so far.
     """
 
     def __init__(self, loop: Loop, settings: InitializationConfig) -> None:

@@ -46,7 +46,6 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
-        scenario: what a scenario prescribes for its variables.
         row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario.
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
@@ -129,9 +128,6 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rings: the output rings of its instances, and of all instances that it has values from.
         loops: the algebraic loops at the start that have instances of this node.
         initialization: how these loops are iterated.
-        links_in: links that end here.
-        links_out: links that start here.
-        restarts: how many times the run was restarted.
         shared_memory: whether processes of one host exchange messages through shared memory.
         records: the result files, if it is the recorder.
     """

@@ -36,14 +36,7 @@ _TRUTH = {"true": True, "1": True, "1.0": True, "false": False, "0": False, "0.0
 
 
 class SeriesRefused(ValueError):
-    """A table that cannot be used: what was found, and what would be right.
-
-    Args:
-        found: what is wrong.
-        expected: what would be right.
-        key: the key of the scenario that it is about.
-        suggestion: the nearest right name, if there is one.
-    """
+    """A table that cannot be used: what was found and expected, and the key of the scenario that it is about."""
 
     def __init__(self, found: str, expected: str, key: str = "file", suggestion: str | None = None) -> None:
         super().__init__(found)

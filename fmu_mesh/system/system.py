@@ -43,13 +43,10 @@ class SystemInstance(msgspec.Struct, frozen=True):
     """One instance of the system.
 
     Attributes:
-        name: instance name.
         fmu: absolute path of the model; empty for a kind without files.
-        description: its model description.
         start_values: start values by variable name, converted to the variable's type; with those of the scenario.
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
-        scenario: what a scenario prescribes for its variables.
         not_finite: what an output that is NaN or infinite means.
     """
 
