@@ -113,8 +113,9 @@ def chosen_description(package: Package, ssd: str | None) -> str:
     if ssd in titles:
         return titles[ssd]
     near = nearest(ssd, [*names, *(posixpath.splitext(name)[0] for name in names), *titles])
-    hint = meant(near, f"It has {listed(names)}.")
-    raise ConfigurationError(f"'{package.root}' has no description '{ssd}'", hint=hint)
+    raise ConfigurationError(
+        f"'{package.root}' has no description '{ssd}'", hint=meant(near, f"It has {listed(names)}.")
+    )
 
 
 class _Configuration:
