@@ -8,9 +8,9 @@ from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
-from ..system.grouping import automatic_nodes
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
+from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
 from ..system.series_files import course_of
 from ..system.system import Connection, SystemInstance

@@ -24,9 +24,8 @@ from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import Connection, Variables, resolve_connections, unit_warnings
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
-from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess
+from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule

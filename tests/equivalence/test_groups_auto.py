@@ -12,8 +12,8 @@ from fmu_mesh.config.loading import read_file
 from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.pictures.plan_page import plan_page
 from fmu_mesh.run.preparing import prepare
-from fmu_mesh.system.grouping import automatic_nodes
 from fmu_mesh.system.plan import RECORDER, Plan
+from fmu_mesh.system.process_sharing import automatic_nodes
 from tests.helpers import Place, rows_of, write_config
 
 ADDER = {"fmu": "Adder"}
