@@ -10,11 +10,12 @@ from typing import Final
 from .. import files
 from ..config.loading import PlainConfig, read_file
 from ..errors import ConfigurationError
-from .package import ARCHIVE, beginning, is_package
+from .package import ARCHIVE, DEFAULT, beginning
 
 __all__ = ["named_package", "names_package", "read_configuration"]
 
 _YAML: Final = (".yaml", ".yml", ".json")
+_PACKAGES: Final = (".ssp", ".ssd")
 _PARTS: Final = (".ssv", ".ssm", ".ssb")
 
 
@@ -68,7 +69,7 @@ def named_package(path: Path, ssd: str | None = None) -> tuple[Path, str | None]
 
 def names_package(path: Path) -> bool:
     """Whether a path is that of a package of SSP: by its suffix, or by what is in it if it has another one."""
-    if is_package(path):
+    if path.suffix.lower() in _PACKAGES or files.is_file(path / DEFAULT):
         return True
     if files.is_folder(path):
         return any(path.glob("*.ssd"))

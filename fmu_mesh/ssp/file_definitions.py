@@ -15,7 +15,7 @@ from ..variables.units import BaseUnit
 from ..variables.value_types import INTEGERS
 from .grammar import PATTERNS
 from .problems import Problems
-from .system_structure import Enumeration, FilePlace, MapEntry, Transformation, Unit
+from .system_structure import Enumeration, FilePlace, Transformation, Unit
 from .xml_reading import XmlElement
 
 __all__ = ["enumeration_named", "enumerations_of", "transformation_of", "unit_named", "units_of"]
@@ -91,7 +91,7 @@ def enumerations_of(root: XmlElement, tag: str, problems: Problems) -> dict[str,
                 problems.add(item.place, f"the value {number}", "a whole number of 64 bits")
             else:
                 items[name] = number
-        enumerations[element.text("name")] = Enumeration(element.text("name"), items)
+        enumerations[element.text("name")] = items
     return enumerations
 
 
@@ -120,7 +120,7 @@ def transformation_of(element: XmlElement, problems: Problems) -> Transformation
     kind = _KINDS[found[0].tag]
     if kind == "linear":
         return _linear(found[0], problems)
-    return Transformation(kind, found[0].place, entries=tuple(_entries(found[0], kind, problems)))
+    return Transformation(kind, found[0].place, entries=_entries(found[0], kind, problems))
 
 
 def _unique(root: XmlElement, tag: str, child: str, problems: Problems) -> Iterator[XmlElement]:
@@ -160,7 +160,8 @@ def _linear(element: XmlElement, problems: Problems) -> Transformation:
     return Transformation("linear", element.place, factor, offset)
 
 
-def _entries(element: XmlElement, kind: str, problems: Problems) -> Iterator[MapEntry]:
+def _entries(element: XmlElement, kind: str, problems: Problems) -> dict[str, str]:
+    entries: dict[str, str] = {}
     lines: dict[str, int] = {}
     for entry in element.children("ssc:MapEntry"):
         source, target = (_map_value(entry, side, kind, problems) for side in ("source", "target"))
@@ -171,7 +172,8 @@ def _entries(element: XmlElement, kind: str, problems: Problems) -> Iterator[Map
             problems.add(entry.place, found, f"one entry for each source (first: line {lines[source]})")
             continue
         lines[source] = entry.place.line
-        yield MapEntry(source, target, entry.place)
+        entries[source] = target
+    return entries
 
 
 def _map_value(entry: XmlElement, side: str, kind: str, problems: Problems) -> str | None:

@@ -195,7 +195,7 @@ class _Flattening:
             found = f"a mapping and a factor or a unit conversion on the way from '{source}' to '{target}'"
             self._problems.add(mapping.place, found, "one of the two")
             return None
-        entries = {one.source: one.target for one in mapping.entries} if mapping is not None else {}
+        entries = mapping.entries if mapping is not None else {}
         if mapping is None and _by_variables(source, target, own, relative=relative) == total:
             return PathChange(own, place=place)
         return PathChange(total, entries, ignore_units=mapping is None, place=place)

@@ -25,7 +25,7 @@ from ..text import listed, meant, nearest, nearest_file
 from .problems import Problems
 from .system_structure import FilePlace
 
-__all__ = ["ARCHIVE", "DEFAULT", "RESULT_BESIDE_PACKAGE", "Package", "beginning", "is_package"]
+__all__ = ["ARCHIVE", "DEFAULT", "RESULT_BESIDE_PACKAGE", "Package", "beginning"]
 
 ARCHIVE: Final = b"PK\x03\x04"
 """The first bytes of a ZIP archive with at least one file."""
@@ -35,12 +35,6 @@ RESULT_BESIDE_PACKAGE: Final = f"../{RecordConfig().file}"
 """The result file of a package that says none: beside the archive, and not in it."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
-_SUFFIXES: Final = (".ssp", ".ssd")
-
-
-def is_package(path: Path) -> bool:
-    """Whether a path is meant as a package: by its suffix, or as a folder with a SystemStructure.ssd."""
-    return path.suffix.lower() in _SUFFIXES or files.is_file(path / DEFAULT)
 
 
 class Package:

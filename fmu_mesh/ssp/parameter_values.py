@@ -92,10 +92,11 @@ def target_of_connector(connector: Connector, path: tuple[str, ...]) -> ValueTar
     """A connector of the system at ``path`` as a target."""
     sizes = tuple(size for size in connector.dimensions if isinstance(size, int))
     shape = None if len(sizes) < len(connector.dimensions) or connector.type is None else sizes
-    items = connector.enumeration.items if connector.enumeration is not None else {}
     owner = f" of '{'.'.join(path)}'" if path else ""
     words = f"the connector '{connector.name}'{owner}"
-    return ValueTarget(words, VARIABLE_TYPES.get(connector.type or ""), shape, connector.unit, items=items)
+    return ValueTarget(
+        words, VARIABLE_TYPES.get(connector.type or ""), shape, connector.unit, items=connector.enumeration or {}
+    )
 
 
 def converted(
@@ -106,7 +107,7 @@ def converted(
     The parameter has at least one value, and ``entry`` is that of the mapping that led to the target.
     """
     type_ = VARIABLE_TYPES[parameter.type]
-    items = parameter.enumeration.items if parameter.enumeration is not None else {}
+    items = parameter.enumeration or {}
     sizes = (len(parameter.values),) if len(parameter.values) > 1 else ()
     shape = _shape(parameter, parameter.dimensions or sizes, target, problems)
     if shape is None:
@@ -207,7 +208,7 @@ def _transformed(
     Raises:
         _Misfit: the transformation is not one for such values.
     """
-    entries = {entry.source: entry.target for entry in transformation.entries}
+    entries = transformation.entries
     match transformation.kind:
         case "linear":
             if target.type is not None and not is_float(target.type):

@@ -88,7 +88,7 @@ def read_values(package: Package, name: str, problems: Problems) -> Binding | No
     else:
         data, shown_name = package.read_beside(Path(name)), name
     root = read_xml(data, shown_name, "ssv:ParameterSet", problems)
-    return Binding(parameter_set(root, problems), root.place) if root is not None else None
+    return Binding(parameter_set(root, problems)) if root is not None else None
 
 
 class _Reader:
@@ -326,7 +326,7 @@ class _Reader:
                 refuse_ambiguous(parameters, parameters.ambiguous, self._problems)
                 return None
             entries = parameter_mapping(found, self._problems)
-        return Binding(parameters, element.place, element.get("prefix") or "", entries)
+        return Binding(parameters, element.get("prefix") or "", entries)
 
     def _referred(  # noqa: PLR0913, PLR0917  what a reference consists of
         self,

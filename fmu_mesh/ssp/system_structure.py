@@ -22,7 +22,6 @@ __all__ = [
     "Element",
     "Enumeration",
     "FilePlace",
-    "MapEntry",
     "MappingEntry",
     "ParameterMapping",
     "ParameterSet",
@@ -47,6 +46,10 @@ ConnectorKind = Literal[
     "local",
     "unspecified",
 ]
+
+
+Enumeration = dict[str, int]
+"""An enumeration that a file defines (SSP 2.0, 4.4.1): the values by the names of the items."""
 
 
 class FilePlace(msgspec.Struct, frozen=True):
@@ -75,13 +78,6 @@ class Unit(msgspec.Struct, frozen=True):
     base: BaseUnit | None = None
 
 
-class Enumeration(msgspec.Struct, frozen=True):
-    """An enumeration that a file defines (SSP 2.0, 4.4.1): the values by the names of the items."""
-
-    name: str
-    items: dict[str, int]
-
-
 class Connector(msgspec.Struct, frozen=True):
     """A connector of an element (SSP 2.0, 5.2.1).
 
@@ -102,26 +98,19 @@ class Connector(msgspec.Struct, frozen=True):
     dimensions: tuple[int | str | None, ...] = ()
 
 
-class MapEntry(msgspec.Struct, frozen=True):
-    """One entry of a mapping of values: both are `true` or `false`, a whole number as `3`, or the name of an item."""
-
-    source: str
-    target: str
-    place: FilePlace
-
-
 class Transformation(msgspec.Struct, frozen=True):
     """A transformation of a connection or of a mapped parameter (SSP 2.0, 4.5.2).
 
     Attributes:
         kind: linear: factor and offset; otherwise ``entries``.
+        entries: targets by sources: both are `true` or `false`, a whole number as `3`, or the name of an item.
     """
 
     kind: Literal["linear", "boolean", "integer", "enumeration"]
     place: FilePlace
     factor: float = 1.0
     offset: float = 0.0
-    entries: tuple[MapEntry, ...] = ()
+    entries: dict[str, str] = {}
 
 
 class StructureConnection(msgspec.Struct, frozen=True):
@@ -204,7 +193,6 @@ class Binding(msgspec.Struct, frozen=True):
     """
 
     values: ParameterSet
-    place: FilePlace
     prefix: str = ""
     mapping: ParameterMapping | None = None
 

@@ -30,7 +30,7 @@ from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
 from .start_values import why_not_settable
 from .system import Connection, ResolvedSystem, SystemInstance
-from .window import batch_of, recorder_window, rows_of_ring, window_of
+from .window import recorder_window, rows_of_ring, window_of
 
 __all__ = ["MASTER", "RECORDER", "Feed", "InstancePlan", "Link", "NodePlan", "Plan", "make_plan"]
 
@@ -298,7 +298,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
-            batch=1 if shared else batch_of(plan.window),  # a cycle over several nodes waits for each row
+            batch=1 if shared else max(1, plan.window // 16),  # a cycle over several nodes waits for each row
             memory=memory,
             rings=tuple(
                 places[name]

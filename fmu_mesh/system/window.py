@@ -13,7 +13,6 @@ from .system import ResolvedSystem
 __all__ = [
     "AUTO_WINDOW_POINTS",
     "STEADY_POINTS",
-    "batch_of",
     "recorder_window",
     "rows_for",
     "rows_of_ring",
@@ -44,11 +43,6 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
     The window is that of the mesh in points, the sizes in bytes those of the rows of all recorded instances.
     """
     return max(window, min(RECORDER_WINDOW, _ROOM_BYTES // max(sum(row_sizes), 1)))
-
-
-def batch_of(window: int) -> int:
-    """Number of points that a node may sleep for if no other waits for its next one; ``window``: of the mesh."""
-    return max(1, window // 16)
 
 
 def window_of(system: ResolvedSystem, outputs: Iterable[Layout], asked: int | None = None) -> int:

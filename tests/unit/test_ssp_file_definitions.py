@@ -157,7 +157,7 @@ def _enumerations(*enumerations: str) -> tuple[dict[str, Enumeration], Problems]
 def test_an_enumeration_is_read_with_the_numbers_of_its_items() -> None:
     found, problems = _enumerations(ITEMS.format("State", "on", "-5"))
 
-    assert found == {"State": Enumeration("State", {"off": 0, "on": -5})}
+    assert found == {"State": {"off": 0, "on": -5}}
     assert not problems.findings
 
 
@@ -229,7 +229,7 @@ def test_a_mapping_of_values_is_read_in_the_shortest_form(
 
     assert found is not None
     assert found.kind == kind.lower()
-    assert [(entry.source, entry.target) for entry in found.entries] == expected
+    assert [*found.entries.items()] == expected
     assert not problems.findings
 
 

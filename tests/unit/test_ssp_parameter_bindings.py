@@ -298,8 +298,7 @@ def test_any_bindings_give_what_a_search_over_all_of_them_gives(
     def own(path: tuple[str, ...]) -> tuple[Binding, ...]:
         return tuple(
             Binding(
-                ParameterSet("s", tuple(ParameterValue(n, "Real", (str(v),), place) for n, v in values.items()), place),
-                place,
+                ParameterSet("s", tuple(ParameterValue(n, "Real", (str(v),), place) for n, v in values.items()), place)
             )
             for owner, values in numbered
             if owner == path
@@ -355,7 +354,7 @@ def test_the_value_of_an_fmu_that_cannot_be_read_is_not_judged() -> None:
     place = FilePlace("x.ssd", 1, "")
     values = ParameterSet("s", (ParameterValue("k", "Real", ("1",), place),), place)
     system = StructureSystem(
-        "r", place, elements=(StructureComponent("g", "g.fmu", place, bindings=(Binding(values, place),)),)
+        "r", place, elements=(StructureComponent("g", "g.fmu", place, bindings=(Binding(values),)),)
     )
     problems = Problems()
 
