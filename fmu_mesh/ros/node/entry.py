@@ -154,7 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         node = create_node()
     except Exception as error:  # noqa: BLE001 rclpy raises many types for wrong arguments, and each says which
         print(f"fmu_mesh.ros.node: {_wrong_arguments(error)}", file=sys.stderr)  # noqa: T201 as above
-        rclpy.try_shutdown()
+        with _Deadline(f"ROS was not shut down within {_END_S:g} s", ConfigurationError.exit_code):
+            rclpy.try_shutdown()
         return ConfigurationError.exit_code
     try:
         executor = executors.SingleThreadedExecutor()
