@@ -342,7 +342,9 @@ class _Table:
             return None
         some = None if isinstance(places, range) else places
         try:
-            table: NDArray[np.float64] = np.loadtxt(io.BytesIO(body), delimiter=",", comments=None, ndmin=2, usecols=some)
+            table: NDArray[np.float64] = np.loadtxt(
+                io.BytesIO(body), delimiter=",", comments=None, ndmin=2, usecols=some
+            )
         except ValueError:
             return None
         # `loadtxt` passes over empty lines.

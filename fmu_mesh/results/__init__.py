@@ -1,0 +1,1 @@
+"""Result files: one module per format that writes, reads, follows and recovers its files, behind one contract."""
