@@ -7,11 +7,11 @@ text, or no library.
 The last row may be cut off where a run was killed, or goes on.
 """
 
-# Why lines are made in C, and why twice. The recorder shares the processors with nodes that step, and most of its time
-# is the text of numbers. orjson makes it fast, but it has to be split into cells again: to find its commas took NumPy a
-# quarter of the recorder's time (ADR 7). `csv_rows.c` writes the digits of a whole block into memory that is used again,
-# and copies the text of a value that has not changed. Python has the same characters for texts and for machines without
-# the library; tests compare both.
+# Why lines are made in C, and why twice. The recorder shares the processors with nodes that step, and most of its
+# time is the text of numbers. orjson makes it fast, but it has to be split into cells again: to find its commas took
+# NumPy a quarter of the recorder's time (ADR 7). `csv_rows.c` writes the digits of a whole block into memory that is
+# used again, and copies the text of a value that has not changed. Python has the same characters for texts and for
+# machines without the library; tests compare both.
 #
 # What may go wrong: the writer may be killed at any byte, and a reader may look at any moment. So `write` gives whole
 # rows to the operating system, nothing is buffered, and everybody who reads finds the end of the last whole row with
