@@ -8,34 +8,23 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import IO
 
 from ..errors import Interrupted
 from ..wire.runtime import is_stopped
 from .fork_server import Forked
 
-__all__ = ["Child", "Process", "how_it_ended", "is_other_python"]
+__all__ = ["Child", "Process", "how_it_ended"]
 
 Process = subprocess.Popen[bytes] | Forked
 """A process that was started by exec, or by the fork server. It leads a process group of the number of its `pid`."""
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000
-
-
-def is_other_python(interpreter: str) -> bool:
-    """Whether ``interpreter`` is not the Python that runs this process, with the packages that it has.
-
-    The Python of a virtual environment is a link in the folder of the environment.
-    """
-    own, other = Path(sys.executable), Path(interpreter)
-    return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())
 
 
 class Child:

@@ -38,7 +38,7 @@ from ..errors import Interrupted, MeshLost
 from ..files import remove_tree
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
-from .child import Child, Process, is_other_python
+from .child import Child, Process
 from .events import Event, OutputLine, Reachable, decode_event
 from .fork_server import ForkServer, executed, fork_server
 from .launcher_states import (
@@ -53,6 +53,7 @@ from .launcher_states import (
     Signal,
     Start,
 )
+from .one_process import is_other_python
 from .outcome import Outcome, outcome_at
 from .results import rows_left, what_is_kept
 from .run_plan import RunPlan

@@ -29,8 +29,8 @@ from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
-from .child import is_other_python
 from .events import Event, EventWriter, Log, Reachable, Status
+from .one_process import is_other_python
 from .outcome import Outcome, outcome_at
 from .process import RunProcess
 from .results import open_results
