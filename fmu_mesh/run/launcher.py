@@ -54,8 +54,9 @@ from .launcher_states import (
     Signal,
     Start,
 )
+from .one_process import is_other_python
 from .outcome import Outcome, outcome_at
-from .run_plan import RunPlan, is_other_python
+from .run_plan import RunPlan
 
 __all__ = ["Launcher"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -10,9 +11,8 @@ from ..errors import NotInOneProcess
 from ..instances.registry import claims
 from ..system.plan import Plan
 from ..system.process_sharing import Claims, ClaimsOf, SharedProcess
-from .run_plan import is_other_python
 
-__all__ = ["OneProcess", "apart", "claims_in"]
+__all__ = ["OneProcess", "apart", "claims_in", "is_other_python"]
 
 
 class OneProcess:
@@ -44,6 +44,15 @@ class OneProcess:
                 if (why := self._process.refusal(name, partial(claims_of, name))) is not None:
                     raise NotInOneProcess(why, hint=hint)
                 self._members.add(member)
+
+
+def is_other_python(interpreter: str) -> bool:
+    """Whether ``interpreter`` is not the Python that runs this process, with the packages that it has.
+
+    The Python of a virtual environment is a link in the folder of the environment.
+    """
+    own, other = Path(sys.executable), Path(interpreter)
+    return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())
 
 
 def apart(plan: Plan) -> list[str]:

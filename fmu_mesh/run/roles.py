@@ -31,9 +31,10 @@ from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status
+from .one_process import is_other_python
 from .outcome import Outcome, outcome_at
 from .process import RunProcess
-from .run_plan import MANUAL, NodeRun, RunPlan, is_other_python, opening_in, read_node, read_run
+from .run_plan import MANUAL, NodeRun, RunPlan, opening_in, read_node, read_run
 from .wiring import patient, wiring
 
 __all__ = ["job_of", "run_master", "run_node"]

@@ -6,7 +6,6 @@ Owns the file through which they get it. Each process decodes only the parts of 
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +25,7 @@ from ..text import counted, listed, nearest
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
 
-__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "is_other_python", "opening_in", "read_node", "read_run"]
+__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "opening_in", "read_node", "read_run"]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
@@ -250,12 +249,3 @@ def _no_node(plan: Plan, name: str) -> ConfigurationError:
     suggestion = nearest(name, names)
     hint = f"Did you mean '{suggestion}'?" if suggestion else None
     return ConfigurationError(f"there is no node '{name}'; there are: {listed(names)}.", hint=hint)
-
-
-def is_other_python(interpreter: str) -> bool:
-    """Whether ``interpreter`` is not the Python that runs this process, with the packages that it has.
-
-    The Python of a virtual environment is a link in the folder of the environment.
-    """
-    own, other = Path(sys.executable), Path(interpreter)
-    return (own.parent.resolve(), own.resolve()) != (other.parent.resolve(), other.resolve())

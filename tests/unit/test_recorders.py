@@ -9,7 +9,6 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from fmu_mesh.results.formats import result_endings, result_format
 
 import fmu_mesh
 from fmu_mesh import plugins
@@ -17,6 +16,7 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
 from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.formats import result_endings, result_format
 from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.results.record_files import rows_left
 from fmu_mesh.results.recording import ResultFile, ResultFormat
