@@ -14,23 +14,19 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 
 from ...errors import LoadFailed
-from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from ...variables.model_description import DefaultExperiment, ModelDescription
+from ..world_variables import WorldVariable, joint_variables, numbered, world_input, world_output
 from .gazebo_sdf import GazeboModel, read_world
 from .gazebo_section import GazeboClassicConfig
 
-__all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboLink", "GazeboWorld", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
-
-Where = Literal[
-    "state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"
-]
 
 _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""
@@ -60,20 +56,13 @@ class GazeboLink(msgspec.Struct, frozen=True):
     name: str
 
 
-class GazeboPlace(msgspec.Struct, frozen=True):
-    """Where the value of a variable is stored: the kind of value, and the index in the flat array of that kind."""
-
-    where: Where
-    index: int
-
-
 class GazeboWorld(msgspec.Struct, frozen=True):
     """A world.
 
     Attributes:
         text: the SDF that Gazebo gets.
         step_size: of the engine in s.
-        places: by variable name.
+        places: the variables by name.
     """
 
     text: bytes
@@ -81,7 +70,7 @@ class GazeboWorld(msgspec.Struct, frozen=True):
     joints: tuple[GazeboJoint, ...]
     links: tuple[GazeboLink, ...]
     description: ModelDescription
-    places: dict[str, GazeboPlace]
+    places: dict[str, WorldVariable]
 
 
 def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
@@ -95,21 +84,19 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
     moving = [model for model in sdf.models if model.moving]
     joints, links = _joints(moving, free, path), _links(moving)
-    variables = dict(_variables(joints, links))
+    variables = numbered(_variables(joints, links))
     description = ModelDescription(
         model_name=sdf.element.get("name") or path.stem,
         model_identifier="gazebo_classic",
         fmi_version="",
         kind="physics_engine",
         guid=hashlib.sha256(sdf.source).hexdigest()[:32],
-        variables=tuple(
-            msgspec.structs.replace(variable, value_reference=number) for number, variable in enumerate(variables)
-        ),
+        variables=tuple(own.variable for own in variables),
         generation_tool="Gazebo classic",
         default_experiment=DefaultExperiment(step_size=step_size),
         problems=sdf.notes,
     )
-    places = {variable.name: place for variable, place in variables.items()}
+    places = {own.variable.name: own for own in variables}
     return GazeboWorld(sdf.text, step_size, joints, links, description, places)
 
 
@@ -150,28 +137,19 @@ def _number(text: str | None, default: float, path: Path) -> float:
         raise LoadFailed(f"'{path}' has '{text.strip()}' where a number should be") from error
 
 
-def _variables(
-    joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]
-) -> Iterator[tuple[Variable, GazeboPlace]]:
+def _variables(joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]) -> Iterator[WorldVariable]:
     for number, joint in enumerate(joints):
-        length, effort = ("rad", "N.m") if joint.revolute else ("m", "N")
-        state, name = JOINT_STATE * number, joint.name
-        yield _entry(f"{name}.position", "output", length, "position of the joint", "state", state)
-        yield _entry(f"{name}.velocity", "output", f"{length}/s", "velocity of the joint", "state", state + 1)
-        text = "acceleration in the last step"
-        yield _entry(f"{name}.acceleration", "output", f"{length}/s2", text, "state", state + 2)
-        text = "effort applied in the last step"
-        yield _entry(f"{name}.effort_applied", "output", effort, text, "effort_applied", number)
-        yield _entry(f"{name}.effort_command", "input", effort, "what a controller asks for", "effort_command", number)
-        text = "what is applied, such as the torque of an actuator"
-        yield _entry(f"{name}.effort", "input", effort, text, "effort", number)
+        places = {what: (what, number) for what in ("effort_applied", "effort_command", "effort")}
+        in_state = enumerate(("position", "velocity", "acceleration"), JOINT_STATE * number)
+        places |= {what: ("state", place) for place, what in in_state}
+        yield from joint_variables(joint.name, places, revolute=joint.revolute)
     for number, link in enumerate(links):
         yield from _link_variables(link.name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
     for axis, letter in enumerate("xyz"):
-        yield _entry(f"wind_{letter}", "input", "m/s", "velocity of the medium in world axes", "wind", axis)
+        yield world_input(f"wind_{letter}", ("wind", axis), "m/s", "velocity of the medium in world axes")
 
 
-def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variable, GazeboPlace]]:
+def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariable]:
     in_state = (
         ("position", "xyz", "m", "of the link's origin in world axes"),
         ("orientation", "wxyz", "1", "attitude as a unit quaternion, link axes to world axes"),
@@ -180,35 +158,15 @@ def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variab
     )
     for what, letters, unit, text in in_state:
         for letter in letters:
-            yield _entry(f"{name}.{what}_{letter}", "output", unit, text, "state", state)
+            yield world_output(f"{name}.{what}_{letter}", ("state", state), unit, text)
             state += 1
     for axis, letter in enumerate("xyz"):
         place = 3 * number + axis
         text = "velocity of the medium in link axes"
-        yield _entry(f"{name}.wind_{letter}", "output", "m/s", text, "body_wind", place)
+        yield world_output(f"{name}.wind_{letter}", ("body_wind", place), "m/s", text)
         text = "velocity of the link's origin against the medium in link axes"
-        yield _entry(f"{name}.relative_velocity_{letter}", "output", "m/s", text, "relative_velocity", place)
+        yield world_output(f"{name}.relative_velocity_{letter}", ("relative_velocity", place), "m/s", text)
         text = "acts at the link's origin, in link axes"
-        yield _entry(f"{name}.force_{letter}", "input", "N", text, "wrench", 6 * number + axis)
+        yield world_input(f"{name}.force_{letter}", ("wrench", 6 * number + axis), "N", text)
         text = "acts about the link's origin, in link axes"
-        yield _entry(f"{name}.moment_{letter}", "input", "N.m", text, "wrench", 6 * number + 3 + axis)
-
-
-def _entry(  # noqa: PLR0913, PLR0917  each is a column of a table
-    name: str, causality: Causality, unit: str, text: str, where: Where, index: int
-) -> tuple[Variable, GazeboPlace]:
-    variable = Variable(
-        name=name,
-        value_reference=0,
-        type="Float64",
-        causality=causality,
-        variability="continuous",
-        initial=None if causality == "input" else "calculated",
-        start=0.0 if causality == "input" else None,
-        unit=unit,
-        description=text,
-        dependencies=(),  # at the first point the engine has not taken a step: nothing depends on an input
-        # Efforts and forces of the same step act on these at once.
-        feedthrough=None if name.endswith((".acceleration", ".effort_applied")) else (),
-    )
-    return variable, GazeboPlace(where, index)
+        yield world_input(f"{name}.moment_{letter}", ("wrench", 6 * number + 3 + axis), "N.m", text)
