@@ -49,9 +49,10 @@ Result = TypeVar("Result")
 # and for each `CallWatch` one thread that waits for the deadlines of its calls. ADR 12 says what is guarded, ADR 56 how
 # the line of a component is found, ADR 57 which steps are taken without Python.
 #
-# They share two attributes. Only the calling thread writes `_call` and `_position`, each with one assignment, and it
-# never waits for the watching thread to look. That one reads both once in a round and compares them with those of the
-# round before. It holds the lock of the condition from there until it waits, so a call that begins meanwhile wakes it.
+# They share two attributes. Only the calling thread writes `_call` and `_position` (or the one that crashes in its last
+# call), each with one assignment, and it never waits for the watching thread to look. That one reads both once in a
+# round and compares them with those of the round before. It holds the lock of the condition from there until it waits,
+# so a call that begins meanwhile wakes it.
 #
 # A call that hangs cannot be cancelled: no exception of Python reaches C, and a signal would interrupt the FMU
 # anywhere, perhaps while it holds a lock of malloc. So an overrun is told on the watching thread, and whoever owns the

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.instances.fmi.archive.archive import opened
-from fmu_mesh.instances.fmi.archive.library_names import rename_libraries
-from fmu_mesh.instances.fmi.archive.process_claims import claims_of
+from fmu_mesh.instances.fmi.archive.library_names import claims_of, rename_libraries
 from fmu_mesh.instances.fmi.archive.shared_library import read_shared_library
 from fmu_mesh.system.process_sharing import BOTH_USE_PYTHON, Claims, SharedProcess
 from tests.fmus.helpers import NO_COMPILER

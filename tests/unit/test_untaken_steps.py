@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.errors import StepFailed
+from fmu_mesh.errors import StepFailed, TerminationRequested
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.co_simulation.extrapolation import TakesDerivatives
 from fmu_mesh.instances.fmi.opening import open_instance, stepped
@@ -59,6 +59,23 @@ def test_what_fmi_1_repeats_it_repeats_without_wish_because_it_costs_nothing(ste
         instance.advance(0.0, 0.25)
 
         assert instance.get_values(["reached", "attempts"]) == [0.25, 3]
+
+
+@pytest.mark.parametrize("options", [StepOptions(), RETRY], ids=["as it is", "retrying"])
+def test_a_step_from_a_restored_state_does_not_end_the_run_again(
+    options: StepOptions, event_fmu: Callable[..., Path], tmp_path: Path
+) -> None:
+    with running(event_fmu("Stairs", 2), tmp_path, "co_simulation", 0.25, options, end=2) as stairs:
+        state = stairs.get_state()
+        for step in range(8):
+            stairs.do_step(step)
+        with pytest.raises(TerminationRequested):
+            stairs.do_step(8)
+
+        stairs.set_state(state)
+        stairs.do_step(0)
+
+        stairs.free_state(state)
 
 
 @pytest.mark.parametrize("flag", ["canRejectSteps", "canHandleVariableCommunicationStepSize"])

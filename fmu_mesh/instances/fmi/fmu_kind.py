@@ -193,7 +193,7 @@ class FmuKind(Kind[FmuConfig]):
     def claims(self, path: Path, section: FmuConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """What the libraries of the FMU have that a process has only once; nothing of those that are compiled here."""
         from .archive.archive import Terms, opened  # noqa: PLC0415  as above
-        from .archive.process_claims import claims_of  # noqa: PLC0415  as above
+        from .archive.library_names import claims_of  # noqa: PLC0415  as above
 
         if description.library is None:
             return {}

@@ -28,9 +28,10 @@ from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body
+from ..world_variables import WorldVariable
 from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess, check_program
 from .gazebo_section import GazeboClassicConfig
-from .gazebo_world import JOINT_STATE, LINK_STATE, GazeboPlace, load_gazebo_world
+from .gazebo_world import JOINT_STATE, LINK_STATE, load_gazebo_world
 
 __all__ = ["GazeboClassicInstance", "check_gazebo_classic"]
 
@@ -172,7 +173,7 @@ class GazeboClassicInstance:
         bad = (name for name, place in self._inputs_by_name.items() if not math.isfinite(self._value(place)))
         return next(bad, None)
 
-    def _value(self, place: GazeboPlace) -> float:
+    def _value(self, place: WorldVariable) -> float:
         return float(self._arrays[place.where][place.index])
 
     def _derive(self, links: Sequence[int]) -> None:
@@ -194,7 +195,7 @@ class GazeboClassicInstance:
         return StepFailed(f"Gazebo classic: {error}", instance=self.name)
 
 
-def _derived_links(places: Sequence[GazeboPlace]) -> list[int]:
+def _derived_links(places: Sequence[WorldVariable]) -> list[int]:
     """The links for which these places need a computation."""
     return sorted({place.index // 3 for place in places if place.where in {"body_wind", "relative_velocity"}})
 

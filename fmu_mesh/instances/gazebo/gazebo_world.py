@@ -1,8 +1,10 @@
-"""An SDF world as a model description, and where the value of each variable is stored.
+"""An SDF world for Gazebo classic: read, completed, checked, and as a model description.
 
-Owns names, units and meaning of the variables, which are those of `fmu_mesh.instances.mujoco.mujoco_world`, so that one
-configuration fits both engines; sensors and actuators of the model have no variables. Which parts of the file are
-simulated is in `fmu_mesh.instances.gazebo.gazebo_sdf`; the steps are in `fmu_mesh.instances.gazebo.gazebo_classic`.
+Owns which parts of SDF can be simulated, and where the value of each variable is stored. Parts that Gazebo would
+silently leave out and that change the motion are refused by name; parts that have no variables or do not change the
+motion are notes. Names, units and meaning of the variables are those of MuJoCo (`fmu_mesh.instances.world_variables`),
+so that one configuration fits both engines; sensors and actuators of the model have no variables. The steps are in
+`fmu_mesh.instances.gazebo.gazebo_classic`.
 
 A joint or link is named as in the file where that name is unique, and `model::name` where it is not.
 """
@@ -11,29 +13,79 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
+import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from urllib.parse import unquote
 
 import msgspec
 
+from ...archives.safe_xml import safe_xml
 from ...errors import LoadFailed
-from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
-from .gazebo_sdf import GazeboModel, read_world
+from ...files import opened
+from ...variables.model_description import DefaultExperiment, ModelDescription
+from ..world_variables import WorldVariable, joint_variables, numbered, world_input, world_output
 from .gazebo_section import GazeboClassicConfig
 
-__all__ = ["GazeboJoint", "GazeboLink", "GazeboPlace", "GazeboWorld", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboLink", "GazeboWorld", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
 
-Where = Literal[
-    "state", "effort_applied", "effort_command", "effort", "wrench", "wind", "body_wind", "relative_velocity"
-]
-
 _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""
+
+_WITH_VARIABLES = ("revolute", "prismatic")
+_WITHOUT_VARIABLES = ("ball", "universal", "screw", "revolute2", "gearbox")
+_JOINTS = ("revolute", "continuous", "prismatic", "fixed", *_WITHOUT_VARIABLES)
+
+_VERSION = re.compile(r"/(\d+|tip)$")
+
+_GROUND = """
+<model name="ground_plane">
+  <static>true</static>
+  <link name="link">
+    <collision name="collision">
+      <geometry><plane><normal>0 0 1</normal><size>100 100</size></plane></geometry>
+      <surface><friction><ode><mu>100</mu><mu2>50</mu2></ode></friction></surface>
+    </collision>
+  </link>
+</model>
+"""
+"""Has the same effect on the motion as Gazebo's own model of this name."""
+
+
+class GazeboModel(msgspec.Struct, frozen=True):
+    """A model, also one in another model.
+
+    Attributes:
+        scoped: the name in Gazebo, such as `outer::inner`.
+        moving: whether it is not static; Gazebo lets a model in a static one move.
+    """
+
+    scoped: str
+    element: ET.Element
+    moving: bool
+
+
+class SdfWorld(msgspec.Struct, frozen=True):
+    """The file of a world.
+
+    Attributes:
+        text: the SDF that Gazebo gets; the unchanged file if nothing had to be changed.
+        source: the file.
+        element: the world as Gazebo gets it.
+        models: all models, outer ones first.
+        notes: parts that differ from the file or have no variables.
+    """
+
+    text: bytes
+    source: bytes
+    element: ET.Element
+    models: tuple[GazeboModel, ...]
+    notes: tuple[str, ...]
 
 
 class GazeboJoint(msgspec.Struct, frozen=True):
@@ -60,20 +112,13 @@ class GazeboLink(msgspec.Struct, frozen=True):
     name: str
 
 
-class GazeboPlace(msgspec.Struct, frozen=True):
-    """Where the value of a variable is stored: the kind of value, and the index in the flat array of that kind."""
-
-    where: Where
-    index: int
-
-
 class GazeboWorld(msgspec.Struct, frozen=True):
     """A world.
 
     Attributes:
         text: the SDF that Gazebo gets.
         step_size: of the engine in s.
-        places: by variable name.
+        places: the variables by name.
     """
 
     text: bytes
@@ -81,7 +126,7 @@ class GazeboWorld(msgspec.Struct, frozen=True):
     joints: tuple[GazeboJoint, ...]
     links: tuple[GazeboLink, ...]
     description: ModelDescription
-    places: dict[str, GazeboPlace]
+    places: dict[str, WorldVariable]
 
 
 def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
@@ -90,26 +135,24 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
     Raises:
         LoadFailed: it is no world that Gazebo could load without looking elsewhere.
     """
-    sdf = read_world(path)
+    sdf = _read(path)
     step_size = _number(sdf.element.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
     moving = [model for model in sdf.models if model.moving]
     joints, links = _joints(moving, free, path), _links(moving)
-    variables = dict(_variables(joints, links))
+    variables = numbered(_variables(joints, links))
     description = ModelDescription(
         model_name=sdf.element.get("name") or path.stem,
         model_identifier="gazebo_classic",
         fmi_version="",
         kind="physics_engine",
         guid=hashlib.sha256(sdf.source).hexdigest()[:32],
-        variables=tuple(
-            msgspec.structs.replace(variable, value_reference=number) for number, variable in enumerate(variables)
-        ),
+        variables=tuple(own.variable for own in variables),
         generation_tool="Gazebo classic",
         default_experiment=DefaultExperiment(step_size=step_size),
         problems=sdf.notes,
     )
-    places = {variable.name: place for variable, place in variables.items()}
+    places = {own.variable.name: own for own in variables}
     return GazeboWorld(sdf.text, step_size, joints, links, description, places)
 
 
@@ -150,28 +193,19 @@ def _number(text: str | None, default: float, path: Path) -> float:
         raise LoadFailed(f"'{path}' has '{text.strip()}' where a number should be") from error
 
 
-def _variables(
-    joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]
-) -> Iterator[tuple[Variable, GazeboPlace]]:
+def _variables(joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]) -> Iterator[WorldVariable]:
     for number, joint in enumerate(joints):
-        length, effort = ("rad", "N.m") if joint.revolute else ("m", "N")
-        state, name = JOINT_STATE * number, joint.name
-        yield _entry(f"{name}.position", "output", length, "position of the joint", "state", state)
-        yield _entry(f"{name}.velocity", "output", f"{length}/s", "velocity of the joint", "state", state + 1)
-        text = "acceleration in the last step"
-        yield _entry(f"{name}.acceleration", "output", f"{length}/s2", text, "state", state + 2)
-        text = "effort applied in the last step"
-        yield _entry(f"{name}.effort_applied", "output", effort, text, "effort_applied", number)
-        yield _entry(f"{name}.effort_command", "input", effort, "what a controller asks for", "effort_command", number)
-        text = "what is applied, such as the torque of an actuator"
-        yield _entry(f"{name}.effort", "input", effort, text, "effort", number)
+        places = {what: (what, number) for what in ("effort_applied", "effort_command", "effort")}
+        in_state = enumerate(("position", "velocity", "acceleration"), JOINT_STATE * number)
+        places |= {what: ("state", place) for place, what in in_state}
+        yield from joint_variables(joint.name, places, revolute=joint.revolute)
     for number, link in enumerate(links):
         yield from _link_variables(link.name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
     for axis, letter in enumerate("xyz"):
-        yield _entry(f"wind_{letter}", "input", "m/s", "velocity of the medium in world axes", "wind", axis)
+        yield world_input(f"wind_{letter}", ("wind", axis), "m/s", "velocity of the medium in world axes")
 
 
-def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variable, GazeboPlace]]:
+def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariable]:
     in_state = (
         ("position", "xyz", "m", "of the link's origin in world axes"),
         ("orientation", "wxyz", "1", "attitude as a unit quaternion, link axes to world axes"),
@@ -180,35 +214,130 @@ def _link_variables(name: str, number: int, state: int) -> Iterator[tuple[Variab
     )
     for what, letters, unit, text in in_state:
         for letter in letters:
-            yield _entry(f"{name}.{what}_{letter}", "output", unit, text, "state", state)
+            yield world_output(f"{name}.{what}_{letter}", ("state", state), unit, text)
             state += 1
     for axis, letter in enumerate("xyz"):
         place = 3 * number + axis
         text = "velocity of the medium in link axes"
-        yield _entry(f"{name}.wind_{letter}", "output", "m/s", text, "body_wind", place)
+        yield world_output(f"{name}.wind_{letter}", ("body_wind", place), "m/s", text)
         text = "velocity of the link's origin against the medium in link axes"
-        yield _entry(f"{name}.relative_velocity_{letter}", "output", "m/s", text, "relative_velocity", place)
+        yield world_output(f"{name}.relative_velocity_{letter}", ("relative_velocity", place), "m/s", text)
         text = "acts at the link's origin, in link axes"
-        yield _entry(f"{name}.force_{letter}", "input", "N", text, "wrench", 6 * number + axis)
+        yield world_input(f"{name}.force_{letter}", ("wrench", 6 * number + axis), "N", text)
         text = "acts about the link's origin, in link axes"
-        yield _entry(f"{name}.moment_{letter}", "input", "N.m", text, "wrench", 6 * number + 3 + axis)
+        yield world_input(f"{name}.moment_{letter}", ("wrench", 6 * number + 3 + axis), "N.m", text)
 
 
-def _entry(  # noqa: PLR0913, PLR0917  each is a column of a table
-    name: str, causality: Causality, unit: str, text: str, where: Where, index: int
-) -> tuple[Variable, GazeboPlace]:
-    variable = Variable(
-        name=name,
-        value_reference=0,
-        type="Float64",
-        causality=causality,
-        variability="continuous",
-        initial=None if causality == "input" else "calculated",
-        start=0.0 if causality == "input" else None,
-        unit=unit,
-        description=text,
-        dependencies=(),  # at the first point the engine has not taken a step: nothing depends on an input
-        # Efforts and forces of the same step act on these at once.
-        feedthrough=None if name.endswith((".acceleration", ".effort_applied")) else (),
-    )
-    return variable, GazeboPlace(where, index)
+# --- reading the file
+
+
+def _read(path: Path) -> SdfWorld:
+    """Read the world at ``path``.
+
+    Raises:
+        LoadFailed: it is no world that Gazebo could simulate without looking elsewhere.
+    """
+    try:
+        with opened(path) as file:
+            source = file.read()
+        safe_xml(source, f"'{path}'")
+        root = ET.fromstring(source)  # noqa: S314  it was parsed safely
+    except (OSError, ET.ParseError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise LoadFailed(f"'{path}' cannot be read as an SDF world: {reason}") from error
+    worlds = root.findall("world")
+    if root.tag != "sdf" or len(worlds) != 1:
+        raise LoadFailed(f"'{path}' is no SDF file with one world", hint="Gazebo classic 11 reads SDF up to 1.7.")
+    (world,) = worlds
+    notes = list(_without_known_includes(world))
+    _refuse_includes(world, path)
+    models = tuple(_models(world, ""))
+    _refuse_what_gazebo_leaves_out(world, models, path)
+    changed = bool(notes)
+    for joint in world.iter("joint"):
+        if joint.get("type") == "continuous":
+            _make_revolute(joint)
+            changed = True
+    notes += _notes(world, models)
+    return SdfWorld(ET.tostring(root) if changed else source, source, world, models, tuple(notes))
+
+
+def _models(parent: ET.Element, scope: str) -> Iterator[GazeboModel]:
+    for element in parent.findall("model"):
+        scoped = f"{scope}{element.get('name')}"
+        yield GazeboModel(scoped, element, element.findtext("static", "false").strip() not in {"true", "1"})
+        yield from _models(element, f"{scoped}::")
+
+
+def _without_known_includes(world: ET.Element) -> Iterator[str]:
+    """Replace each include that needs no file by its model; yields a note for each."""
+    for number, include in enumerate([*world]):
+        uri = include.findtext("uri", "").strip() if include.tag == "include" else ""
+        name = _VERSION.sub("", unquote(uri).rstrip("/")).rpartition("/")[2].casefold().replace(" ", "_")
+        if name not in {"sun", "ground_plane"} or include.find("plugin") is not None:
+            continue
+        if name == "sun":
+            world[number] = ET.Comment("a light")
+            yield f"left out, as a light moves nothing: the included '{uri}'"
+            continue
+        ground = ET.fromstring(_GROUND)  # noqa: S314  our own text
+        ground.set("name", include.findtext("name", "ground_plane").strip())
+        if (pose := include.find("pose")) is not None:
+            ground.append(pose)
+        world[number] = ground
+        yield f"a static plane stands for the included '{uri}'"
+
+
+def _refuse_includes(world: ET.Element, path: Path) -> None:
+    uris = [include.findtext("uri", "without a uri").strip() for include in world.iter("include")]
+    if uris:
+        models = f"a model ({uris[0]})" if len(uris) == 1 else f"models ({', '.join(uris)})"
+        raise LoadFailed(
+            f"'{path}' includes {models}",
+            hint="Nothing is fetched for a run: write the text of each model in the place of its <include>, as "
+            "`gz sdf -p WORLD` of a Gazebo that has the models prints it.",
+        )
+
+
+def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[GazeboModel, ...], path: Path) -> None:
+    """Parts that Gazebo ignores although they change the motion; and names with spaces.
+
+    A space ends a name in the protocol of Gazebo's process.
+    """
+    problems = [f"the world '{inner.get('name')}' in a world" for inner in world.findall("world")]
+    problems += [f"the joint '{joint.get('name')}' outside of a model" for joint in world.findall("joint")]
+    for model in models:
+        for joint in model.element.findall("joint"):
+            if joint.get("type") not in _JOINTS:
+                problems.append(f"the joint '{model.scoped}::{joint.get('name')}' of the type '{joint.get('type')}'")
+        names = [f"{model.scoped}::{own.get('name')}" for own in model.element if own.tag in {"joint", "link"}]
+        problems += [f"a space in the name '{name}'" for name in names if model.moving and len(name.split()) != 1]
+    if problems:
+        hint = f"There are joints of the types {', '.join(_JOINTS)}, each in a <model>."
+        raise LoadFailed(f"'{path}' has what cannot be simulated with Gazebo classic: {'; '.join(problems)}", hint=hint)
+
+
+def _make_revolute(joint: ET.Element) -> None:
+    """Replace a continuous joint, which Gazebo classic does not have, by a revolute joint without position limits."""
+    joint.set("type", "revolute")
+    for limit in joint.iterfind("axis/limit"):
+        for end in [*limit.findall("lower"), *limit.findall("upper")]:
+            limit.remove(end)
+
+
+def _notes(world: ET.Element, models: tuple[GazeboModel, ...]) -> Iterator[str]:
+    for model in models:
+        for joint in model.element.findall("joint"):
+            name, kind = f"{model.scoped}::{joint.get('name')}", joint.get("type")
+            if kind in _WITHOUT_VARIABLES:
+                yield f"the joint '{name}' is simulated, and has no variables, as it is a {kind} joint"
+            elif kind in _WITH_VARIABLES and not model.moving:
+                yield f"the joint '{name}' has no variables: its model is static"
+        for collision in model.element.iterfind("link/collision"):
+            for uri in collision.iterfind("geometry//uri"):
+                name = f"{model.scoped}::{collision.get('name')}"
+                yield f"the collision '{name}' is not simulated unless Gazebo finds {(uri.text or '').strip()}"
+    for sensor in world.iter("sensor"):
+        yield f"the sensor '{sensor.get('name')}' has no variables"
+    for plugin in world.iter("plugin"):
+        yield f"the plugin '{plugin.get('filename')}' does nothing unless Gazebo finds it"

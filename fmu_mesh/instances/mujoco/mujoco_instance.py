@@ -30,8 +30,9 @@ from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import ModelDescription, Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
 from ..contract import KeepsStateAsBytes
+from ..world_variables import WorldVariable
 from .mujoco_section import MujocoConfig
-from .mujoco_world import MujocoVariable, engine, load_world, warnings
+from .mujoco_world import engine, load_world, warnings
 from .rendering import Picture
 
 __all__ = ["MujocoInstance"]
@@ -237,7 +238,7 @@ class MujocoInstance(KeepsStateAsBytes):
                 self._direct[entry.index] = False
         self._limited = bool(self._world.limits)
 
-    def _drive(self, entries: Iterable[MujocoVariable]) -> None:
+    def _drive(self, entries: Iterable[WorldVariable]) -> None:
         """From now on, every step applies forces and moments of the bodies of these variables."""
         bodies = {entry.index // 6 for entry in entries if entry.where == "wrench"}
         self._driven = tuple(sorted({*self._driven, *bodies}))
@@ -331,7 +332,7 @@ class MujocoInstance(KeepsStateAsBytes):
         return [*own, self._data.sensordata, self._data.actuator_force]
 
 
-def _grouped(entries: Sequence[MujocoVariable]) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
+def _grouped(entries: Sequence[WorldVariable]) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
     """(kind, indices in its array, columns) of all variables, so that one assignment copies all of a kind."""
     groups: dict[str, tuple[list[int], list[int]]] = {}
     for column, entry in enumerate(entries):
@@ -341,6 +342,6 @@ def _grouped(entries: Sequence[MujocoVariable]) -> list[tuple[str, NDArray[np.in
     return [(where, np.array(places), np.array(columns)) for where, (places, columns) in groups.items()]
 
 
-def _bodies_of(entries: Iterable[MujocoVariable]) -> set[int]:
+def _bodies_of(entries: Iterable[WorldVariable]) -> set[int]:
     """The bodies whose velocities have to be computed for these variables."""
     return {entry.index // 3 for entry in entries if entry.where in _OF_VELOCITIES}

@@ -29,7 +29,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
@@ -37,51 +37,19 @@ from ...errors import LoadFailed
 from ...files import opened
 from ...installing import importing
 from ...text import listed, nearest
-from ...variables.model_description import Causality, DefaultExperiment, ModelDescription, Variable
+from ...variables.model_description import DefaultExperiment, ModelDescription
+from ..world_variables import Place, WorldVariable, joint_variables, numbered, world_input, world_output
 from .mujoco_section import MujocoConfig
 
-__all__ = ["MujocoVariable", "Where", "World", "engine", "load_world", "warnings"]
-
-Where = Literal[
-    "position",
-    "velocity",
-    "acceleration",
-    "effort_applied",
-    "effort_command",
-    "effort",
-    "body_position",
-    "body_orientation",
-    "linear_velocity",
-    "angular_velocity",
-    "body_wind",
-    "relative_velocity",
-    "wrench",
-    "sensor",
-    "control",
-    "actuator_force",
-    "wind",
-]
+__all__ = ["World", "engine", "load_world", "warnings"]
 
 warnings: list[str] = []
 """Warnings of MuJoCo since this was cleared. It has one handler per process; the default one would write a file."""
 
 _WORLD_BODY = 0
 _WIND = ("wind_x", "wind_y", "wind_z")
-_OF_THE_STEP = (".acceleration", ".effort_applied", ".force")
-"""Ends of the names of outputs that efforts and forces of the same step act on at once."""
-
-
-class MujocoVariable(msgspec.Struct, frozen=True):
-    """One variable and where its value is stored.
-
-    Attributes:
-        where: the kind of value.
-        index: place in the flat array of that kind.
-    """
-
-    variable: Variable
-    where: Where
-    index: int
+_OF_DOFS = ("velocity", "acceleration", "effort_applied", "effort_command", "effort")
+"""What a joint has for each degree of freedom."""
 
 
 class World(msgspec.Struct, frozen=True):
@@ -96,7 +64,7 @@ class World(msgspec.Struct, frozen=True):
 
     model: Any
     description: ModelDescription
-    entries: tuple[MujocoVariable, ...]
+    entries: tuple[WorldVariable, ...]
     limits: tuple[tuple[int, float, float], ...]
     keyframe: int | None
 
@@ -117,11 +85,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
         reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())
         raise LoadFailed(f"MuJoCo cannot load '{path}': {reason}") from error
     keyframe = _keyframe(model, config.keyframe, path)
-    entries = tuple(_entries(mujoco, model, keyframe))
-    numbered = tuple(
-        msgspec.structs.replace(entry, variable=msgspec.structs.replace(entry.variable, value_reference=number))
-        for number, entry in enumerate(entries)
-    )
+    entries = numbered(_entries(mujoco, model, keyframe))
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
     description = ModelDescription(
         model_name=_text(model, 0) or path.stem,
@@ -129,14 +93,14 @@ def load_world(path: Path, config: MujocoConfig) -> World:
         fmi_version="",
         kind="physics_engine",
         guid=hashlib.sha256(data).hexdigest()[:32],
-        variables=tuple(entry.variable for entry in numbered),
+        variables=tuple(entry.variable for entry in entries),
         generation_tool=f"MuJoCo {mujoco.__version__}",
         default_experiment=DefaultExperiment(step_size=float(model.opt.timestep)),
         can_get_and_set_state=True,
         can_serialize_state=True,
         problems=(*(" ".join(text.split()) for text in warnings), *_left_out(mujoco, model, data)),
     )
-    return World(model, description, numbered, tuple(_limits(mujoco, model, free)), keyframe)
+    return World(model, description, entries, tuple(_limits(mujoco, model, free)), keyframe)
 
 
 def engine() -> ModuleType:
@@ -163,7 +127,7 @@ def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: 
     raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=hint)
 
 
-def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[MujocoVariable]:  # noqa: ANN401  mujoco has no types
+def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     yield from _joints(mujoco, model, keyframe)
     yield from _bodies(model)
     for number in range(model.nsensor):
@@ -171,17 +135,17 @@ def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[M
         first, size = int(sensor.adr[0]), int(sensor.dim[0])
         for offset in range(size if sensor.name else 0):
             index = f"[{offset + 1}]" if size > 1 else ""
-            yield _output(f"{sensor.name}.value{index}", "sensor", first + offset, None, "value of a sensor")
+            yield world_output(f"{sensor.name}.value{index}", ("sensor", first + offset), None, "value of a sensor")
     for number in range(model.nu):
         if name := model.actuator(number).name:
-            yield _input(f"{name}.control", "control", number, None, "control of an actuator of the model")
-            yield _output(f"{name}.force", "actuator_force", number, None, "its force in the last step")
+            yield world_input(f"{name}.control", ("control", number), None, "control of an actuator of the model")
+            yield world_output(f"{name}.force", ("actuator_force", number), None, "its force in the last step")
     for axis, letter in enumerate("xyz"):
         start = float(model.opt.wind[axis])
-        yield _input(f"wind_{letter}", "wind", axis, "m/s", "velocity of the medium in world axes", start)
+        yield world_input(f"wind_{letter}", ("wind", axis), "m/s", "velocity of the medium in world axes", start)
 
 
-def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[MujocoVariable]:  # noqa: ANN401  mujoco has no types
+def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     positions = model.qpos0 if keyframe is None else model.key_qpos[keyframe]
     velocities = [0.0] * model.nv if keyframe is None else model.key_qvel[keyframe]
     for number in range(model.njnt):
@@ -189,71 +153,38 @@ def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Mu
         revolute = joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
         if not joint.name or not (revolute or joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE):
             continue
-        length, effort = ("rad", "N.m") if revolute else ("m", "N")
         qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
-        position, velocity = float(positions[qpos]), float(velocities[dof])
-        name = joint.name
-        yield _output(f"{name}.position", "position", qpos, length, "position of the joint", position)
-        yield _output(f"{name}.velocity", "velocity", dof, f"{length}/s", "velocity of the joint", velocity)
-        yield _output(f"{name}.acceleration", "acceleration", dof, f"{length}/s2", "acceleration in the last step")
-        yield _output(f"{name}.effort_applied", "effort_applied", dof, effort, "effort applied in the last step")
-        yield _input(f"{name}.effort_command", "effort_command", dof, effort, "what a controller asks for")
-        yield _input(f"{name}.effort", "effort", dof, effort, "what is applied, such as the torque of an actuator")
+        places = {what: (what, dof) for what in _OF_DOFS} | {"position": ("position", qpos)}
+        start = {"position": float(positions[qpos]), "velocity": float(velocities[dof])}
+        yield from joint_variables(joint.name, places, revolute=revolute, start=start)
 
 
-def _bodies(model: Any) -> Iterator[MujocoVariable]:  # noqa: ANN401  mujoco has no types
+def _bodies(model: Any) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     for number in range(_WORLD_BODY + 1, model.nbody):
         name = model.body(number).name
         if not name:
             continue
-        yield from _vector(name, "position", "body_position", number, "m", "of the body's origin in world axes")
+        in_world, place = "of the body's origin in world axes", 3 * number
+        yield from _vector(f"{name}.position", ("body_position", place), "m", in_world)
+        text = "attitude as a unit quaternion, body axes to world axes"
         for part, letter in enumerate("wxyz"):
-            text = "attitude as a unit quaternion, body axes to world axes"
-            yield _output(f"{name}.orientation_{letter}", "body_orientation", 4 * number + part, "1", text)
-        text = "of the body's origin in world axes"
-        yield from _vector(name, "linear_velocity", "linear_velocity", number, "m/s", text)
-        yield from _vector(name, "angular_velocity", "angular_velocity", number, "rad/s", "in world axes")
-        yield from _vector(name, "wind", "body_wind", number, "m/s", "velocity of the medium in body axes")
+            yield world_output(f"{name}.orientation_{letter}", ("body_orientation", 4 * number + part), "1", text)
+        yield from _vector(f"{name}.linear_velocity", ("linear_velocity", place), "m/s", in_world)
+        yield from _vector(f"{name}.angular_velocity", ("angular_velocity", place), "rad/s", "in world axes")
+        text = "velocity of the medium in body axes"
+        yield from _vector(f"{name}.wind", ("body_wind", place), "m/s", text, _WIND)
         text = "velocity of the body's origin against the medium in body axes"
-        yield from _vector(name, "relative_velocity", "relative_velocity", number, "m/s", text)
-        for offset, (what, unit) in enumerate((("force", "N"), ("moment", "N.m"))):
-            acting = "acts at the body's origin" if what == "force" else "acts about the body's origin"
+        yield from _vector(f"{name}.relative_velocity", ("relative_velocity", place), "m/s", text, _WIND)
+        for offset, (what, unit, where) in enumerate((("force", "N", "at"), ("moment", "N.m", "about"))):
             for axis, letter in enumerate("xyz"):
-                place = 6 * number + 3 * offset + axis
-                yield _input(f"{name}.{what}_{letter}", "wrench", place, unit, f"{acting}, in body axes")
+                text = f"acts {where} the body's origin, in body axes"
+                yield world_input(f"{name}.{what}_{letter}", ("wrench", 6 * number + 3 * offset + axis), unit, text)
 
 
-def _vector(body: str, what: str, where: Where, number: int, unit: str, text: str) -> Iterator[MujocoVariable]:  # noqa: PLR0913, PLR0917  each is a column of the table above
+def _vector(name: str, place: Place, unit: str, text: str, depends_on: tuple[str, ...] = ()) -> Iterator[WorldVariable]:
+    where, first = place
     for axis, letter in enumerate("xyz"):
-        yield _output(f"{body}.{what}_{letter}", where, 3 * number + axis, unit, text)
-
-
-def _output(  # noqa: PLR0913, PLR0917  each is a column of the table above
-    name: str, where: Where, index: int, unit: str | None, text: str, start: float | None = None
-) -> MujocoVariable:
-    return MujocoVariable(_variable(name, "output", unit, text, start), where, index)
-
-
-def _input(name: str, where: Where, index: int, unit: str | None, text: str, start: float = 0.0) -> MujocoVariable:  # noqa: PLR0913, PLR0917  each is a column of the table above
-    return MujocoVariable(_variable(name, "input", unit, text, start), where, index)
-
-
-def _variable(name: str, causality: Causality, unit: str | None, text: str, start: float | None) -> Variable:
-    depends_on = _WIND if ".wind_" in name or ".relative_velocity_" in name else ()
-    return Variable(
-        name=name,
-        value_reference=0,
-        type="Float64",
-        causality=causality,
-        variability="continuous",
-        initial=None if causality == "input" else "exact" if start is not None else "calculated",
-        start=start,
-        unit=unit,
-        description=text,
-        # At the first point the engine has not taken a step: only the current wind has an effect.
-        dependencies=depends_on,
-        feedthrough=None if name.endswith(_OF_THE_STEP) else depends_on,
-    )
+        yield world_output(f"{name}_{letter}", (where, first + axis), unit, text, None, depends_on)
 
 
 def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types

@@ -114,11 +114,15 @@ class PythonInstance:
         """Current values by name; in Initialization Mode, outputs are computed from the inputs as they are now."""
         if self._phase == "initialization" and not set(names).isdisjoint(self._outputs):
             self._initialize()
-        values = []
+        values: list[Value] = []
         for name in names:
             attribute = self._values[name] if name in self._values else self._declared[name].start
+            variable = self._variables[name]
             try:
-                values.append(_as_value(attribute, self._variables[name]))
+                if variable.shape:
+                    values.append(nested(_array(attribute, variable).reshape(-1).tolist(), variable.shape))
+                else:
+                    values.append(_scalar(attribute, variable))
             except ValueRefused as refused:
                 raise _ERRORS[self._phase](str(refused), instance=self.name, variable=name) from refused
         return values
@@ -275,17 +279,6 @@ class PythonInstance:
 def _as_attribute(value: Value, variable: Variable) -> Any:  # noqa: ANN401 a value of any type
     """A value as the component sees it: an array is one of numpy, which belongs to the component."""
     return np.array(value, dtype=DTYPES[variable.type]).reshape(variable.shape) if variable.shape else value
-
-
-def _as_value(attribute: object, variable: Variable) -> Value:
-    """The value of an attribute; an array as nested lists.
-
-    Raises:
-        ValueRefused: it is no value of the variable's type and shape.
-    """
-    if variable.shape:
-        return nested(_array(attribute, variable).reshape(-1).tolist(), variable.shape)
-    return _scalar(attribute, variable)
 
 
 def _reader(ring: Ring, variable: Variable) -> Callable[[int], Any]:
