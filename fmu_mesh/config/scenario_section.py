@@ -23,9 +23,7 @@ PlainInput = bool | int | float | str | list[Any]
 class ScenarioValues(Base, frozen=True, kw_only=True):
     """The values of one variable over time: here, in a table, or in the messages of a bag."""
 
-    times: Annotated[
-        list[float] | None, Meta(description="Times of `values` in s, in ascending order.")
-    ] = None
+    times: Annotated[list[float] | None, Meta(description="Times of `values` in s, in ascending order.")] = None
     values: Annotated[list[PlainInput] | None, Meta(description="The value from each of `times` on.")] = None
     file: Annotated[
         str | None,
