@@ -261,7 +261,8 @@ class MasterStates:
         """
         if self._moved_at is None:
             self._moved_at = now
-        if self.failure is None:
+        # What a command has decided is done first: the wall clock that limits the grant may begin anew with it.
+        if self.failure is None and not self._actions:
             match self.state:
                 case "starting":
                     self._wait_for_nodes(now)

@@ -250,6 +250,15 @@ def test_a_resumed_run_follows_the_wall_clock_from_where_it_is(plan: Plan) -> No
     assert run.decide() == [RaiseGrant(13), FollowClock(13), RaiseGrant(LAST)]
 
 
+def test_the_wall_clock_begins_anew_before_more_is_granted(plan: Plan) -> None:
+    run = running(plan, paused=True)
+    run.command("resume")
+
+    # The point that the caller gives here is still that of the clock from before the pause.
+    assert run.states.decide(run.now, LAST) == [RaiseGrant(0), FollowClock(0)]
+    assert run.states.decide(run.now, 1) == [RaiseGrant(1)]
+
+
 def test_steps_are_counted_from_the_pause_and_not_from_the_progress(plan: Plan) -> None:
     run = running(plan)
     run.at(10)
