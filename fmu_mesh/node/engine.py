@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from functools import partial
 from itertools import chain
 from threading import Lock
 from time import perf_counter
@@ -41,7 +40,7 @@ __all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
 # * A wake-up is lost, because its sender was killed: each sleep has a limit, then everything is looked at anew.
 # * An FMU changes the floating-point mode or a signal handler of the process: the mode is looked at after each step,
 #   as that is two additions; all else every 50 ms (`_STATE_CHECK_S`), as that is 10 us.
-# * Python writes a table while the burst uses it: it cannot, because `_fill` and `_follow` run on the main thread,
+# * Python writes a table while the burst uses it: it cannot, because `refit` and `_follow` run on the main thread,
 #   between two calls of `node_run`, or for a member whose step the burst has just given to Python.
 #
 # Tried and given up: one call from Python for each step (as much time as a small FMU takes), loops that llvmlite
@@ -86,7 +85,7 @@ class Engine(ABC):
         self._units = table(native.UnitTable, list(map(self._unit, units, members)))
         for unit, tables in zip(units, members, strict=True):
             for runner, member in zip(unit, tables, strict=True):
-                runner.follow(member, partial(self._fill, unit, runner))
+                runner.follow(member, self)
 
     def _unit(self, unit: Sequence[Runner], members: object) -> native.UnitTable:
         last_tick = unit[0].last_step if len(unit) == 1 else self._last_point
@@ -94,8 +93,8 @@ class Engine(ABC):
         return native.UnitTable(members=members, n_members=len(unit), tick_points=points, last_tick=last_tick, burst=1)
 
     @abstractmethod
-    def _fill(self, unit: Sequence[Runner], runner: Runner) -> None:
-        """Note in the table of a runner how it is stepped, which has changed."""
+    def refit(self, runner: Runner) -> None:
+        """On the main thread, between steps: the runner steps in another way from the next step on."""
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
@@ -238,9 +237,9 @@ class BurstEngine(Engine):
     def _ticks(self) -> int:
         return sum(runner.step for runner in self.runners)
 
-    def _fill(self, unit: Sequence[Runner], runner: Runner) -> None:
+    def refit(self, runner: Runner) -> None:
         """Fill the table of a runner: at the start, and again whenever it steps in another way."""
-        before = runner.table
+        before, unit = runner.table, next(unit for unit in self.units if runner in unit)
         own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
         if own is not None and any(source.transfer.has_text for source in runner.sources):
             own = None
@@ -249,8 +248,10 @@ class BurstEngine(Engine):
         grid, points = runner.grid, runner.plan.step_points
         watched = runner.watched if runner.watched is not None else runner.outputs
         rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
+        names = ("kind", "component", "do_step", "said") if own is not None else ()  # without them, BY_PYTHON is 0
+        calls = {name: getattr(own, name) for name in names}
         made = native.MemberTable(
-            kind=StepKind.BY_PYTHON,
+            **calls,
             start_time=grid.start_time,
             base_step_size=grid.step_size,
             step_size=points * grid.step_size,
@@ -267,7 +268,6 @@ class BurstEngine(Engine):
         )
         loads = list(chain(*moves))
         if own is not None:
-            made.kind, made.component, made.do_step, made.said = own.kind, own.component, own.do_step, own.said
             made.give(setters=own.setters, getters=own.getters, stores=own.stores)
             loads += own.loads
         made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
@@ -280,8 +280,9 @@ class BurstEngine(Engine):
         timed = runner.instance
         if isinstance(timed, TimedInputs):
             self._tracks[runner.name] = [timed.tracks]  # what the table points to
-            runner.table.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
-            runner.table.python_at, runner.table.tracks_from = timed.python_at, timed.tracks_from
+            member = runner.table
+            member.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
+            member.python_at, member.tracks_from = timed.python_at, timed.tracks_from
 
     def _complete(self, unit: int, runner: Runner, result: int) -> None:
         """Let Python take a step, or complete one that returned something unusual."""
@@ -345,7 +346,7 @@ class PlainEngine(Engine):
         self._slice_s = slice_s
         self._attention = False
 
-    def _fill(self, unit: Sequence[Runner], runner: Runner) -> None:
+    def refit(self, runner: Runner) -> None:
         """Nothing: each step asks the runner itself."""
 
     def _burst(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
@@ -396,11 +397,11 @@ class PlainEngine(Engine):
             place.spent_ns += int((perf_counter() - began) * 1e9)
 
     def _step(self, place: native.UnitTable, runner: Runner) -> None:
-        table, step = runner.table, runner.step
+        member, step = runner.table, runner.step
         try:
             for source in runner.sources:
                 source.transfer.step(step)
-            table.stage = Stage.IN_PYTHON
+            member.stage = Stage.IN_PYTHON
             runner.instance.do_step(step)
             if not runner.is_finite.check(step + 1):
                 raise runner.is_finite.error(step + 1, runner.grid)
@@ -409,9 +410,9 @@ class PlainEngine(Engine):
             runner.is_finite.explain(error)
             raise
         finally:
-            table.stage = Stage.WAITING
+            member.stage = Stage.WAITING
         if floating_point_changed():
             restore_floating_point()
         runner.outputs.stamp(step + 1)
-        table.step = step + 1
+        member.step = step + 1
         runner.counter.raise_to(step + 2)

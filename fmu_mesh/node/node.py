@@ -8,9 +8,6 @@ One step of a node, in pseudocode::
                 step as far as the grant, the windows and the rows of the sources allow
         send new rows as frames to the nodes that do not read the rings
         handle the messages that arrived: frames go into mirrors of rings, a higher grant is stored
-
-Owns the life of the process between `ready` and `done`. The FMUs are only called here, on the main thread; queries are
-served by `fmu_mesh.node.node_server` from snapshots.
 """
 
 from __future__ import annotations
@@ -58,13 +55,12 @@ from ..wire.messages import (
 )
 from ..wire.session import RouterLink
 from .activity import Activity
-from .connecting import connect
 from .engine import Engine, make_engine
 from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
-from .stepping import Runner
+from .stepping import Runner, connect
 from .streams import PRIORITY
 from .time_measurement import Profiler
 
@@ -78,16 +74,13 @@ __all__ = ["Node"]
 # What may go wrong, and who decides:
 # * The master's token is gone. That is a question, not a verdict (ADR 67): on this host its process answers, else a
 #   query for the token; and its last message may still be on its way, so `_LAST_WORD_S` is given to it.
-# * The master is silent: `Membership.check_silence` knows the deadlines of a link and of a step.
-# * The run is aborted while a step lasts: the step ends first; a hang is reported by another thread.
 # * An FMU fails: the recorder first gets all rows that are complete, then the master gets the report. The order
 #   matters: after the report it ends the others.
 
 log = logging.getLogger(__name__)
 
 # Whatever a node sleeps for, after this time it looks at everything again: a wake-up that a killed process has lost
-# costs this much once (docs/rings.md), silence of the master is noticed in steps of it, and `AwakeClock` is read often
-# enough.
+# costs this much once (docs/rings.md), and silence of the master is noticed in steps that `AwakeClock` can count.
 _LONGEST_SLEEP_S = 0.5
 _TELL_S = 0.1
 _LAST_WORD_S = 0.3
@@ -132,23 +125,18 @@ class Node:
         self._token_went = False
         self.failure_is_known = False
         self._clock = AwakeClock()
-        self._heard = 0.0
-        self._lazy_sent = 0.0
+        self._heard = self._lazy_sent = self._progress_told_at = 0.0
         self._progress_sent = -1
-        self._progress_told_at = 0.0
         self._runners: dict[str, Runner] = {}
         self._receivers: dict[int, FrameReceiver | Link] = {}
-        self._own_memory = HostMemory.private(plan.memory, plan.node)
-        self._memory = self._own_memory
+        self._memory = self._own_memory = HostMemory.private(plan.memory, plan.node)
         self._engine: Engine | None = None
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
         self._membership = Membership(plan, session, self._inbox, launch, router)
         self._profiler: Profiler | None = None
         self._activity = Activity(plan, self._inbox.refusals)
-        self.server = NodeServer(
-            plan, session, self._inbox, self._activity, self._membership.report, on_hang, self._tell_set
-        )
+        self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self._tell_set)
 
     @property
     def finished(self) -> bool:
@@ -196,7 +184,16 @@ class Node:
         if not self._membership.lost_master:
             with self._engine.sending if self._engine is not None else nullcontext():
                 self._send_last_rows()  # should the step end now, the main thread waits for this
-        return self.server.report_hang(error, self._patience_s())
+        runner = self._activity.runners.get(error.instance or "")
+        if runner is not None and self._activity.state != "initializing":
+            error = error.at(runner.point, self._plan.grid.time(runner.point))
+        try:
+            report = NodeReport(self._plan.node, error.point or 0, error.report())
+            self._membership.report(report, self._patience_s())
+        except FmuMeshError as unreachable:
+            log.warning("hang_not_reported", extra={"error": str(unreachable)})
+            return False
+        return True
 
     # --- before the first point
 
@@ -427,7 +424,6 @@ class Node:
         )
 
     def _patience_s(self) -> float:
-        """How long in s a report of a failure may take."""
         return min(self._plan.timeouts.stop, math.inf if self._membership.is_admitted else _NO_MASTER_S)
 
     def _tell_end(self, error: FmuMeshError | None, timeout_s: float) -> None:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import logging
 import queue
 import threading
 import time
@@ -16,11 +15,11 @@ from functools import partial
 import msgspec
 import zenoh
 
-from ..errors import FmuError, FmuMeshError
+from ..errors import FmuError
 from ..system.plan import NodePlan
 from ..wire.inbox import Inbox
 from ..wire.keys import SUBSCRIBED, Keys
-from ..wire.messages import NodeReport, SetValue, decode_json
+from ..wire.messages import SetValue, decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine
@@ -44,8 +43,6 @@ __all__ = ["NodeServer"]
 # Why not in the callbacks of Zenoh: one that waits for a point would hold all later queries of its instance. ADR 68
 # says why nothing is declared for a variable.
 
-log = logging.getLogger(__name__)
-
 _TICK_S = 0.25
 # A stream whose subscriber Zenoh does not announce (it reports only the first of an instance) begins within about this
 # time; shorter would take the main thread's time for nothing.
@@ -64,7 +61,6 @@ class NodeServer:
 
     Args:
         session: the session of this process; stays the caller's.
-        report: tells the master how the node has ended; its argument is the time limit in s.
         on_hang: called on the server thread if a step does not return in time.
         tell: tells the recorder, if there is one, which value was set; on the main thread.
     """
@@ -75,14 +71,12 @@ class NodeServer:
         session: zenoh.Session,
         inbox: Inbox,
         activity: Activity,
-        report: Callable[[NodeReport, float], None],
         on_hang: Callable[[FmuError], None],
         tell: Callable[[SetValue], None],
     ) -> None:
         self._on_hang = on_hang
         self._plan = plan
         self._session = session
-        self._report = report
         self._keys = Keys(plan.key_prefix, plan.mesh)
         self._inbox = inbox
         self._activity = activity
@@ -191,19 +185,6 @@ class NodeServer:
                 publisher.put(msgspec.json.encode(self._activity.status(name)))
         if (hang := self._activity.look_at_steps()) is not None:
             self._on_hang(hang)
-
-    def report_hang(self, error: FmuError, deadline_s: float) -> bool:
-        """On a watching thread: tell the master that an FMU does not return; return whether it knows now."""
-        runner = self._activity.runners.get(error.instance or "")
-        if runner is not None and self._activity.state != "initializing":
-            error = error.at(runner.point, self._plan.grid.time(runner.point))
-        report = NodeReport(self._plan.node, error.point or 0, error.report())
-        try:
-            self._report(report, deadline_s)
-        except FmuMeshError as unreachable:
-            log.warning("hang_not_reported", extra={"error": str(unreachable)})
-            return False
-        return True
 
     # --- queries
 

@@ -1,12 +1,14 @@
 """The instances of a node as they are stepped: a `Runner` is one instance with its rows; a `Source` feeds it.
 
-Owns what one step of one instance needs, and nothing about waiting. `fmu_mesh.node.engine` steps the runners.
+Owns what one step of one instance needs, and where its inputs come from: rings that others share, and mirrors of rings
+that frames fill. It owns nothing about waiting. `fmu_mesh.node.engine` steps the runners.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, cast
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple, Protocol, cast
 
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
@@ -14,16 +16,17 @@ from ..instances.instance_wrapper import AroundInstance
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
-from ..rings.host_memory import Counter
+from ..rings.host_memory import Counter, HostMemory
 from ..rings.ring import Ring
 from ..rings.transfer import Transfer
 from ..simtime import TimeGrid
 from ..system.layout import Layout
-from ..system.plan import InstancePlan
+from ..system.plan import InstancePlan, Link, NodePlan
 from ..system.window import rows_of_ring
+from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from .links import OutLink
 
-__all__ = ["Runner", "Source"]
+__all__ = ["Runner", "Source", "connect", "sources_of"]
 
 
 class Source(NamedTuple):
@@ -55,6 +58,14 @@ class Source(NamedTuple):
         )
 
 
+class Refitting(Protocol):
+    """The engine of a runner, as far as a runner knows it."""
+
+    def refit(self, runner: Runner) -> None:
+        """The runner steps in another way from the next step on."""
+        ...
+
+
 class Runner:
     """One instance with its row of inputs and its output ring.
 
@@ -62,7 +73,6 @@ class Runner:
         out_links: send its rows to those who do not read its ring.
         watched: a ring with further outputs, which somebody watches.
         table: how far it is, which whoever steps it writes, and for the burst how it is stepped.
-        refit: to be called where the instance steps in another way from the next step on.
     """
 
     def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter) -> None:
@@ -78,8 +88,7 @@ class Runner:
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
         self.is_finite = FiniteRows(plan, outputs, self.inputs)
-        self.table = native.MemberTable()
-        self.refit: Callable[[], None] = lambda: None
+        self.follow(native.MemberTable())
 
     def bind(self) -> None:
         """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode.
@@ -124,9 +133,9 @@ class Runner:
             if link.to_recorder:
                 link.send_last(end)
 
-    def follow(self, table: native.MemberTable, refit: Callable[[], None] = lambda: None) -> None:
-        """From now on an engine steps it, with this ``table``, and fills it anew by ``refit``."""
-        self.table, self.refit = table, refit
+    def follow(self, table: native.MemberTable, engine: Refitting | None = None) -> None:
+        """From now on this ``engine`` steps it, with this ``table``."""
+        self.table, self._engine = table, engine
 
     def watch(self, names: Sequence[str]) -> None:
         """From now on also read these outputs after every step; the plan does not contain them."""
@@ -145,6 +154,11 @@ class Runner:
         if isinstance(self.instance, AroundInstance):
             self.instance.take_care()
             self.refit()
+
+    def refit(self) -> None:
+        """The instance steps in another way from the next step on."""
+        if self._engine is not None:
+            self._engine.refit(self)
 
     @property
     def step(self) -> int:
@@ -190,3 +204,63 @@ class Runner:
             return "the master's grant"
         output, own = source.transfer.columns[0][:2]
         return f"'{source.instance}.{output}', which feeds '{self.name}.{own}'"
+
+
+def connect(
+    plan: NodePlan,
+    runners: Mapping[str, Runner],
+    memory: HostMemory,
+    own_memory: HostMemory,
+    shares: Collection[str],
+) -> dict[int, FrameReceiver | Link]:
+    """Give all runners their sources: in ``memory`` for nodes that share it, and in mirrors for all others.
+
+    Returns:
+        What takes the frames of each link, by its number; the link itself if it brings initial values only.
+    """
+    rows: dict[str, list[SourceRows]] = {name: [SourceRows(own.outputs, own.counter)] for name, own in runners.items()}
+    places = {place.instance: place for place in plan.rings}
+    receivers: dict[int, FrameReceiver | Link] = {}
+    for link in plan.links_in:
+        receivers[link.index] = link
+        if link.initial_only:
+            continue
+        shared = memory if link.source_node in shares else None
+        fits = partial(_fits, runners, link.source)
+        found, receiver = rows_of(link, places[link.source], shared, own_memory, fits)
+        rows.setdefault(link.source, []).extend(found)
+        if receiver is not None:
+            receivers[link.index] = receiver
+    points = {name: place.step_points for name, place in places.items()}
+    for runner in runners.values():
+        runner.sources.extend(sources_of(runner, rows, points))
+    return receivers
+
+
+def sources_of(
+    runner: Runner, rows: Mapping[str, Sequence[SourceRows]], step_points: Mapping[str, int]
+) -> Iterator[Source]:
+    """The sources of a runner, from the rows and the base points per own step of each instance."""
+    for feed in runner.plan.feeds:
+        for ring, counter, text in rows[feed.source]:
+            transfer = Transfer(
+                feed,
+                ring,
+                runner.inputs,
+                target=runner.name,
+                source_points=step_points[feed.source],
+                target_points=runner.plan.step_points,
+                text=text,
+            )
+            if transfer.columns:
+                yield Source(feed.source, transfer, counter)
+
+
+def _fits(runners: Mapping[str, Runner], source: str, end: int) -> bool:
+    """Whether rows of a mirror before own step ``end`` overwrite no row that a step still needs."""
+    return all(
+        end - own.transfer.rule.row_for(runner.step) <= own.transfer.source.rows
+        for runner in runners.values()
+        for own in runner.sources
+        if own.instance == source
+    )

@@ -20,12 +20,9 @@ Get = Callable[[Sequence[str]], list[Value]]
 
 
 def merged(values: Mapping[str, Value], layout: Layout, get: Get) -> dict[str, Value]:
-    """Values of whole variables, from values of variables and of elements of arrays.
+    """Values of whole variables, from values of variables and of elements of arrays: `u[2]` is an element of `u`.
 
-    Args:
-        values: by name; `u[2]` is an element of `u`.
-        layout: the columns that the names belong to.
-        get: reads the current values of variables; the other elements of an array keep them.
+    ``get`` reads the current values of variables; the other elements of an array keep them.
     """
     row = Ring(layout, 1)
     columns = {name: layout.column(name).name for name in values}

@@ -83,11 +83,7 @@ class Transfer:
         }
 
     def step(self, step: int) -> None:
-        """Move the values for own step ``step`` of the target.
-
-        Raises:
-            StepFailed: see `check_range`.
-        """
+        """Move the values for own step ``step`` of the target; raises as `check_range` does."""
         if self._checked:
             self.check_range(step)
         slot = self.rule.row_for(step) & self.source.mask

@@ -27,11 +27,10 @@ from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..node.connecting import connect
 from ..node.engine import Engine, make_engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
-from ..node.stepping import Runner
+from ..node.stepping import Runner, connect
 from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..rings import native

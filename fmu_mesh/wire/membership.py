@@ -265,13 +265,9 @@ class Membership:
         over: Callable[[], bool] = lambda: False,
         priority: zenoh.Priority = zenoh.Priority.DEFAULT,
     ) -> None:
-        """From any thread: report to the master how this participant has ended.
+        """From any thread: report to the master how this participant has ended, unless it is ``over`` before.
 
-        Args:
-            report: the report.
-            timeout_s: how long the master may take to answer, in s.
-            over: whether the report is not needed any more.
-            priority: the report arrives after earlier messages of the same priority.
+        The report arrives after earlier messages of the same priority.
 
         Raises:
             MeshLost: the master did not accept it in time, or this is not a node of its run.

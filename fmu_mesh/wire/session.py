@@ -70,17 +70,12 @@ _CANNOT_LISTEN = (
 """Why a session cannot listen at an endpoint: the text of the system, our text, and a hint."""
 
 
+_BACKGROUND: Final = {"priority": "background", "congestion_control": "drop"}
 _ADMIN_SPACE_IS_OURS: Final = {
     "enabled": True,
     "default_permission": "allow",
     "rules": [
-        {
-            "id": "admin",
-            "messages": ["query"],
-            "flows": ["ingress"],
-            "permission": "deny",
-            "key_exprs": ["@/**"],
-        }
+        {"id": "admin", "messages": ["query"], "flows": ["ingress"], "permission": "deny", "key_exprs": ["@/**"]}
     ],
     "subjects": [{"id": "all"}],
     "policies": [{"rules": ["admin"], "subjects": ["all"]}],
@@ -199,14 +194,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         # Answers get what their question has: a queue of their own behind all other messages. An answer that
         # waits for a client that does not read would stop the link on which it came, and with it frames and progress.
         # `**` fits no key of the synchronization: their `@sync` is verbatim.
-        "qos/network": [
-            {
-                "messages": ["query"],
-                "key_exprs": ["**"],
-                "overwrite": {"priority": "background", "congestion_control": "drop"},
-                "flows": ["ingress"],
-            }
-        ],
+        "qos/network": [{"messages": ["query"], "key_exprs": ["**"], "overwrite": _BACKGROUND, "flows": ["ingress"]}],
         # Measured: with the implicit shared memory, Python is slower for messages of 3 kB and more.
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": wiring.asks_itself,
@@ -348,11 +336,8 @@ def answers(
     A query that is sent before the queryable is known gets no reply. So this waits until a queryable matches, and
     repeats the query when the matching changes.
 
-    Args:
-        session: the session to ask with.
-        question: what is asked.
-        over: whether the answer is not needed any more.
-        every: whether to wait for the end of the query; False: the first answer is enough.
+    ``over`` says whether the answer is not needed any more. With ``every`` this waits for the end of the query; without
+    it, the first answer is enough.
 
     Raises:
         DeadlineExceeded: there was no answer in time.

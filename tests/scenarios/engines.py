@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.node.connecting import sources_of
 from fmu_mesh.node.engine import BurstEngine, Engine
-from fmu_mesh.node.stepping import Runner
+from fmu_mesh.node.stepping import Runner, sources_of
 from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan, Plan

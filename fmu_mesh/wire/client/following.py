@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
-from types import TracebackType
 from typing import Generic, Self, TypeVar
 
 import zenoh
@@ -60,9 +59,7 @@ class Follower(Generic[Item]):
         self._stack.callback(token.undeclare)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._stack.close()
         self.arrived.put(None)  # another thread may be waiting for more
 
@@ -71,12 +68,8 @@ class Follower(Generic[Item]):
     ) -> None:
         """From now on the samples of these keys arrive, as ``decode`` returns them; not those that it refuses.
 
-        A reader that is much too slow loses samples, because a thread of Zenoh must not wait for it.
-
-        Args:
-            keys: what arrives.
-            decode: of each sample what arrives.
-            through: one key expression to subscribe to instead of each key.
+        A reader that is much too slow loses samples, because a thread of Zenoh must not wait for it. ``through`` is one
+        key expression to subscribe to instead of each key.
         """
 
         def take(sample: zenoh.Sample) -> None:
@@ -140,9 +133,7 @@ class ValueStream:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         for key in list(self._subscribers):
             self._subscribers.pop(key).undeclare()
 

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
-from types import TracebackType
 from typing import NamedTuple, Self, TypeVar
 
 import zenoh
@@ -52,6 +51,10 @@ class Meshes:
 
     Attributes:
         silent: for meshes with a note that are not in `all`, the reason.
+
+    Raises:
+        ConfigurationError: (every method) there is no such mesh, or there are several.
+        DeadlineExceeded: (every method) the mesh, or an endpoint, does not answer.
     """
 
     def __init__(self, endpoints: Sequence[str], timeout_s: float) -> None:
@@ -70,17 +73,11 @@ class Meshes:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._close()
 
     def look(self) -> None:
-        """Find the meshes that run now.
-
-        Raises:
-            DeadlineExceeded: an endpoint does not answer.
-        """
+        """Find the meshes that run now."""
         self._found = [*(self._shown() if self._endpoints else self._noted())]
         self._found.sort(key=lambda found: found.keys.mesh)
 
@@ -107,23 +104,13 @@ class Meshes:
             yield wait
 
     def appeared(self, mesh: str | None) -> MeshClient | None:
-        """The mesh with this name or key, or the only mesh; None if there is none.
-
-        Raises:
-            ConfigurationError: there are several.
-            DeadlineExceeded: it does not answer.
-        """
+        """The mesh with this name or key, or the only mesh; None if there is none."""
         if mesh is None:
             return self.named(None) if self._found else None
         return self.named(mesh) if any(found.is_called(mesh) for found in self._found) else None
 
     def all(self) -> list[MeshClient]:
-        """All meshes that answer, at least one.
-
-        Raises:
-            ConfigurationError: there is none.
-            DeadlineExceeded: none of them answers.
-        """
+        """All meshes that answer, at least one."""
         clients: list[MeshClient] = []
         self.silent = []
         running = self._running()
@@ -141,11 +128,7 @@ class Meshes:
     def answers(
         self, clients: Sequence[MeshClient], question: Callable[[MeshClient], Answer]
     ) -> list[tuple[MeshClient, Answer]]:
-        """The answers of the meshes that answer, at least one; the others are added to `silent`.
-
-        Raises:
-            FmuMeshError: none of them answers.
-        """
+        """The answers of the meshes that answer, at least one; the others are added to `silent`."""
         answers: list[tuple[MeshClient, Answer]] = []
         for client in clients:
             try:
@@ -157,12 +140,7 @@ class Meshes:
         return answers
 
     def one(self, reference: str | None) -> MeshClient:
-        """The mesh that a reference (a key, a name, or nothing) means.
-
-        Raises:
-            ConfigurationError: there is none, or more than one.
-            DeadlineExceeded: it does not answer.
-        """
+        """The mesh that a reference (a key, a name, or nothing) means."""
         running = self._running()
         if reference is not None:
             named = [found for found in running if _means(found.keys, reference)]
@@ -180,12 +158,7 @@ class Meshes:
         )
 
     def named(self, mesh: str | None) -> MeshClient:
-        """The mesh with this name, or with this key; None for the only one.
-
-        Raises:
-            ConfigurationError: there is none, or more than one.
-            DeadlineExceeded: it does not answer.
-        """
+        """The mesh with this name, or with this key; None for the only one."""
         running = self._running()
         named = [found for found in running if mesh is None or found.is_called(mesh)]
         if len(named) == 1:

@@ -110,12 +110,7 @@ def wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: floa
 
 
 def appearance(meshes: Meshes, mesh: str | None, timeout_s: float) -> MeshClient:
-    """Wait until a mesh is there.
-
-    Args:
-        meshes: the meshes that can be reached.
-        mesh: its name or key; None for the only one.
-        timeout_s: time limit in s.
+    """Wait until a mesh is there: the one with this name or key, or the only one.
 
     Raises:
         ConfigurationError: there are several.
