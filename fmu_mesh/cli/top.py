@@ -11,7 +11,6 @@ import shutil
 import sys
 import threading
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -92,9 +91,7 @@ class _Courses:
             self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         if self._names and self._thread.ident is not None:
             self._thread.join()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack, redirect_stdout
-from types import TracebackType
 from typing import Literal, Self
 
 import msgspec
@@ -85,9 +84,7 @@ class RunReporter:
             self._stack.enter_context(redirect_stdout(sys.stderr))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._stack.close()
         if self._wanted:
             print_json(self._report(error))

@@ -16,7 +16,7 @@ import time
 import tty
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Final, Self
 
 from ...printing import printable, unguarded
@@ -54,9 +54,7 @@ class Screen:
             self._write(_OTHER_SCREEN)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
         os.close(self._woken)
         os.close(self._waker)
