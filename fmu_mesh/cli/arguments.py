@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 from ..config.base import ENDPOINT_PATTERN
@@ -16,19 +16,23 @@ from ..errors import ConfigurationError
 from ..text import listed, nearest
 
 __all__ = [
+    "PACKAGE",
+    "QUIET",
+    "SSD",
     "CommandParser",
     "Parsers",
+    "Part",
     "Runs",
-    "add_json",
-    "add_package",
-    "add_quiet",
-    "add_reaching",
-    "add_ssd",
+    "argument",
     "count",
     "endpoint",
+    "group",
+    "json_switch",
     "number",
     "port_number",
     "positive_seconds",
+    "reaching",
+    "switch",
     "tolerance",
     "whole",
 ]
@@ -87,52 +91,49 @@ class CommandParser(argparse.ArgumentParser):
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
-Parsers = Mapping[str, Callable[[CommandParser], None]]
-"""What a module of arguments offers: for each command the function that adds them."""
 Runs = Mapping[str, Callable[[argparse.Namespace], int]]
 """What a module of commands offers: for each command the function that runs it and returns the exit code."""
+Part = Callable[[argparse._ActionsContainer], object]  # noqa: SLF001  the base of parsers and groups has no other name
+"""Adds an argument, or several, to a command or to a group of its arguments."""
+Parsers = Mapping[str, Sequence[Part]]
+"""What a module of arguments offers: for each command its arguments, in the order of the help."""
 
 
-def add_json(parser: argparse.ArgumentParser, text: str = "JSON, one object per line") -> None:
-    """Add `--json`."""
-    parser.add_argument("--json", action="store_true", help=text)
+def argument(name: str, metavar: str, text: str, **details: Any) -> Part:  # noqa: ANN401 the arguments of argparse
+    """An argument with a value: its name, what stands for the value in the help, and the help."""
+    return lambda parser: parser.add_argument(name, metavar=metavar, help=text, **details)
 
 
-def add_quiet(parser: argparse.ArgumentParser) -> None:
-    """Add `-q`."""
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+def switch(*names: str, text: str) -> Part:
+    """A flag without a value."""
+    return lambda parser: parser.add_argument(*names, action="store_true", help=text)
 
 
-def add_reaching(parser: argparse.ArgumentParser, timeout_s: float = _TIMEOUT_S) -> None:
-    """Add the flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
-    parser.add_argument(
-        "--connect",
-        type=endpoint,
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host",
+def group(title: str, *parts: Part) -> Part:
+    """Arguments with a title in the help."""
+
+    def add(parser: argparse._ActionsContainer) -> None:
+        own = parser.add_argument_group(title)
+        for part in parts:
+            part(own)
+
+    return add
+
+
+def json_switch(text: str = "JSON, one object per line") -> Part:
+    """`--json`."""
+    return switch("--json", text=text)
+
+
+def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[Part, Part]:
+    """The flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
+    where = "Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host"
+    return (
+        argument("--connect", "ENDPOINT", where, type=endpoint, action="append", default=[]),
+        argument(
+            "--timeout", "S", f"deadline of every query in s ({timeout_s:g})", type=positive_seconds, default=timeout_s
+        ),
     )
-    parser.add_argument(
-        "--timeout",
-        type=positive_seconds,
-        default=timeout_s,
-        metavar="S",
-        help=f"deadline of every query in s ({timeout_s:g})",
-    )
-
-
-def add_package(parser: argparse.ArgumentParser) -> None:
-    """Add what chooses a variant of a package: `--ssd` and `--ssv`."""
-    add_ssd(parser)
-    text = "values of an SSV file, which replace those of a package: a file in it, or another one; repeatable"
-    parser.add_argument("--ssv", action="append", default=[], metavar="FILE.ssv", help=text)
-
-
-def add_ssd(parser: argparse.ArgumentParser) -> None:
-    """Add `--ssd`."""
-    text = "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
-    parser.add_argument("--ssd", metavar="NAME", help=text)
 
 
 def number(text: str) -> float:
@@ -194,3 +195,20 @@ def _read(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
+
+
+QUIET = switch("-q", "--quiet", text="print errors only")
+SSD = argument(
+    "--ssd", "NAME", "the description in a package of SSP: its file or its name; default: SystemStructure.ssd"
+)
+PACKAGE = (
+    SSD,
+    argument(
+        "--ssv",
+        "FILE.ssv",
+        "values of an SSV file, which replace those of a package: a file in it, or another one; repeatable",
+        action="append",
+        default=[],
+    ),
+)
+"""What chooses a variant of a package."""

@@ -162,5 +162,6 @@ def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, M
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
         if name in needed:
-            import_module(f".{kind}_arguments", __package__).PARSERS[name](command)
+            for add in import_module(f".{kind}_arguments", __package__).PARSERS[name]:
+                add(command)
     return parser, commands.choices

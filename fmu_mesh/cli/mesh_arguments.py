@@ -8,17 +8,18 @@ from typing import Final, get_args
 from ..ros.bags.play_options import PlayOptions
 from ..wire.views import MeshState
 from .arguments import (
-    CommandParser,
+    QUIET,
     Parsers,
-    add_json,
-    add_quiet,
-    add_reaching,
+    argument,
     count,
+    json_switch,
     number,
     port_number,
     positive_seconds,
+    reaching,
+    switch,
 )
-from .run_options import add_options
+from .run_options import options
 
 __all__ = ["LEVELS", "PARSERS"]
 
@@ -33,172 +34,100 @@ _REFERENCE: Final = (
     "regular expression); or a key (with wildcards of Zenoh)"
 )
 _WHICH: Final = "a mesh or an instance: NAME, MESH/INSTANCE, or its key"
-
-
-def _add_question(parser: CommandParser) -> None:
-    """Add the flags of a command that asks running meshes."""
-    add_reaching(parser)
-    add_json(parser)
-
-
-def _add_ls(parser: CommandParser) -> None:
-    _add_question(parser)
-    parser.add_argument("name", nargs="?", metavar="NAME", help="a mesh, or an instance, whose variables are listed")
-    parser.add_argument("-l", "--long", action="store_true", help="also list the variables of every instance")
-
-
-def _add_status(parser: CommandParser) -> None:
-    _add_question(parser)
-    parser.add_argument("key", nargs="?", metavar="KEY", help=f"{_WHICH}; default: every mesh")
-
-
-def _add_info(parser: CommandParser) -> None:
-    _add_question(parser)
-    parser.add_argument("key", metavar="KEY", help=_WHICH)
-
-
-def _add_get(parser: CommandParser) -> None:
-    _add_question(parser)
-    parser.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
-
-
-def _add_set(parser: CommandParser) -> None:
-    _add_question(parser)
-    add_quiet(parser)
-    parser.add_argument("key", metavar="KEY", help="`instance.variable`, `MESH/instance.variable`, or a key")
-    parser.add_argument("value", metavar="VALUE", help="a number, true, false, text, or [a, list] for an array")
-    parser.add_argument("--at", type=number, metavar="T", help="simulation time in s from which on it holds")
-
-
-def _add_watch(parser: CommandParser) -> None:
-    _add_question(parser)
-    parser.add_argument("key", nargs="+", metavar="KEY", help=_REFERENCE)
-    parser.add_argument("--count", type=count, metavar="N", help="end after N values")
-
-
-def _add_top(parser: CommandParser) -> None:
-    add_reaching(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument("--once", action="store_true", help="show it once and exit")
-    parser.add_argument(
-        "--interval", type=positive_seconds, default=_INTERVAL_S, metavar="S", help="time between two looks in s (1)"
-    )
-    parser.add_argument(
-        "--watch",
-        nargs="+",
-        default=[],
-        metavar="INSTANCE.VARIABLE",
-        help="also show the course of these variables (or patterns, such as 'arm*.x')",
-    )
-    add_json(parser, "JSON, one object per look")
-
-
-def _add_dashboard(parser: CommandParser) -> None:
-    add_reaching(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: all that run")
-    parser.add_argument("--host", default=_HOST, metavar="ADDRESS", help=f"address where the page is served ({_HOST})")
-    parser.add_argument("--port", type=port_number, default=0, metavar="N", help="port of the page; 0: a free one (0)")
-    parser.add_argument("--read-only", action="store_true", help="show the meshes, but set and steer nothing")
-    parser.add_argument("--no-browser", action="store_true", help="print the address only")
-
-
-def _add_foxglove(parser: CommandParser) -> None:
-    add_reaching(parser)
-    add_quiet(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument(
-        "--variables",
-        nargs="+",
-        default=[],
-        metavar="INSTANCE.VARIABLE",
-        help="offer only these, or patterns; default: all outputs",
-    )
-    parser.add_argument("--host", default=_HOST, metavar="ADDRESS", help=f"the address to listen at ({_HOST})")
-    parser.add_argument(
-        "--port",
-        type=port_number,
-        default=8765,
-        metavar="N",
-        help="the port, 0 for a free one (8765)",
-    )
-    parser.add_argument("--steer", action="store_true", help="clients may set inputs and parameters")
-    parser.add_argument(
-        "--origin",
-        action="append",
-        default=[],
-        metavar="ORIGIN",
-        help="let pages of this origin connect, too, such as https://foxglove.example.org; may be repeated",
-    )
-
-
-def _add_logs(parser: CommandParser) -> None:
-    add_reaching(parser)
-    add_json(parser)
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    parser.add_argument("--instance", metavar="NAME", help="only the messages of this instance")
-    parser.add_argument(
-        "--level",
-        choices=LEVELS,
-        default="ok",
-        metavar="STATUS",
-        help=f"from this status on: {', '.join(LEVELS)} (ok)",
-    )
-    parser.add_argument("-f", "--follow", action="store_true", help="also show new messages, until the mesh ends")
-
-
-def _add_command(parser: CommandParser) -> None:
-    add_reaching(parser)
-    add_json(parser)
-    add_quiet(parser)
-    _add_mesh(parser)
-
-
-def _add_step(parser: CommandParser) -> None:
-    _add_command(parser)
-    parser.add_argument("points", nargs="?", metavar="N", help="points (1)")
-
-
-def _add_wait(parser: CommandParser) -> None:
-    add_reaching(parser, _PATIENCE_S)
-    add_json(parser, "JSON, as `status` prints it")
-    add_quiet(parser)
-    _add_mesh(parser)
-    parser.add_argument(
-        "--state",
-        choices=get_args(MeshState),
-        default="running",
-        metavar="STATE",
-        help=f"{', '.join(get_args(MeshState))} (running)",
-    )
-
-
-def _add_mesh(parser: CommandParser) -> None:
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-
-
-def _add_play(parser: CommandParser) -> None:
-    add_reaching(parser, _PATIENCE_S)
-    add_quiet(parser)
-    parser.add_argument("bag", type=Path, metavar="BAG", help="an MCAP file, or the folder of a `ros2 bag`")
-    parser.add_argument("mesh", nargs="?", metavar="MESH", help="name or key of the mesh; default: the only one")
-    add_options(parser, "topics", "start", "stamps", "config", options=PlayOptions)
-
+_MESH: Final = argument("mesh", "MESH", "name or key of the mesh; default: the only one", nargs="?")
+_KEYS: Final = argument("key", "KEY", _REFERENCE, nargs="+")
+_QUESTION: Final = (*reaching(), json_switch())
+"""The flags of a command that asks running meshes."""
+_COMMAND: Final = (*_QUESTION, QUIET, _MESH)
 
 PARSERS: Parsers = {
-    "ls": _add_ls,
-    "status": _add_status,
-    "info": _add_info,
-    "get": _add_get,
-    "set": _add_set,
-    "watch": _add_watch,
-    "top": _add_top,
-    "dashboard": _add_dashboard,
-    "foxglove": _add_foxglove,
-    "logs": _add_logs,
-    "wait": _add_wait,
-    "pause": _add_command,
-    "resume": _add_command,
-    "step": _add_step,
-    "stop": _add_command,
-    "play": _add_play,
+    "ls": (
+        *_QUESTION,
+        argument("name", "NAME", "a mesh, or an instance, whose variables are listed", nargs="?"),
+        switch("-l", "--long", text="also list the variables of every instance"),
+    ),
+    "status": (*_QUESTION, argument("key", "KEY", f"{_WHICH}; default: every mesh", nargs="?")),
+    "info": (*_QUESTION, argument("key", "KEY", _WHICH)),
+    "get": (*_QUESTION, _KEYS),
+    "set": (
+        *_QUESTION,
+        QUIET,
+        argument("key", "KEY", "`instance.variable`, `MESH/instance.variable`, or a key"),
+        argument("value", "VALUE", "a number, true, false, text, or [a, list] for an array"),
+        argument("--at", "T", "simulation time in s from which on it holds", type=number),
+    ),
+    "watch": (*_QUESTION, _KEYS, argument("--count", "N", "end after N values", type=count)),
+    "top": (
+        *reaching(),
+        _MESH,
+        switch("--once", text="show it once and exit"),
+        argument("--interval", "S", "time between two looks in s (1)", type=positive_seconds, default=_INTERVAL_S),
+        argument(
+            "--watch",
+            "INSTANCE.VARIABLE",
+            "also show the course of these variables (or patterns, such as 'arm*.x')",
+            nargs="+",
+            default=[],
+        ),
+        json_switch("JSON, one object per look"),
+    ),
+    "dashboard": (
+        *reaching(),
+        argument("mesh", "MESH", "name or key of the mesh; default: all that run", nargs="?"),
+        argument("--host", "ADDRESS", f"address where the page is served ({_HOST})", default=_HOST),
+        argument("--port", "N", "port of the page; 0: a free one (0)", type=port_number, default=0),
+        switch("--read-only", text="show the meshes, but set and steer nothing"),
+        switch("--no-browser", text="print the address only"),
+    ),
+    "foxglove": (
+        *reaching(),
+        QUIET,
+        _MESH,
+        argument(
+            "--variables",
+            "INSTANCE.VARIABLE",
+            "offer only these, or patterns; default: all outputs",
+            nargs="+",
+            default=[],
+        ),
+        argument("--host", "ADDRESS", f"the address to listen at ({_HOST})", default=_HOST),
+        argument("--port", "N", "the port, 0 for a free one (8765)", type=port_number, default=8765),
+        switch("--steer", text="clients may set inputs and parameters"),
+        argument(
+            "--origin",
+            "ORIGIN",
+            "let pages of this origin connect, too, such as https://foxglove.example.org; may be repeated",
+            action="append",
+            default=[],
+        ),
+    ),
+    "logs": (
+        *_QUESTION,
+        _MESH,
+        argument("--instance", "NAME", "only the messages of this instance"),
+        argument("--level", "STATUS", f"from this status on: {', '.join(LEVELS)} (ok)", choices=LEVELS, default="ok"),
+        switch("-f", "--follow", text="also show new messages, until the mesh ends"),
+    ),
+    **dict.fromkeys(("pause", "resume", "stop"), _COMMAND),
+    "step": (*_COMMAND, argument("points", "N", "points (1)", nargs="?")),
+    "wait": (
+        *reaching(_PATIENCE_S),
+        json_switch("JSON, as `status` prints it"),
+        QUIET,
+        _MESH,
+        argument(
+            "--state",
+            "STATE",
+            f"{', '.join(get_args(MeshState))} (running)",
+            choices=get_args(MeshState),
+            default="running",
+        ),
+    ),
+    "play": (
+        *reaching(_PATIENCE_S),
+        QUIET,
+        argument("bag", "BAG", "an MCAP file, or the folder of a `ros2 bag`", type=Path),
+        _MESH,
+        options("topics", "start", "stamps", "config", of=PlayOptions),
+    ),
 }

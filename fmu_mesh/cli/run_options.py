@@ -12,39 +12,18 @@ from ..config.call_options import CallOptions, option_fields
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError
 from ..run.options import PlanOptions, RunOptions
-from .arguments import add_package, count, endpoint, number, whole
+from .arguments import PACKAGE, Part, argument, count, endpoint, group, number, whole
 from .output.terminal import teller
 
 if TYPE_CHECKING:
     from ..api.mesh_builder import Mesh
     from ..config.yaml_text import Plain
 
-__all__ = ["add_configuration", "add_options", "given_options", "mesh_of"]
-
-
-def add_configuration(parser: argparse.ArgumentParser) -> None:
-    """Add the argument CONFIG, and the flags that replace what CONFIG says."""
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="the configuration file, or a package of SSP")
-    add_package(parser)
-    add_options(
-        parser.add_argument_group("instead of what CONFIG says"),
-        "algorithm",
-        "step_size",
-        "stop_time",
-        "window",
-        "real_time_factor",
-        "start_values",
-        "config_values",
-        "scenario",
-        "output",
-        "listen",
-        "connect",
-    )
-    add_options(parser, "allow_code")
+__all__ = ["CONFIGURED", "add_options", "given_options", "mesh_of", "options"]
 
 
 def mesh_of(arguments: argparse.Namespace) -> Mesh:
-    """The mesh of CONFIG, in the variant that the flags of `add_configuration` choose."""
+    """The mesh of CONFIG, in the variant that the flags of `CONFIGURED` choose."""
     from ..api.mesh_builder import load  # noqa: PLC0415 the help needs no mesh
 
     return load(arguments.config, ssd=arguments.ssd, ssv=arguments.ssv)
@@ -89,6 +68,35 @@ def add_options(
         if field.bare is not None:
             details |= {"nargs": "?", "const": field.bare}
         parser.add_argument(flag, **details)
+
+
+def options(*names: str, of: type[CallOptions] = RunOptions, **words: Mapping[str, str]) -> Part:
+    """The flags of options; see `add_options`."""
+    return lambda parser: add_options(parser, *names, options=of, **words)
+
+
+CONFIGURED = (
+    argument("config", "CONFIG", "the configuration file, or a package of SSP", type=Path),
+    *PACKAGE,
+    group(
+        "instead of what CONFIG says",
+        options(
+            "algorithm",
+            "step_size",
+            "stop_time",
+            "window",
+            "real_time_factor",
+            "start_values",
+            "config_values",
+            "scenario",
+            "output",
+            "listen",
+            "connect",
+        ),
+    ),
+    options("allow_code"),
+)
+"""The argument CONFIG, and the flags that replace what CONFIG says."""
 
 
 def given_options(arguments: argparse.Namespace, options: type[CallOptions] = PlanOptions) -> dict[str, Any]:
