@@ -31,6 +31,11 @@ def _add_simulate(parser: argparse._ActionsContainer) -> None:
     add_options(parser, *flags, options=SimulateOptions, defaults={**defaults, "output": "nothing is written"})
 
 
+def _add_processes(parser: argparse._ActionsContainer) -> None:
+    """Until version 0.5: `sweep` warns, and says what to do."""
+    parser.add_argument("--processes", action="store_true", default=None, help=argparse.SUPPRESS)
+
+
 def _part(text: str) -> tuple[int, int]:
     number, slash, of = text.partition("/")
     if not (slash and 1 <= whole(number) <= whole(of)):
@@ -114,7 +119,8 @@ PARSERS: Parsers = {
         group("what is kept", options("reduce", "folder", "curves", of=SweepOptions)),
         group(
             "how it runs",
-            options("resume", "force", "workers", "max_instances", "processes", "reset", of=SweepOptions),
+            options("resume", "force", "workers", "max_instances", "reset", of=SweepOptions),
+            _add_processes,
             argument(
                 "--dask",
                 "ADDRESS",

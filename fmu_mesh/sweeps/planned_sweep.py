@@ -37,6 +37,11 @@ log = logging.getLogger("fmu_mesh.run")
 
 _OPTION = re.compile(r"`(start_values|config_values)=\{'([^']+)': ")
 
+_DEPRECATED = (
+    "the option that runs each variant in processes goes in two versions: leave it out; variants whose instances may "
+    "not share a process get processes without it"
+)
+
 _OF_EACH_RUN = [name for name in VariantOptions.__struct_fields__ if name != "on_notice"]
 
 
@@ -106,6 +111,8 @@ def planned_sweep(
         most_instances=dict(options.max_instances),
     )
     tell = options.on_notice or log.info
+    if options.processes:
+        tell(f"warning: {_DEPRECATED}")
     try:
         plan = _any_plan(own, base, wanted, tell)
     except ConfigurationError as error:

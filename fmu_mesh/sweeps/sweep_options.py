@@ -58,7 +58,7 @@ class SweepOptions(VariantOptions, frozen=True, kw_only=True):
     curves: Annotated[bool, Option("False: keep the table only", "--no-curves")] = True
     resume: Annotated[bool, Option("keep the runs that the folder has, and run what is missing", "--resume")] = False
     force: Annotated[bool, Option("remove the sweep that the folder has, and no other files", "--force")] = False
-    processes: Annotated[bool, Option("run each variant in processes, as `Mesh.run` does", "--processes")] = False
+    processes: Annotated[bool, Option("deprecated: run each variant in processes, as `Mesh.run` does")] = False
     reset: Annotated[bool, Option("reset the instances of FMUs between two runs (fmi2Reset)", "--reset")] = False
     max_instances: Annotated[
         Mapping[str, int] | Iterable[Any],

@@ -96,14 +96,15 @@ def test_models_that_a_thread_has_loaded_go_with_the_thread(config: Path, tmp_pa
 
 def test_a_sweep_in_processes_has_the_rows_of_one_in_one_process(config: Path, tmp_path: Path) -> None:
     found = {}
+    told: list[str] = []
     for processes in (False, True):
-        with fmu_mesh.sweep(
-            config, {"pendulum.d": [0.1, 0.4]}, processes=processes, folder=tmp_path / f"{processes}"
-        ) as running:
+        options = {"processes": processes, "folder": tmp_path / f"{processes}", "on_notice": told.append}
+        with fmu_mesh.sweep(config, {"pendulum.d": [0.1, 0.4]}, **options) as running:
             found[processes] = running.wait(DEADLINE_S)
 
     assert contents(found[True]) == contents(found[False])
     assert [row.values for row in found[True]] == [row.values for row in found[False]]
+    assert sum("goes in two versions: leave it out" in text for text in told) == 1
 
 
 def test_rows_and_progress_are_there_while_the_sweep_goes_on(faulty: Path, tmp_path: Path) -> None:
