@@ -23,12 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class Arguments:
-    """The variables of one FMU by their use; a wrong argument raises `CallRefused`.
-
-    Args:
-        instance: instance name, for messages.
-        description: the model description.
-    """
+    """The variables of one FMU by their use; a wrong argument raises `CallRefused`."""
 
     def __init__(self, instance: str, description: ModelDescription) -> None:
         self.instance = instance

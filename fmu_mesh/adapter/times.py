@@ -90,11 +90,7 @@ def clock_from(start: Instant) -> CallerClock:
 
 
 class SecondsClock:
-    """A clock in seconds.
-
-    Args:
-        start: the caller's time in s when the FMU's time is 0.0.
-    """
+    """A clock in seconds, which has ``start`` when the time of the FMU is 0.0."""
 
     def __init__(self, start: float) -> None:
         self._start = start
@@ -121,11 +117,7 @@ class SecondsClock:
 
 
 class NanosecondsClock:
-    """A clock in whole nanoseconds, as in ROS: exact for any start.
-
-    Args:
-        start: the caller's time in ns when the FMU's time is 0.0.
-    """
+    """A clock in whole nanoseconds, as in ROS: exact for any start."""
 
     def __init__(self, start: int) -> None:
         self._start = start

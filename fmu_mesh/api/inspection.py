@@ -77,13 +77,10 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
     description: ModelDescription
 
     def page(self, width: int = _WIDTH, variables: Sequence[str] = (), *, everything: bool = False) -> str:
-        """The page in lines of at most ``width`` columns, unless a name is longer.
+        """The page in lines of at most ``width`` columns, unless a name is longer; with ``everything``, of all variables.
 
-        Args:
-            width: in columns.
-            variables: names, or patterns of names (`*`: any characters; `?`: one; `re:...`: a regular expression); if
-                given, only these variables are shown.
-            everything: whether all variables are listed.
+        ``variables`` are names, or patterns (`*`: any characters; `?`: one; `re:...`: a regular expression): only these
+        are shown.
 
         Raises:
             UnknownName: there is no such variable; suggests the nearest one.

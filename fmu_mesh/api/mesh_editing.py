@@ -49,11 +49,8 @@ _REST: Final[dict[str, Any]] = {
 def check_part(call: str, part: Mapping[str, Any], paths: Sequence[str], inside: str = "") -> None:
     """Check the structure of a part of a configuration, before it becomes one.
 
-    Args:
-        call: the call that gives it.
-        part: sections by name.
-        paths: what the call gives; findings about anything else in these sections are not its own.
-        inside: the start of these paths, which the call says already.
+    ``paths`` are what the call gives: findings about anything else in these sections are not its own. ``inside`` is the
+    start of these paths, which the call says already.
 
     Raises:
         CallRefused: there is a finding.
@@ -108,13 +105,9 @@ def without_instance(plain: PlainConfig, name: str) -> PlainConfig:
 
 
 def with_record(section: Any, variables: Sequence[str], keys: Mapping[str, Any], *, also: bool) -> Any:  # noqa: ANN401  as a file has it
-    """The section `record` with another first file, or with one more.
+    """The section `record`, a mapping or a list of mappings, with another first file; or with one more (``also``).
 
-    Args:
-        section: what it was: a mapping or a list of mappings.
-        variables: what the file gets; all outputs if there are none.
-        keys: other keys of its section; None leaves what the section says.
-        also: whether it is one more file.
+    Without ``variables``, the file gets all outputs. A key that is None leaves what the section says.
     """
     given = {"from" if key == "start" else key: plain_value(value) for key, value in keys.items() if value is not None}
     given["variables"] = list(variables) or None
@@ -152,22 +145,14 @@ def _is_of(variable: object, name: str) -> bool:
 
 
 def sections_of(plain: PlainConfig) -> dict[str, Any]:
-    """The sections of a configuration.
-
-    Raises:
-        ConfigurationError: it has none.
-    """
+    """The sections of a configuration, which is an error without any."""
     if not isinstance(plain.data, dict):
         raise ConfigurationError(f"'{plain.file}' has {shown(plain.data)} where a configuration should be")
     return plain.data
 
 
 def connections_of(plain: PlainConfig) -> list[Any]:
-    """The connections of a configuration.
-
-    Raises:
-        ConfigurationError: the section is no list.
-    """
+    """The connections of a configuration; anything but a list is an error."""
     own = sections_of(plain).get("connections") or []
     if not isinstance(own, list):
         raise ConfigurationError(f"'connections' of '{plain.file}' is {shown(own)}, where a list should be")
@@ -202,9 +187,6 @@ def rebased(configuration: PlainConfig, folder: Path) -> dict[str, Any]:
         >>> from fmu_mesh.config.loading import read_file
         >>> rebased(read_file(Path("configs/pendulum_delay.yaml")), Path())["instances"]["pendulum"]["fmu"]
         'fmus/DampedPendulum.fmu'
-
-    Raises:
-        ConfigurationError: too much of the configuration is wrong to know its paths.
     """
     data: dict[str, Any] = plain_value(configuration.data)
     old, new = (os.path.realpath(path) for path in (configuration.file.absolute().parent, folder))

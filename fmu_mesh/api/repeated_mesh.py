@@ -139,11 +139,7 @@ class RepeatedMesh:
 
 
 class _CollectedRows:
-    """The rows of a run in memory, and in its result file if it has one; see `ResultFile`.
-
-    Args:
-        plan: the plan of the run.
-    """
+    """The rows of a run in memory, and in its result file if it has one; see `ResultFile`."""
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan

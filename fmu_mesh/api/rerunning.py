@@ -114,7 +114,7 @@ def rerun(result: str | Path, options: RerunOptions) -> Result:
 
 @takes(RerunOptions)
 def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
-    """Plan a rerun; the arguments and errors are those of `rerun`.
+    """Plan a rerun; the errors are those of `rerun`.
 
     Args:
         result: the result file.
@@ -173,11 +173,7 @@ def _last_point(metadata: RunMetadata, result: Result) -> int | None:
 
 
 def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:
-    """Check that the models and the files of the scenario are those of the first run.
-
-    Raises:
-        ConfigurationError: some are not; has a finding for each.
-    """
+    """Check that models and files of the scenario are those of the first run: a finding for each that is not."""
     findings = []
     for name, own in metadata.models.items():
         now = plan.contents.get(name, "")

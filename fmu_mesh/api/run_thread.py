@@ -56,11 +56,7 @@ _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.W
 
 
 class RunThread:
-    """Runs a plan on a thread of its own, which starts at once.
-
-    Args:
-        plan: the plan of the run.
-        settings: how it runs.
+    """Runs a plan, as its settings say, on a thread of its own, which starts at once.
 
     Attributes:
         plan: the plan of the run.
@@ -195,11 +191,7 @@ class RunThread:
         _active.discard(self)
 
     def _run(self) -> Result:
-        """Run it, and again if it may be restarted.
-
-        Raises:
-            FmuMeshError: it ended early; has the result.
-        """
+        """Run it, and again if it may be restarted."""
         plan, most = self.plan, self._settings.restarts
         while True:
             try:
@@ -301,11 +293,7 @@ def _end_all() -> None:
 
 
 def _make_folder(folder: Path, plan: RunPlan) -> None:
-    """Make the folder for results that stay in memory.
-
-    Raises:
-        CallRefused: a run of the same plan has not ended.
-    """
+    """Make the folder for results that stay in memory."""
     try:
         folder.mkdir(mode=0o700)
     except FileExistsError as error:

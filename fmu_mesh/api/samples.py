@@ -42,12 +42,7 @@ class Sample(NamedTuple):
 
 
 class Watch(Iterator[Sample]):
-    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed.
-
-    Args:
-        client: the way into the mesh.
-        targets: the variables.
-    """
+    """The values of variables as they come, from when it was made until the mesh ends, or until it is closed."""
 
     def __init__(self, client: MeshClient, targets: Sequence[Target]) -> None:
         self._targets = {target.key: target for target in targets}

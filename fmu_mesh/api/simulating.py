@@ -79,12 +79,7 @@ def as_given(error: ConfigurationError, front: str) -> ConfigurationError:
 
 
 def experiment_of(fmu: str | Path, options: SimulateOptions) -> tuple[Mesh, dict[str, Any]]:
-    """A mesh of one FMU for one experiment, and the options of its run.
-
-    Raises:
-        CallRefused: an option is wrong.
-        LoadFailed: it is no FMU that can run here; says why.
-    """
+    """A mesh of one FMU for one experiment, and the options of its run."""
     given = options.given()
     section = {key: given.pop(key) for key in ("kind", "tolerance", "solver") if key in given}
     simulation = partial(_times_of, options)

@@ -51,11 +51,7 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE  # by default argparse takes -1e-3 and -inf for options
 
     def error(self, message: str) -> NoReturn:
-        """Raise one sentence about the error.
-
-        Raises:
-            ConfigurationError: always.
-        """
+        """Raise one sentence about the error."""
         name, _, what = message.removeprefix("argument ").partition(": ")
         hint = None
         if name == "the following arguments are required":

@@ -55,11 +55,7 @@ def _is_configuration(path: Path) -> bool:
 
 
 def write(graph: SystemGraph, output: Path) -> None:
-    """Write a graph into a file; its suffix gives the format.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
+    """Write a graph into a file; its suffix gives the format."""
     suffix = output.suffix.lower()
     if suffix in (".png", ".pdf"):
         draw(graph.figure(), output)

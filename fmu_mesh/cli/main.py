@@ -113,11 +113,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
-    """The command and its arguments; None, after the help, without a command.
-
-    Raises:
-        ConfigurationError: there is no such command, or an argument is wrong.
-    """
+    """The command and its arguments; None, after the help, without a command."""
     name = next((argument for argument in given if not argument.startswith("-")), None)
     if name is not None and given[0] == name and name not in COMMANDS:
         raise _unknown(name)
@@ -145,11 +141,7 @@ def _unknown(name: str) -> ConfigurationError:
 
 
 def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, Mapping[str, CommandParser]]:
-    """The parser, and the parsers of all commands by name.
-
-    Args:
-        needed: the commands whose arguments are needed.
-    """
+    """The parser, and those of all commands by name; those of commands that are not ``needed`` have no arguments."""
     parser = CommandParser(
         prog="fmu-mesh",
         description="A service mesh for co-simulation: FMUs as Zenoh nodes under one master.",

@@ -140,14 +140,7 @@ def _name(text: str, taken: Iterable[str]) -> str:
 
 
 def configuration_for(models: Sequence[Model], *, mesh: str, file: Path, schema: str) -> str:
-    """The text of a configuration.
-
-    Args:
-        models: the FMUs; those that cannot run here become comments.
-        mesh: the name of the mesh.
-        file: where the text is going to be.
-        schema: the file of the JSON Schema beside it.
-    """
+    """The text of a configuration, which is going to be ``file``; FMUs that cannot run here become comments."""
     step, grid = _simulation(models)
     lines = [
         f"# yaml-language-server: $schema={schema}",

@@ -54,11 +54,7 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def _of_files(arguments: argparse.Namespace) -> Figure:
-    """A picture of one or several result files.
-
-    Raises:
-        ConfigurationError: a file cannot be read or has no such variable, or options cannot be combined.
-    """
+    """A picture of one or several result files."""
     result, *others = (Result(path.stem, file=path) for path in arguments.results)
     if arguments.difference and (not others or arguments.x is not None):
         hint = "Name two result files." if not others else "Leave --x out."
@@ -73,12 +69,7 @@ def _of_files(arguments: argparse.Namespace) -> Figure:
 
 
 def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure, str]:
-    """A picture of a sweep, and what it shows.
-
-    Raises:
-        ConfigurationError: it is not said which variable, or two options cannot be combined.
-        CallRefused: there is no such column or parameter.
-    """
+    """A picture of a sweep, and what it shows."""
     variables: Sequence[str] = arguments.variables or ()
     if arguments.heat_map is not None:
         if variables or arguments.colour:
@@ -93,10 +84,6 @@ def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure
 
 def check_plot(plot: Path, plan: RunPlan) -> None:
     """Check before a run that its result can be plotted at its end.
-
-    Args:
-        plot: the file of the picture.
-        plan: the plan of the run.
 
     Raises:
         ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
@@ -114,11 +101,7 @@ def check_plot(plot: Path, plan: RunPlan) -> None:
 
 
 def plot_results(result: Path | Result, plot: Path, plan: Plan) -> None:
-    """Draw the result of a run, or its file, with one axes for each unit of its plan.
-
-    Raises:
-        ConfigurationError: the result cannot be read, or the plot cannot be written.
-    """
+    """Draw the result of a run, or its file, with one axes for each unit of its plan."""
     if isinstance(result, Path):
         result = Result(plan.system.config.mesh, file=result, system=plan.system)
     draw(result.plot(), plot)

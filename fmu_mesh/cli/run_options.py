@@ -36,14 +36,9 @@ def add_options(
     defaults: Mapping[str, str] | None = None,
     metavars: Mapping[str, str] | None = None,
 ) -> None:
-    """Add flags for options, as their Struct describes them.
+    """Add flags for options, the fields of a Struct, as it describes them.
 
-    Args:
-        parser: the parser of a command, or a group of its flags.
-        names: the fields of the Struct.
-        options: the Struct.
-        defaults: by field, the default value for the help.
-        metavars: by field, the name of the value in the help, if it differs from that in the Struct.
+    ``defaults`` has default values for the help, and ``metavars`` names of values that differ from those in the Struct.
     """
     for name in names:
         field = option_fields(options)[name]

@@ -44,11 +44,7 @@ def _launch(arguments: argparse.Namespace) -> int:
 
 
 def _how(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How a run is started.
-
-    Raises:
-        ConfigurationError: two options cannot be combined.
-    """
+    """How a run is started; refuses options that cannot be combined."""
     local = arguments.processes is False
     if local and arguments.paused:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")

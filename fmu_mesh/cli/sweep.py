@@ -85,11 +85,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 
 def _planned(arguments: argparse.Namespace) -> PlannedSweep:
-    """Plan the sweep, or what is missing of one.
-
-    Raises:
-        ConfigurationError: something is wrong with it, or two arguments cannot be combined.
-    """
+    """Plan the sweep, or what is missing of one."""
     given = given_options(arguments, SweepOptions)
     if is_sweep(arguments.config):
         if given.keys() - _OF_FOLDER or any(getattr(arguments, name) for name in ("ssd", "ssv", "vary")):

@@ -62,17 +62,9 @@ class _Courses:
 
     A thread asks for the values, because `top` has to show the state of a mesh whose values do not come.
 
-    Args:
-        run: the mesh.
-        names: the variables; none: nothing is asked for.
-        interval_s: time between two looks at the mesh in s.
-
     Attributes:
         per_look: number of values in the time between two looks.
         interval_s: time between two values in s.
-
-    Raises:
-        UnknownName: there is no such variable.
     """
 
     def __init__(self, run: Run, names: Sequence[str], interval_s: float) -> None:
@@ -155,13 +147,7 @@ def _follow(run: Run, courses: _Courses, *, as_json: bool) -> int:
 
 
 def page(look: Look, before: Look | None = None, *, width: int | None = None) -> list[str]:
-    """The lines of one look.
-
-    Args:
-        look: the status of the mesh and of its instances.
-        before: that of the last look, for rates; None at the first one.
-        width: largest width in columns; None: no limit.
-    """
+    """The lines of one look, in at most ``width`` columns; rates are those since the look ``before``."""
     status, instances = look
     step_size = status.real_time_factor / status.points_per_second if status.points_per_second else 0.0
     head = [

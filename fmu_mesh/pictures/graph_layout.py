@@ -89,12 +89,9 @@ def going_back(names: Sequence[str], wires: Sequence[tuple[str, str, int]]) -> s
 
 
 def arranged(boxes: Mapping[str, Dot], wires: Sequence[Wire], *, fold: bool = True) -> Arrangement:
-    """Arrange boxes by their wires; depends on nothing but the arguments and their order.
+    """Arrange boxes, given as width and height in the order of execution, by the wires between them.
 
-    Args:
-        boxes: width and height by name, in the order of execution.
-        wires: the wires between them.
-        fold: whether many columns become several bands, one below the other.
+    Depends on nothing but the arguments and their order. With ``fold``, many columns become several bands.
     """
     wired = {end for wire in wires for end in (wire.source, wire.target)}
     main = _Columns({name: size for name, size in boxes.items() if name in wired}, wires, fold=fold).arrangement()

@@ -124,11 +124,7 @@ def _svg_text(label: Label) -> str:
 
 
 def figure_of_drawing(drawing: Drawing) -> Figure:
-    """The figure of matplotlib, which writes PNG and PDF.
-
-    Raises:
-        ConfigurationError: it is not installed.
-    """
+    """The figure of matplotlib, which writes PNG and PDF."""
     figure = empty_figure()
     figure.set_layout_engine("none")
     from matplotlib.patches import Circle, FancyBboxPatch, PathPatch, Polygon  # noqa: PLC0415  an extra, and slow to import

@@ -26,12 +26,7 @@ _PROBLEM_CHARACTERS = 200
 
 
 def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
-    """The plan as lines of text, the same on every terminal and in every pipe.
-
-    Args:
-        plan: what would run.
-        loaded: its configuration, which says where start values come from.
-    """
+    """The plan as lines of text, the same on every terminal and in every pipe; ``loaded`` says where start values come from."""
     sections = [
         ("", _head(plan)),
         ("Instances", _instances(plan)),

@@ -151,13 +151,7 @@ def _factor(text: str) -> str:
 def figure_of(results: Sequence[Curves], picture: PictureOptions) -> Figure:
     """The matplotlib figure: one axes below the other, each as high as its legend.
 
-    Args:
-        results: what is drawn of each result. A variable has one colour, and of several results each one kind of line.
-        picture: the rest.
-
-    Raises:
-        CallRefused: the horizontal axis has texts.
-        ConfigurationError: matplotlib is not installed.
+    A variable has one colour, and of several results each one kind of line.
     """
     figure = empty_figure()
     # A character that is not in the font is drawn as a box, without a word.
@@ -348,12 +342,7 @@ class _Drawer:
 
 
 class _Room:
-    """Where a text beside a point covers few lines; all lengths are in points, from the lower left corner of the axes.
-
-    Args:
-        axes: the axes, with all lines.
-        width: about their width in inches; ``height`` likewise.
-    """
+    """Where a text beside a point covers few lines; all lengths are in points, from the lower left corner of the axes."""
 
     def __init__(self, axes: Axes, width: float, height: float) -> None:
         self._limits = axes.get_xlim(), axes.get_ylim()

@@ -62,7 +62,7 @@ class VariantCurve(msgspec.Struct, frozen=True):
 
 
 def curves_figure(title: str, y_label: str, colour_label: str, curves: Iterable[VariantCurve]) -> Figure:
-    """All curves in one axes, coloured by a parameter.
+    """All curves in one axes, coloured by a parameter; of an iterator, only the points that are drawn are kept in memory.
 
     Many numbers have a colour bar, which is logarithmic if they are spread over decades. Few numbers, texts and truth
     values have a legend. A note says how many variants have no rows.
@@ -74,16 +74,6 @@ def curves_figure(title: str, y_label: str, colour_label: str, curves: Iterable[
         >>> figure = curves_figure("decay", "y", "d in 1/s", curves)
         >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
         ['0.5', '1', '2']
-
-    Args:
-        title: the title of the picture.
-        y_label: name and unit of the variable.
-        colour_label: name and unit of the parameter.
-        curves: one for each variant. Of an iterator, only the points that are drawn are kept in memory.
-
-    Raises:
-        CallRefused: the variable has texts.
-        ConfigurationError: matplotlib is not installed.
     """
     figure = empty_figure()
     figure.set_size_inches(*_INCHES)
@@ -110,7 +100,7 @@ def heat_map_figure(
     y: tuple[str, Sequence[PlainValue]],
     z: tuple[str, Sequence[float | None]],
 ) -> Figure:
-    """A value over two parameters: as cells for a grid, and as points for what a sampler has chosen.
+    """A value over two parameters, each with its label: as cells for a grid, and as points for what a sampler has chosen.
 
     An axis is logarithmic if its values are spread by ratio. Cells without a value are hatched; points without one are
     grey crosses.
@@ -121,17 +111,6 @@ def heat_map_figure(
         ... )
         >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
         ['false', 'true']
-
-    Args:
-        title: the title of the picture.
-        x: label of the horizontal axis, and its value for each variant.
-        y: label of the vertical axis, and its value for each variant.
-        z: label of the colour bar, and the value of each variant; None or NaN for one that failed.
-
-    Raises:
-        CallRefused: several variants have the same two values, so a cell has no single value; or there is a text where
-            a number should be.
-        ConfigurationError: matplotlib is not installed.
     """
     values = np.array([_finite(value, z[0]) for value in z[1]])
     figure = empty_figure()

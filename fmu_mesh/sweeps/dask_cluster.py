@@ -28,11 +28,9 @@ T = TypeVar("T")
 
 @contextmanager
 def dask_executor(address: str | None, workers: int | None = None) -> Iterator[Executor]:
-    """The executor of a Dask cluster, until the end of the block.
+    """The executor of a Dask cluster, until the end of the block: of the scheduler at ``address``, or processes of this host.
 
-    Args:
-        address: of the scheduler, such as tcp://192.168.1.2:8786; None: a cluster of processes of this host.
-        workers: number of these processes; None: one for each processor.
+    Their number is ``workers``; by default one for each processor.
 
     Raises:
         LibraryMissing: Dask is not installed.

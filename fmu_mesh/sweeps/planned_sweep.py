@@ -136,12 +136,7 @@ def planned_sweep(
 def continued_sweep(
     folder: Path, *, allow_code: bool = False, on_notice: Callable[[str], None] = log.info
 ) -> PlannedSweep:
-    """Plan what is missing of the sweep in a folder.
-
-    Args:
-        folder: the folder.
-        allow_code: run the Python code that it names; also, run it although another user owns it.
-        on_notice: as in `SweepOptions`.
+    """Plan what is missing of the sweep in a folder; ``allow_code`` also runs it if another user owns it.
 
     Raises:
         ConfigurationError: there is no sweep in the folder, another user has made it, or its mesh cannot run any more.
@@ -204,17 +199,7 @@ def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
 
 
 def _any_plan(mesh: Mesh, base: Mapping[str, Any], wanted: Wanted, tell: Callable[[str], None] = log.info) -> RunPlan:
-    """The plan of the first variant, or of the last one: one of them may have values that are refused.
-
-    Args:
-        mesh: the mesh.
-        base: the options of each run.
-        wanted: what was asked.
-        tell: called with each warning, and before something that takes long, such as compiling an FMU.
-
-    Raises:
-        ConfigurationError: neither can run; that of the first.
-    """
+    """The plan of the first variant, or of the last one: one of them may have values that are refused."""
     first: ConfigurationError | None = None
     for number in (0, len(wanted.variants) - 1):
         options = options_of_variant(base, mesh.instances, wanted.parameters(number))
@@ -266,11 +251,7 @@ def _contents(mesh: Mesh, wanted: Wanted, parameters: Parameters) -> Mapping[str
 
 
 def _at_once(plan: RunPlan, most_instances: Mapping[str, int]) -> int | None:
-    """How many variants may be under way.
-
-    Raises:
-        ConfigurationError: no instance has such a model, or one variant needs more instances of it.
-    """
+    """How many variants may be under way; refuses a limit for no model, or one that a single variant exceeds."""
     limits = []
     models = [Path(own.fmu).name for own in plan.plan.system.instances.values() if own.fmu]
     for name, most in most_instances.items():
@@ -308,11 +289,7 @@ def _units(plan: RunPlan, names: Sequence[str]) -> dict[str, str | None]:
 
 
 def _column(function: Own) -> str:
-    """The name of the column of a function of the user.
-
-    Raises:
-        ConfigurationError: workers could not import it.
-    """
+    """The name of the column of a function of the user, which workers can import."""
     name = getattr(function, "__qualname__", "")
     if not name or "<" in name:
         found = f"the reduction '{name or type(function).__name__}' cannot be imported by the workers"

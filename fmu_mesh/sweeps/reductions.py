@@ -91,10 +91,6 @@ def check_reductions(reductions: Sequence[Reduction], recorded: Mapping[str, Var
     Example:
         >>> check_reductions([read_reduction("max(pendulum.a)")], {"pendulum.a": "Float64"})
 
-    Args:
-        reductions: the reductions.
-        recorded: the types of the recorded variables, by `instance.variable`.
-
     Raises:
         ConfigurationError: with all findings, and the nearest names.
     """

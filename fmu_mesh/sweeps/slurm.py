@@ -222,11 +222,7 @@ def cancel(job: SlurmJob) -> None:
 
 
 def _check_option(option: str) -> None:
-    """Check that an option can be a line of the script.
-
-    Raises:
-        ConfigurationError: it is no option, or one that belongs to the sweep.
-    """
+    """Check that an option can be a line of the script, and does not belong to the sweep."""
     if not option.startswith("-") or not option.isprintable():
         hint = "Write it as `sbatch` takes it, such as --slurm-option=--partition=short."
         raise ConfigurationError(f"{option!r} is no option of `sbatch`", hint=hint)
@@ -236,12 +232,7 @@ def _check_option(option: str) -> None:
 
 
 def _submitted(script: Path) -> str:
-    """What `sbatch` has printed for a script.
-
-    Raises:
-        ConfigurationError: there is no `sbatch`, or it refuses the job.
-        DeadlineExceeded: it has not answered.
-    """
+    """What `sbatch` has printed for a script."""
     try:
         code, printed, errors = _run(["sbatch", "--parsable", script.name], _SUBMIT_S, folder=script.parent)
     except DeadlineExceeded as error:
@@ -317,10 +308,6 @@ def _run(command: Sequence[str], deadline_s: float, *, folder: Path | None = Non
 
     It is in a process group of its own: Ctrl-C does not reach it, and after the deadline it ends with all that it has
     started, since on some clusters it is a script around the real one.
-
-    Raises:
-        ConfigurationError: it is not installed.
-        DeadlineExceeded: it has not ended in time.
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_OVERRULING)}
     try:

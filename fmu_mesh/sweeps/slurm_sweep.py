@@ -47,13 +47,9 @@ class SlurmOptions(msgspec.Struct, frozen=True):
 
 
 class SlurmSweep(Sweep):
-    """A sweep whose variants run in the tasks of an array of jobs.
+    """A sweep whose variants run in the tasks of an array of jobs; all hosts share its folder.
 
     To leave it, or to interrupt it, leaves the tasks as they are.
-
-    Args:
-        planned: the sweep, in a folder that all hosts share.
-        options: how it is given to Slurm.
 
     Attributes:
         job: the array of jobs; None if nothing is missing.
@@ -111,11 +107,7 @@ class SlurmSweep(Sweep):
                 self._follow(self.job)
 
     def _follow(self, job: SlurmJob) -> None:
-        """Read the rows until no task is left.
-
-        Raises:
-            MeshLost: all tasks have ended, and variants are missing; or Slurm does not answer.
-        """
+        """Read the rows until no task is left."""
         left: int | None = job.tasks
         answered = asked = time.monotonic()
         while self._left and left != 0 and not self._cancelled.wait(_LOOK_S):

@@ -81,11 +81,7 @@ class Wanted(msgspec.Struct, frozen=True):
 
 
 class SweepFolder:
-    """One folder; see above.
-
-    Args:
-        path: the folder; it may not exist yet.
-    """
+    """One folder, which may not exist yet; see above."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -110,11 +106,7 @@ class SweepFolder:
         return self.path / _WANTED
 
     def begin(self, wanted: Wanted) -> None:
-        """Make the folder, and write down what is asked.
-
-        Raises:
-            ConfigurationError: it cannot be written.
-        """
+        """Make the folder, and write down what is asked."""
         try:
             (self.curves if wanted.curves else self.path).mkdir(parents=True, exist_ok=True)
             with replaced(self.path / _WANTED) as draft:
@@ -123,11 +115,7 @@ class SweepFolder:
             raise self._unwritable(error) from error
 
     def clear(self) -> None:
-        """Remove what a sweep has written, and nothing else.
-
-        Raises:
-            ConfigurationError: another process adds rows, or a file cannot be removed.
-        """
+        """Remove what a sweep has written, and nothing else."""
         rows = [*self.path.glob(f"{_ROWS}*.jsonl")]
         for file in rows:
             RowFile(file).close()
@@ -162,11 +150,7 @@ class SweepFolder:
 
     @contextmanager
     def writing(self, part: int | None = None) -> Iterator[RowFile]:
-        """In the block, rows can be added; one process at a time may do so for each part.
-
-        Raises:
-            ConfigurationError: another process does so, or the file cannot be written.
-        """
+        """In the block, rows can be added; one process at a time may do so for each part."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -182,16 +166,7 @@ class SweepFolder:
         return ConfigurationError(f"the folder '{self.path}' cannot be written: {error.strerror}")
 
     def write_table(self, wanted: Wanted, rows: Sequence[Row | None], columns: Sequence[str]) -> None:
-        """Write the table; a variant without a row is left out.
-
-        Args:
-            wanted: what was asked.
-            rows: the row of each variant.
-            columns: what is calculated from the curves.
-
-        Raises:
-            ConfigurationError: it cannot be written.
-        """
+        """Write the table; a variant without a row is left out."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["variant", *wanted.names, "exit_code", "message", *columns, "id", "seconds", "worker"])
@@ -207,11 +182,7 @@ class SweepFolder:
 
 
 class RowFile:
-    """A file to which rows are added.
-
-    Args:
-        path: the file.
-    """
+    """A file to which rows are added."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -232,11 +203,7 @@ class RowFile:
             self._write(b"\n")
 
     def add(self, row: Row) -> None:
-        """Add a row.
-
-        Raises:
-            ConfigurationError: the file cannot be written.
-        """
+        """Add a row."""
         self._write(json.dumps(msgspec.to_builtins(row)).encode() + b"\n")
 
     def close(self) -> None:
@@ -275,13 +242,7 @@ def is_sweep(path: Path) -> bool:
 
 
 def identity_of(wanted: Wanted, parameters: Parameters, contents: Mapping[str, str]) -> str:
-    """The id of a variant: the same configuration, options, parameters and models have the same one.
-
-    Args:
-        wanted: what was asked.
-        parameters: those of the variant.
-        contents: SHA-256 of the model of each instance.
-    """
+    """The id of a variant: the same configuration, options, parameters and SHA-256 of models have the same one."""
     options = {name: value for name, value in wanted.options.items() if name != "allow_code"}  # not what is calculated
     asked = [wanted.data, options, sorted(parameters.items()), sorted(contents.items())]
     return hashlib.sha256(msgspec.json.encode(asked, enc_hook=str)).hexdigest()[:16]

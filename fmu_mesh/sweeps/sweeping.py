@@ -96,10 +96,6 @@ class Sweep(ABC):
         ...     result = running.wait()
         ...     running.progress.done, running.progress.total, len(result)
         (4, 4, 4)
-
-    Args:
-        planned: the sweep.
-        part: which part of the variants runs here; None: all.
     """
 
     def __init__(self, planned: PlannedSweep, part: SweepPart | None = None) -> None:
@@ -249,14 +245,7 @@ class Sweep(ABC):
 
 
 class ExecutorSweep(Sweep):
-    """A sweep whose variants run on an executor.
-
-    Args:
-        planned: the sweep.
-        executor: where variants run; it is not shut down here. None: processes of this host.
-        workers: number of these processes; None: one for each processor.
-        part: which part of the variants runs here; None: all.
-    """
+    """A sweep whose variants run on an executor, which is not shut down here, or in as many processes of this host."""
 
     def __init__(
         self,
@@ -334,11 +323,7 @@ class ExecutorSweep(Sweep):
         return future
 
     def _row_of(self, future: Future[Row], number: int) -> Row | None:
-        """The row of a variant that has ended; None if it runs again, because its worker was lost.
-
-        Raises:
-            MeshLost: the executor runs nothing any more.
-        """
+        """The row of a variant that has ended; None if it runs again, because its worker was lost."""
         try:
             return future.result()
         except Exception as error:  # noqa: BLE001  `run_variant` itself raises nothing

@@ -101,13 +101,7 @@ def encoded_task(task: SweepTask) -> bytes:
 
 
 def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:
-    """The options of the run of one variant.
-
-    Args:
-        options: those of each run.
-        instances: names of the instances of the mesh.
-        parameters: `instance.variable` is a start value, and any other name a key of the configuration.
-    """
+    """The options of the run of one variant: `instance.variable` is a start value, any other name a key of the configuration."""
     start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
     keys = {name: value for name, value in parameters.items() if name not in start}
     own = {"start_values": start, "config_values": keys}
@@ -116,12 +110,6 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
 
 def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
     """Run one variant. Called in a worker, by whichever executor.
-
-    Args:
-        task: what `encoded_task` returned.
-        functions: reductions that are functions of the user.
-        identity: `Row.id`.
-        parameters: the parameters of this variant.
 
     Returns:
         The row; also of a run that failed.
@@ -196,11 +184,7 @@ class _Loaded:
         return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
 
     def run(self, identity: str, parameters: Parameters) -> Result:
-        """Run a variant.
-
-        Raises:
-            FmuMeshError: it failed.
-        """
+        """Run a variant."""
         task = self._task
         if task.version != __version__:
             raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
@@ -217,11 +201,7 @@ class _Loaded:
         return self._mesh.run(**options)
 
     def values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
-        """What the row of a variant has of its result.
-
-        Raises:
-            FmuMeshError: a reduction failed.
-        """
+        """What the row of a variant has of its result."""
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
         for name, function in functions.items():
             try:
@@ -304,11 +284,7 @@ def path_of(type_: type, value: object) -> object:
 
 
 def _cell(value: object) -> Cell:
-    """A value of a function of the user as the table has it.
-
-    Raises:
-        TypeError: it is no single value.
-    """
+    """A value of a function of the user as the table has it."""
     plain = value.item() if isinstance(value, np.generic | np.ndarray) else value
     if isinstance(plain, bytes):
         return base64.b64encode(plain).decode()

@@ -41,9 +41,7 @@ T = TypeVar("T")
 class WorkerLost(MeshLost):
     """The process that was running a variant has ended: it was killed, or an FMU crashed it.
 
-    Args:
-        message: how it ended.
-        began: whether it was ready to run anything.
+    ``began`` says whether it was ready to run anything.
     """
 
     def __init__(self, message: str, *, began: bool) -> None:
@@ -56,9 +54,6 @@ class WorkerPool(Executor):
 
     A job whose process is lost raises `WorkerLost`; jobs that waited for that process run in its successor. `submit`
     may be called on one thread at a time.
-
-    Args:
-        workers: how many processes.
     """
 
     def __init__(self, workers: int) -> None:

@@ -38,14 +38,10 @@ _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red"
 
 
 class Display:
-    """Shows the events of a run on standard error.
+    """Shows the events of a run on standard error; if it is quiet, only errors, and what processes of the run write.
 
-    Args:
-        plan: the plan of the run.
-        show_progress: whether to draw the progress line, if standard error is a terminal.
-        quiet: show nothing but errors, and what processes of the run write themselves.
-        waits_for_nodes: whether the address is shown only when all instances answer. Nodes that are started manually
-            need it earlier.
+    ``waits_for_nodes`` shows the address only when all instances answer: nodes that are started manually need it
+    earlier.
     """
 
     def __init__(self, plan: Plan, *, show_progress: bool, quiet: bool = False, waits_for_nodes: bool = True) -> None:

@@ -27,11 +27,7 @@ _LITTLE = 0.1
 
 
 def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path | None) -> None:
-    """Print the table of a run that took ``seconds``, and write the trace file if there is one.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
+    """Print the table of a run that took ``seconds``, and write the trace file if there is one."""
     print(page(profile_page(plan, profile)))
     if file is None:
         return

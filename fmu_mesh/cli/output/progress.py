@@ -96,13 +96,7 @@ class ProgressLine(ABC):
 
 
 class RunProgressLine(ProgressLine):
-    """The progress line of a run.
-
-    Args:
-        plan: the plan of the run.
-        console: returns where it is drawn, if standard error is a terminal: Rich is slow to import.
-        show: False never draws it.
-    """
+    """The progress line of a run."""
 
     def __init__(self, plan: Plan, console: Callable[[], Console], *, show: bool) -> None:
         super().__init__(plan.system.config.mesh, console, show=show)
@@ -123,13 +117,7 @@ class RunProgressLine(ProgressLine):
 
 
 class SweepProgressLine(ProgressLine):
-    """The progress line of a sweep.
-
-    Args:
-        name: name of the mesh.
-        console: returns where it is drawn, if standard error is a terminal: Rich is slow to import.
-        show: False never draws it.
-    """
+    """The progress line of a sweep."""
 
     def __init__(self, name: str, console: Callable[[], Console], *, show: bool) -> None:
         super().__init__(name, console, show=show)
@@ -156,13 +144,7 @@ class SweepProgressLine(ProgressLine):
 
 
 def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> list[str]:
-    """The parts of the line besides the name that fit into ``width`` columns, the most important first.
-
-    Args:
-        grid: the points of the run.
-        status: the status of the mesh; None before the first one.
-        width: in columns.
-    """
+    """The parts of the line besides the name that fit into ``width`` columns, the most important first."""
     if status is None or status.state in ("starting", "initializing"):
         return [status.state if status is not None else "starting"]
     rate, parts = status.points_per_second, []

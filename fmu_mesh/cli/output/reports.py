@@ -65,11 +65,7 @@ class RunReport(msgspec.Struct, frozen=True):
 
 
 class RunReporter:
-    """Prints a `RunReport` at the end of the block; in the block, standard output goes to standard error.
-
-    Args:
-        wanted: whether to do so; otherwise nothing happens.
-    """
+    """If ``wanted``, prints a `RunReport` at the end of the block; in it, standard output goes to standard error."""
 
     def __init__(self, *, wanted: bool) -> None:
         self._wanted = wanted

@@ -32,11 +32,7 @@ _QUIT: Final = b"qQ"
 
 
 class Screen:
-    """The terminal of standard output, as long as the `with` block lasts.
-
-    Args:
-        drawn: whether standard output is a terminal; if not, this only waits.
-    """
+    """The terminal of standard output, as long as the `with` block lasts; if it is not ``drawn``, this only waits."""
 
     def __init__(self, *, drawn: bool) -> None:
         self.drawn = drawn

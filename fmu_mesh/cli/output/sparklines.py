@@ -54,12 +54,7 @@ class Histories:
         return list(self._newest.values())
 
     def lines(self, width: int | None = None, signs: str = BLOCKS) -> list[str]:
-        """A line for each variable.
-
-        Args:
-            width: largest width in columns; None: no limit, and a sparkline of at most 40 values.
-            signs: what a sparkline is drawn with, from the least to the greatest.
-        """
+        """A line for each variable, in at most ``width`` columns; without a width, of at most 40 values."""
         rows = [
             (name, _range(self._values[name]), f"{_text(sample.value)} {sample.unit or ''}".rstrip())
             for name, sample in self._newest.items()
@@ -90,10 +85,6 @@ def sparkline(values: Sequence[float], signs: str = BLOCKS) -> str:
     Example:
         >>> sparkline([0.0, 1.0, 2.0, 3.0, 2.0])
         '▁▃▆█▆'
-
-    Args:
-        values: the oldest first.
-        signs: from the least to the greatest.
     """
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
