@@ -77,7 +77,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
     description: ModelDescription
 
     def page(self, width: int = _WIDTH, variables: Sequence[str] = (), *, everything: bool = False) -> str:
-        """The page in lines of at most ``width`` columns, unless a name is longer; with ``everything``, of all variables.
+        """The page in lines of at most ``width`` columns, unless a name is longer; ``everything``: of all variables.
 
         ``variables`` are names, or patterns (`*`: any characters; `?`: one; `re:...`: a regular expression): only these
         are shown.

@@ -1,4 +1,4 @@
-"""What all pictures have in common: the figure, colours and dashes, legends, files.
+"""What all pictures have in common: the style of the house (colours, dashes, sizes), the figure, legends, files.
 
 matplotlib is optional, so it is imported when something is drawn.
 """
@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,9 +30,17 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLOURS",
+    "CYCLE_COLOURS",
     "DASHES",
+    "FAINT",
+    "FONT",
+    "GROUP",
+    "GROUP_BORDER",
+    "INK",
     "MAX_POINTS",
     "PALETTE",
+    "STATE_COLOURS",
+    "WIRE",
     "add_legend",
     "draw",
     "empty_figure",
@@ -39,6 +48,8 @@ __all__ = [
     "limited",
     "reduced",
     "short",
+    "silently",
+    "style_axes",
     "thinned",
 ]
 
@@ -58,6 +69,12 @@ PALETTE = (
 )
 """Colours that are told apart by the colour-blind; neighbours differ in their brightness as well."""
 COLOURS = len(PALETTE)
+CYCLE_COLOURS = ("#d55e00", "#0072b2", "#aa3377", "#007a5a")
+"""Told apart also by the colour-blind; wires of a cycle are thick as well, for shades of grey."""
+STATE_COLOURS = {"running": "#007a5a", "done": "#0072b2", "failed": "#d55e00"}
+INK, FAINT, WIRE = "#1a1a1a", "#5f6368", "#4a4f55"
+GROUP, GROUP_BORDER = "#eef1f5", "#9aa0a6"
+FONT = "Helvetica, Arial, 'DejaVu Sans', sans-serif"
 DASHES: tuple[Any, ...] = (
     "solid",
     (0, (5, 2)),
@@ -89,15 +106,30 @@ def draw(figure: Figure, output: Path) -> None:
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         picture = BytesIO()  # a failed write to a file raises errors that depend on the backend
-        with warnings.catch_warnings():
-            # For example a character that is not in the font: it is drawn as a box.
-            warnings.simplefilter("ignore")
+        with silently():
             figure.savefig(picture, format=output.suffix.removeprefix(".") or None)
         with replaced(output) as draft:
             draft.write_bytes(picture.getvalue())
     except (OSError, ValueError) as error:  # a ValueError names the formats there are
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigurationError(f"the plot '{output}' cannot be written: {reason}.") from error
+
+
+@contextmanager
+def silently() -> Iterator[None]:
+    """In the block, a character that is not in the font is drawn as a box, without a word."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def style_axes(axes: Axes, label: str, *, is_empty: bool) -> None:
+    """Give axes for curves the look of the house, and the label of their values; say so if there is nothing in them."""
+    axes.set_ylabel(short(label), parse_math=False)
+    axes.grid(visible=True, alpha=0.35)
+    axes.margins(x=0.01)
+    if is_empty:
+        axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
 
 
 def empty_figure() -> Figure:

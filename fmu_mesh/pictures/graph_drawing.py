@@ -11,12 +11,12 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
+from .drawing import CYCLE_COLOURS, FAINT, INK, STATE_COLOURS, WIRE
 from .graph_layout import Arrangement, Dot, Wire, arranged
 from .result_drawing import in_unit
 from .tables import shortened
 
 __all__ = [
-    "CYCLE_COLOURS",
     "Box",
     "Drawing",
     "DrawnWire",
@@ -27,10 +27,6 @@ __all__ = [
     "drawing_of",
 ]
 
-CYCLE_COLOURS = ("#d55e00", "#0072b2", "#aa3377", "#007a5a")
-"""Told apart also by the colour-blind; wires of a cycle are thick as well, for shades of grey."""
-_STATES = {"running": "#007a5a", "done": "#0072b2", "failed": "#d55e00"}
-_INK, _FAINT, _WIRE = "#1a1a1a", "#5f6368", "#4a4f55"
 _MARGIN, _TITLE, _PAD, _GROUP_TITLE = 20.0, 34.0, 16.0, 22.0
 _HEAD, _LIVE, _ROW, _INSET = 42.0, 17.0, 17.0, 9.0
 _NARROW, _LIVE_WIDTH, _BROAD = 120.0, 190.0, 250.0
@@ -103,14 +99,21 @@ class GraphNode(msgspec.Struct, frozen=True):
     @property
     def live(self) -> str:
         """State, speed and waiting as text; empty where they are not known."""
-        if self.state is None:
-            return ""
-        parts = [self.state]
-        if self.points_per_second:
-            parts.append(f"{_short_rate(self.points_per_second)} points/s")
-        if self.wait is not None and self.points_per_second:
-            parts.append(f"waits {100.0 * self.wait:.0f} %")
-        return ", ".join(parts)
+        return ", ".join([self.state, *self.speed]) if self.state is not None else ""
+
+    @property
+    def brief(self) -> str:
+        """The same as it fits into a box, whose colour says which ones run."""
+        return ", ".join(self.speed) if self.speed and self.state == "running" else self.state or ""
+
+    @property
+    def speed(self) -> list[str]:
+        """Speed and waiting in words; empty if it does not move."""
+        if not (rate := self.points_per_second):
+            return []
+        limit, unit = next((own for own in ((1e6, "M"), (1e3, "k")) if rate >= own[0]), (1.0, ""))
+        waits = [f"waits {100.0 * self.wait:.0f} %"] if self.wait is not None else []
+        return [f"{rate / limit:.3g}{unit} points/s", *waits]
 
 
 class Box(NamedTuple):
@@ -129,7 +132,7 @@ class Label(NamedTuple):
     y: float
     text: str
     size: float = 12.0
-    colour: str = _INK
+    colour: str = INK
     bold: bool = False
     anchor: Literal["start", "end"] = "start"
 
@@ -215,7 +218,7 @@ def drawing_of(
         DrawnWire(
             port.edge,
             path,
-            _WIRE if (cycle := edges[port.edge].cycle) is None else CYCLE_COLOURS[cycle % len(CYCLE_COLOURS)],
+            WIRE if (cycle := edges[port.edge].cycle) is None else CYCLE_COLOURS[cycle % len(CYCLE_COLOURS)],
             1.4 if cycle is None else 2.1,
             edges[port.edge].delay > 0,
             port.tip,
@@ -223,14 +226,14 @@ def drawing_of(
         for port, path in plan.wires
     ]
     groups = [
-        (box, Label(box.x + _PAD, box.y + 16.0, f"group {shortened(name, 40)}: one process", 11.0, _FAINT))
+        (box, Label(box.x + _PAD, box.y + 16.0, f"group {shortened(name, 40)}: one process", 11.0, FAINT))
         for name, box in plan.groups.items()
     ]
     legend = _legend(edges)
     height = plan.height + 18.0 * len(legend)
     labels = [
         Label(_MARGIN, _MARGIN + 8.0, title, 14.0, bold=True),
-        *(Label(_MARGIN, plan.height + 18.0 * number, text, 11.0, _FAINT) for number, text in enumerate(legend)),
+        *(Label(_MARGIN, plan.height + 18.0 * number, text, 11.0, FAINT) for number, text in enumerate(legend)),
     ]
     width = max(plan.width, *(_text_width(label) + 2.0 * _MARGIN for label in labels))
     return Drawing(
@@ -258,35 +261,20 @@ def _drawn_instance(node: GraphNode, plan: _Plan, cycle: int | None, *, is_live:
     most = int(box.width / 7.2)
     labels = [
         Label(box.x + _INSET, box.y + 18.0, shortened(node.instance, int(most * 0.92)), 13.0, bold=True),
-        Label(box.x + _INSET, box.y + 33.0, shortened(node.model, most), 11.0, _FAINT),
+        Label(box.x + _INSET, box.y + 33.0, shortened(node.model, most), 11.0, FAINT),
     ]
     dot = None
     if is_live and node.state is not None:
-        colour = _STATES.get(node.state, _FAINT)
+        colour = STATE_COLOURS.get(node.state, FAINT)
         dot = box.x + _INSET + 4.0, box.y + _HEAD + 4.0, colour
-        labels.append(Label(box.x + _INSET + 12.0, box.y + _HEAD + 8.0, shortened(_brief(node), most), 11.0, colour))
+        labels.append(Label(box.x + _INSET + 12.0, box.y + _HEAD + 8.0, shortened(node.brief, most), 11.0, colour))
     for side, texts in enumerate(ports):
         for row, text in enumerate(texts.values()):
             y = box.y + _row_y(row, is_live=is_live) + 4.0
             x = box.x + box.width - _INSET if side else box.x + _INSET
             labels.append(Label(x, y, text, 11.0, anchor="end" if side else "start"))
-    border = _FAINT if cycle is None else CYCLE_COLOURS[cycle % len(CYCLE_COLOURS)]
+    border = FAINT if cycle is None else CYCLE_COLOURS[cycle % len(CYCLE_COLOURS)]
     return DrawnInstance(node.instance, box, border, cycle is not None, tuple(labels), dot)
-
-
-def _brief(node: GraphNode) -> str:
-    """The live values as they fit into a box; the colour says which ones run."""
-    if not node.points_per_second or node.state != "running":
-        return node.state or ""
-    wait = f", waits {100.0 * node.wait:.0f} %" if node.wait is not None else ""
-    return f"{_short_rate(node.points_per_second)} points/s{wait}"
-
-
-def _short_rate(rate: float) -> str:
-    for limit, unit in ((1e6, "M"), (1e3, "k")):
-        if rate >= limit:
-            return f"{rate / limit:.3g}{unit}"
-    return f"{rate:.3g}"
 
 
 # --- places

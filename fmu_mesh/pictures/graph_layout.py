@@ -88,20 +88,20 @@ def going_back(names: Sequence[str], wires: Sequence[tuple[str, str, int]]) -> s
     return {number for number, wire in enumerate(wires) if wire in back}
 
 
-def arranged(boxes: Mapping[str, Dot], wires: Sequence[Wire], *, fold: bool = True) -> Arrangement:
+def arranged(boxes: Mapping[str, Dot], wires: Sequence[Wire]) -> Arrangement:
     """Arrange boxes, given as width and height in the order of execution, by the wires between them.
 
-    Depends on nothing but the arguments and their order. With ``fold``, many columns become several bands.
+    Depends on nothing but the arguments and their order. Many columns become several bands.
     """
     wired = {end for wire in wires for end in (wire.source, wire.target)}
-    main = _Columns({name: size for name, size in boxes.items() if name in wired}, wires, fold=fold).arrangement()
+    main = _Columns({name: size for name, size in boxes.items() if name in wired}, wires).arrangement()
     return _with_others(main, {name: size for name, size in boxes.items() if name not in wired})
 
 
 class _Columns:
     """The boxes that have wires: first their columns, then the order in these, then all places."""
 
-    def __init__(self, boxes: Mapping[str, Dot], wires: Sequence[Wire], *, fold: bool) -> None:
+    def __init__(self, boxes: Mapping[str, Dot], wires: Sequence[Wire]) -> None:
         self._boxes, self._wires = boxes, wires
         inner = [n for n, wire in enumerate(wires) if wire.source is not None and wire.target is not None]
         between = [(str(wires[n].source), str(wires[n].target), wires[n].delay) for n in inner]
@@ -110,7 +110,7 @@ class _Columns:
         self._column = {part.name: number for number, column in enumerate(self._columns) for part in column}
         self._routes = [self._route(number) for number in range(len(wires))]
         self._widths = [max((part.width for part in column), default=0.0) for column in self._columns]
-        self._bands = self._folded() if fold else [0] * len(self._columns)
+        self._bands = self._folded()
         steps = dict.fromkeys(step for route in self._routes for step in pairwise(route))
         self._curves = [step for step in steps if self._is_curve(step)]
         self._turns = [step for step in steps if not self._is_curve(step)]

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ..printing import printable
-from .drawing import empty_figure
+from .drawing import FONT, GROUP, GROUP_BORDER, empty_figure
 from .graph_drawing import Box, Drawing, DrawnWire, Label
 from .graph_layout import Dot
 from .tables import escaped
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["figure_of_drawing", "svg_of_drawing"]
-
-_FONT = "Helvetica, Arial, 'DejaVu Sans', sans-serif"
-_GROUP, _GROUP_BORDER = "#eef1f5", "#9aa0a6"
 
 
 # --- commands of a path
@@ -71,11 +68,11 @@ def svg_of_drawing(drawing: Drawing) -> str:
     width, height = f"{drawing.width:.0f}", f"{drawing.height:.0f}"
     size = f'width="{width}" height="{height}" viewBox="0 0 {width} {height}"'
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="{_FONT}">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="{FONT}">',
         '<rect width="100%" height="100%" fill="#ffffff"/>',
     ]
     for box, label in drawing.groups:
-        lines += [_rect(box, _GROUP, _GROUP_BORDER, 1.0, 8.0), _svg_text(label)]
+        lines += [_rect(box, GROUP, GROUP_BORDER, 1.0, 8.0), _svg_text(label)]
     by_edge: dict[int, list[DrawnWire]] = {}
     for wire in drawing.wires:
         by_edge.setdefault(wire.edge, []).append(wire)
@@ -158,7 +155,7 @@ def figure_of_drawing(drawing: Drawing) -> Figure:
 
     codes = {"M": [Path.MOVETO], "L": [Path.LINETO], "Q": [Path.CURVE3] * 2, "C": [Path.CURVE4] * 3}
     for box, label in drawing.groups:
-        rectangle(box, _GROUP, _GROUP_BORDER, 1.0, 8.0)
+        rectangle(box, GROUP, GROUP_BORDER, 1.0, 8.0)
         write(label)
     for wire in drawing.wires:
         moves = [*_moves(wire.path)]

@@ -9,7 +9,6 @@ from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
 from ..system.grouping import automatic_nodes
-from ..system.initialization_plan import Loop
 from ..system.plan import Plan
 from ..system.records import RecordPlan
 from ..system.series_files import course_of
@@ -26,7 +25,7 @@ _PROBLEM_CHARACTERS = 200
 
 
 def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
-    """The plan as lines of text, the same on every terminal and in every pipe; ``loaded`` says where start values come from."""
+    """The plan as lines of text, the same everywhere; ``loaded`` says where start values come from."""
     sections = [
         ("", _head(plan)),
         ("Instances", _instances(plan)),
@@ -226,14 +225,13 @@ def _initialization(plan: Plan) -> list[str]:
         if level in loops:
             last = loops[level].last
             until = f"levels {level} to {last} are" if last > level else f"level {level} is"
-            lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(_assumed(plan, loops[level]))}"]
+            assumed = (
+                f"{t.target}.{t.input} = {shown(t.start)}"
+                f"{_unit(plan.system.instances[t.target].description.variable_of(t.input))}"
+                for t in loops[level].tears
+            )
+            lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(assumed)}"]
     return lines
-
-
-def _assumed(plan: Plan, loop: Loop) -> list[str]:
-    """The torn inputs of a loop, each with the value that is assumed at first."""
-    described = {tear: plan.system.instances[tear.target].description.variable_of(tear.input) for tear in loop.tears}
-    return [f"{t.target}.{t.input} = {shown(t.start)}{_unit(variable)}" for t, variable in described.items()]
 
 
 def _recorded(plan: Plan) -> list[str]:

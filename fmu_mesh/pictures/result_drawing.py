@@ -5,7 +5,6 @@ Owns how curves of results look. What belongs together is said by whoever calls.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,6 +24,8 @@ from .drawing import (
     limited,
     reduced,
     short,
+    silently,
+    style_axes,
 )
 
 if TYPE_CHECKING:
@@ -154,9 +155,7 @@ def figure_of(results: Sequence[Curves], picture: PictureOptions) -> Figure:
     A variable has one colour, and of several results each one kind of line.
     """
     figure = empty_figure()
-    # A character that is not in the font is drawn as a box, without a word.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silently():
         _Drawer(figure, results, picture).draw()
     return figure
 
@@ -256,15 +255,12 @@ class _Drawer:
                     marker="o" if len(data[0]) == 1 else None,  # a line of one point is invisible
                 )
                 first.setdefault(name, line)
-        axes.set_ylabel(short(panel.label), parse_math=False)
-        axes.grid(visible=True, alpha=0.35)
-        axes.margins(x=0.01)
+        is_empty = not any(len(result.times) for result in self._results)
+        style_axes(axes, panel.label, is_empty=is_empty)
         if panel.label == FLAGS:
             axes.set_yticks([0, 1])
             axes.set_ylim(-0.1, 1.1)
-        if not any(len(result.times) for result in self._results):
-            axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
-        elif not panel.is_difference:
+        if not is_empty and not panel.is_difference:
             self._annotate(axes, panel, height)
         return [first[name] for name in panel.names if name in first]
 
@@ -342,7 +338,7 @@ class _Drawer:
 
 
 class _Room:
-    """Where a text beside a point covers few lines; all lengths are in points, from the lower left corner of the axes."""
+    """Where a text beside a point covers few lines; lengths are in points, from the lower left corner of the axes."""
 
     def __init__(self, axes: Axes, width: float, height: float) -> None:
         self._limits = axes.get_xlim(), axes.get_ylim()

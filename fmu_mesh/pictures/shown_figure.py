@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from io import BytesIO
 
 from matplotlib.figure import Figure
+
+from .drawing import silently
 
 __all__ = ["ShownFigure"]
 
@@ -19,7 +20,6 @@ class ShownFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         picture = BytesIO()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a character that is not in the font is drawn as a box
+        with silently():
             self.savefig(picture, format="png")
         return picture.getvalue()

@@ -6,7 +6,6 @@ Owns which colours and scales a sweep has. Does not know where curves and values
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +17,18 @@ from ..errors import CallRefused
 from ..printing import printable
 from ..text import shown
 from ..variables.value_types import PlainValue
-from .drawing import COLOURS, DASHES, MAX_POINTS, add_legend, empty_figure, reduced, short
+from .drawing import (
+    COLOURS,
+    DASHES,
+    MAX_POINTS,
+    PALETTE,
+    add_legend,
+    empty_figure,
+    reduced,
+    short,
+    silently,
+    style_axes,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +72,7 @@ class VariantCurve(msgspec.Struct, frozen=True):
 
 
 def curves_figure(title: str, y_label: str, colour_label: str, curves: Iterable[VariantCurve]) -> Figure:
-    """All curves in one axes, coloured by a parameter; of an iterator, only the points that are drawn are kept in memory.
+    """All curves in one axes, coloured by a parameter; only the points that are drawn are kept in memory.
 
     Many numbers have a colour bar, which is logarithmic if they are spread over decades. Few numbers, texts and truth
     values have a legend. A note says how many variants have no rows.
@@ -78,19 +88,13 @@ def curves_figure(title: str, y_label: str, colour_label: str, curves: Iterable[
     figure = empty_figure()
     figure.set_size_inches(*_INCHES)
     paths, colours, missing = _paths(y_label, curves)
-    # A character that is not in the font is drawn as a box, without a word.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silently():
         axes = figure.subplots()
         _draw_curves(axes, paths, colours, colour_label)
         axes.set_xlabel("time in s")
-        axes.set_ylabel(short(y_label), parse_math=False)
-        axes.grid(visible=True, alpha=0.35)
-        axes.margins(x=0.01)
+        style_axes(axes, y_label, is_empty=not paths)
         note = f"without rows, not shown: {missing} of {missing + len(paths)}" if missing else ""
         _add_title(figure, axes, title, note)
-        if not paths:
-            axes.text(0.5, 0.5, "no points were recorded", ha="center", va="center", transform=axes.transAxes)
     return figure
 
 
@@ -100,7 +104,7 @@ def heat_map_figure(
     y: tuple[str, Sequence[PlainValue]],
     z: tuple[str, Sequence[float | None]],
 ) -> Figure:
-    """A value over two parameters, each with its label: as cells for a grid, and as points for what a sampler has chosen.
+    """A value over two parameters, each with its label: as cells for a grid, as points for what a sampler has chosen.
 
     An axis is logarithmic if its values are spread by ratio. Cells without a value are hatched; points without one are
     grey crosses.
@@ -115,8 +119,7 @@ def heat_map_figure(
     values = np.array([_finite(value, z[0]) for value in z[1]])
     figure = empty_figure()
     figure.set_size_inches(*_INCHES)
-    with warnings.catch_warnings():  # as above
-        warnings.simplefilter("ignore")
+    with silently():
         horizontal, vertical = _Scale.of(*x), _Scale.of(*y)
         places = [*zip(horizontal.places(x[1]), vertical.places(y[1]), strict=True)]
         cells = dict(zip(places, values.tolist(), strict=True))
@@ -186,7 +189,7 @@ def _draw_curves(axes: Axes, paths: Sequence[_Path], colours: Sequence[PlainValu
         # Numbers have an order, and so have their colours; categories have dashes as well.
         colour, dashes = shades[order], DASHES[0]
         if scale.texts:
-            colour = f"C{order % COLOURS}"
+            colour = PALETTE[order % COLOURS]
             dashes = DASHES[(order if count <= COLOURS else order // COLOURS) % len(DASHES)]
         _add_lines(axes, members, [colour] * len(members), dashes, count)
         lines.append(Line2D([], [], color=colour, linestyle=dashes, linewidth=1.8))

@@ -137,7 +137,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
             for node in nodes:
                 lines += self._lines_of(node, indent)
         if self.cycles:
-            lines += ["", *_wrapped([("cycle", cycle) for cycle in self.cycles])]
+            lines += ["", *(line for cycle in self.cycles for line in _wrapped("cycle", cycle))]
         return page(line.rstrip() for line in lines)
 
     def __repr__(self) -> str:
@@ -158,17 +158,12 @@ class SystemGraph(msgspec.Struct, frozen=True):
 
     def _lines_of(self, node: GraphNode, indent: int) -> list[str]:
         heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), node.live]
-        rows = [
-            (
-                variable.source,
-                f"{edge.target}.{variable.target}",
-                shortened(variable.unit_text, 14),
-                _remark(edge, variable),
-            )
-            for edge in self.edges
-            if edge.source == node.instance
-            for variable in edge.variables
-        ]
+        rows = []
+        for edge in self.edges:
+            delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
+            for own in edge.variables if edge.source == node.instance else ():
+                remark = ", ".join(filter(None, [delay, "map" if own.map else ""]))
+                rows.append((own.source, f"{edge.target}.{own.target}", shortened(own.unit_text, 14), remark))
         first = shortened(" " * indent + "  ".join(filter(None, heading)), _COLUMNS)
         return [first, *_fitted(rows, indent + 2)]
 
@@ -266,38 +261,23 @@ def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus
     )
 
 
-def _remark(edge: GraphEdge, variable: GraphVariable) -> str:
-    delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
-    return ", ".join(filter(None, [delay, "map" if variable.map else ""]))
-
-
 def _fitted(rows: Sequence[tuple[str, str, str, str]], indent: int) -> list[str]:
     """A table of connections in 80 columns: both ends, unit and remark; long names without their middle."""
-    others = max((len(row[2]) for row in rows), default=0) + max((len(row[3]) for row in rows), default=0) + 4
-    room = _COLUMNS - indent - others - len(" -> ")
-    for_source = min(
-        max((len(row[0]) for row in rows), default=0), max(room // 2, room - max(map(_end_of, rows), default=0))
-    )
+    source, target, *others = (max((len(row[column]) for row in rows), default=0) for column in range(4))
+    room = _COLUMNS - indent - sum(others) - 4 - len(" -> ")
+    for_source = min(source, max(room // 2, room - target))
     ends = [
         f"{shortened(row[0], for_source)} -> {shortened(row[1], room - min(len(row[0]), for_source))}" for row in rows
     ]
     return table([(end, *row[2:]) for end, row in zip(ends, rows, strict=True)], indent=indent)
 
 
-def _end_of(row: tuple[str, str, str, str]) -> int:
-    return len(row[1])
-
-
-def _wrapped(lists: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """Names in lines of at most 80 columns, each list with its title."""
-    lines = []
-    for title, names in lists:
-        line = f"{title} "
-        for number, name in enumerate(names):
-            text = f" {shortened(name, _NAME)}" + ("," if number < len(names) - 1 else "")
-            if len(line) + len(text) > _COLUMNS:
-                lines.append(line)
-                line = " " * (len(title) + 1)
-            line += text
-        lines.append(line)
+def _wrapped(title: str, names: Sequence[str]) -> list[str]:
+    """Names after a title, in lines of at most 80 columns."""
+    lines = [f"{title} "]
+    for number, name in enumerate(names):
+        text = f" {shortened(name, _NAME)}" + ("," if number < len(names) - 1 else "")
+        if len(lines[-1]) + len(text) > _COLUMNS:
+            lines.append(" " * (len(title) + 1))
+        lines[-1] += text
     return lines

@@ -28,9 +28,9 @@ T = TypeVar("T")
 
 @contextmanager
 def dask_executor(address: str | None, workers: int | None = None) -> Iterator[Executor]:
-    """The executor of a Dask cluster, until the end of the block: of the scheduler at ``address``, or processes of this host.
+    """The executor of a Dask cluster, until the end of the block: that at ``address``, or one of this host.
 
-    Their number is ``workers``; by default one for each processor.
+    It has that many ``workers``; by default one for each processor.
 
     Raises:
         LibraryMissing: Dask is not installed.

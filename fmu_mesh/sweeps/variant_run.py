@@ -101,7 +101,7 @@ def encoded_task(task: SweepTask) -> bytes:
 
 
 def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:
-    """The options of the run of one variant: `instance.variable` is a start value, any other name a key of the configuration."""
+    """The options of a variant: `instance.variable` is a start value, any other name a key of the configuration."""
     start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
     keys = {name: value for name, value in parameters.items() if name not in start}
     own = {"start_values": start, "config_values": keys}

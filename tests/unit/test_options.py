@@ -297,6 +297,6 @@ def test_the_options_of_a_bag_are_checked_before_it_is_played() -> None:
     run = cast("Run", None)  # not reached
 
     with pytest.raises(CallRefused, match="Did you mean `topics`"):
-        Run.play(run, "bag.mcap", topic=["/a=b.c"])  # type: ignore[call-arg]
+        Run.play(run, "bag.mcap", topic=["/a=b.c"])  # type: ignore[call-arg]  # as above
     with pytest.raises(CallRefused, match="`stamps='sent'`: expected 'header', 'log'"):
-        Run.play(run, "bag.mcap", stamps="sent")  # type: ignore[arg-type]
+        Run.play(run, "bag.mcap", stamps="sent")  # type: ignore[arg-type]  # as above

@@ -14,7 +14,8 @@ import pytest
 from fmu_mesh.api.attaching import attach
 from fmu_mesh.api.mesh_builder import load
 from fmu_mesh.cli.main import main
-from fmu_mesh.pictures.graph_drawing import CYCLE_COLOURS, Box, Drawing, GraphEdge, GraphNode, GraphVariable, drawing_of
+from fmu_mesh.pictures.drawing import CYCLE_COLOURS
+from fmu_mesh.pictures.graph_drawing import Box, Drawing, GraphEdge, GraphNode, GraphVariable, drawing_of
 from fmu_mesh.pictures.graph_layout import Wire, arranged
 from fmu_mesh.pictures.system_graph import SystemGraph, graph_of
 from fmu_mesh.wire.views import InstanceStatus
