@@ -11,7 +11,6 @@ import msgspec
 
 from .. import files
 from ..config.call_options import checked
-from ..config.loading import PlainConfig
 from ..errors import ConfigurationError
 from ..pictures.tables import pairs, table
 from ..printing import page
@@ -21,10 +20,8 @@ from ..ssp.problems import Problems
 from ..ssp.ssd_reading import annotations_of, read_structure
 from ..ssp.system_reading import read_system
 from ..ssp.system_structure import (
-    Annotation,
     Binding,
     Element,
-    Structure,
     StructureComponent,
     StructureSystem,
     components_of,
@@ -188,85 +185,62 @@ def inspect_package(path: str | Path, *, ssd: str | None = None) -> PackageInspe
             for other in package.descriptions
             if (found := structure if other == name else read_structure(package, other, Problems())) is not None
         ]
-        return _Inspected(str(path), package, name, structure, plain).inspection(tuple(variants))
-
-
-class _Inspected:
-    def __init__(self, file: str, package: Package, name: str, structure: Structure, plain: PlainConfig) -> None:
-        self._file = file
-        self._package = package
-        self._name = name
-        self._structure = structure
-        self._plain = plain
-        data = plain.data if isinstance(plain.data, dict) else {}
-        instances = data.get("instances")
-        components = [path for path, _ in components_of(structure.system)]
-        self._instances = dict(zip(components, instances if isinstance(instances, dict) else (), strict=False))
-
-    def inspection(self, variants: tuple[PackageVariant, ...]) -> PackageInspection:
-        structure, plain = self._structure, self._plain
-        data = plain.data if isinstance(plain.data, dict) else {}
-        times, connections = data.get("simulation"), data.get("connections")
-        simulation = times if isinstance(times, dict) else {}
-        step_size, algorithm = simulation.get("step_size"), simulation.get("algorithm")
+        data = plain.data if isinstance(plain.data, dict) else {}  # of a wrong package there may be any part
+        instances, simulation, connections = (data.get(key) for key in ("instances", "simulation", "connections"))
+        times = simulation if isinstance(simulation, dict) else {}
+        step_size, algorithm = times.get("step_size"), times.get("algorithm")
+        components = [place for place, _ in components_of(structure.system)]
+        names = dict(zip(components, instances if isinstance(instances, dict) else (), strict=False))
         elements = list(_elements(structure.system))
+        annotations = [*annotations_of(structure), *(own for _, one in elements[1:] for own in one.annotations)]
         return PackageInspection(
-            file=self._file,
-            bytes=None if files.is_folder(self._package.root) else self._package.root.stat().st_size,
-            description=self._name,
+            file=str(path),
+            bytes=None if files.is_folder(package.root) else package.root.stat().st_size,
+            description=name,
             name=structure.name,
             version=structure.version,
-            variants=variants,
+            variants=tuple(variants),
             start_time=structure.start_time,
             stop_time=structure.stop_time,
             step_size=step_size if isinstance(step_size, float) else None,
             algorithm=algorithm if isinstance(algorithm, str) else None,
             needed=tuple(plain.needed.values()),
-            elements=tuple(self._element(path, element) for path, element in elements),
+            elements=tuple(_element(place, one, names.get(place)) for place, one in elements),
             connectors=tuple(
                 PackageConnector(one.name, one.kind, one.type, one.unit.name if one.unit is not None else None)
                 for one in structure.system.connectors
             ),
             connections=len(connections) if isinstance(connections, list) else 0,
-            parameters=tuple(self._source(path, one) for path, element in elements for one in element.bindings),
-            annotations=dict(Counter(one.type for one in self._annotations([element for _, element in elements]))),
+            parameters=tuple(_source(package, place, own) for place, one in elements for own in one.bindings),
+            annotations=dict(Counter(one.type for one in annotations)),
             problems=tuple(map(str, plain.findings)),
             warnings=tuple(map(str, plain.warnings)),
         )
 
-    def _element(self, path: tuple[str, ...], element: Element) -> PackageElement:
-        is_component = isinstance(element, StructureComponent)
-        return PackageElement(
-            path=path,
-            kind="component" if is_component else "system",
-            source=element.source if isinstance(element, StructureComponent) else None,
-            instance=self._instances.get(path),
-            implementation=element.implementation if isinstance(element, StructureComponent) else None,
-            connectors=dict(Counter(one.kind or "unspecified" for one in element.connectors)),
-            connections=len(element.connections) if isinstance(element, StructureSystem) else 0,
-            description=element.description,
-        )
 
-    def _source(self, path: tuple[str, ...], binding: Binding) -> PackageParameters:
-        mapping = binding.mapping
-        return PackageParameters(
-            element=path,
-            file=self._inside(binding.values.place.file),
-            line=binding.values.place.line,
-            parameters=len(binding.values.parameters),
-            prefix=binding.prefix,
-            mapping=self._inside(mapping.place.file) if mapping is not None else None,
-        )
+def _element(path: tuple[str, ...], element: Element, instance: str | None) -> PackageElement:
+    component = element if isinstance(element, StructureComponent) else None
+    return PackageElement(
+        path=path,
+        kind="component" if component is not None else "system",
+        source=component.source if component is not None else None,
+        instance=instance,
+        implementation=component.implementation if component is not None else None,
+        connectors=dict(Counter(one.kind or "unspecified" for one in element.connectors)),
+        connections=len(element.connections) if isinstance(element, StructureSystem) else 0,
+        description=element.description,
+    )
 
-    def _annotations(self, elements: list[Element]) -> Iterator[Annotation]:
-        yield from annotations_of(self._structure)
-        for element in elements:
-            if element is not self._structure.system:
-                yield from element.annotations
 
-    def _inside(self, file: str) -> str:
+def _source(package: Package, path: tuple[str, ...], binding: Binding) -> PackageParameters:
+    def inside(file: str) -> str:
         """A file as the package names it."""
-        return file.removeprefix(self._package.shown("")).lstrip("/")
+        return file.removeprefix(package.shown("")).lstrip("/")
+
+    values, mapping = binding.values, binding.mapping
+    mapped_by = inside(mapping.place.file) if mapping is not None else None
+    file, line = inside(values.place.file), values.place.line
+    return PackageParameters(path, file, line, len(values.parameters), binding.prefix, mapped_by)
 
 
 def _elements(system: StructureSystem, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Element]]:
@@ -284,17 +258,21 @@ def _elements(system: StructureSystem, path: tuple[str, ...] = ()) -> Iterator[t
 
 
 def _page(found: PackageInspection) -> list[str]:
+    experiment = (("start", found.start_time), ("stop", found.stop_time), ("step", found.step_size))
+    times = [f"{what} {short_number(value)} s" for what, value in experiment if value is not None]
+    annotations = (_line(own) + (f" ({n})" if n > 1 else "") for own, n in found.annotations.items())
+    variants = ", ".join(f"{one.file} ({_line(one.name)})" for one in found.variants)
     lines = pairs(
         [
             ("File", f"{found.file} ({found.bytes} bytes)" if found.bytes is not None else f"{found.file} (a folder)"),
             ("Description", found.description),
             ("Name", _line(found.name)),
             ("Version", f"SSP {found.version}"),
-            ("Variants", _variants(found)),
-            ("Experiment", _experiment(found)),
+            ("Variants", f"{variants}: `ssd=...` chooses one" if len(found.variants) > 1 else ""),
+            ("Experiment", ", ".join([*times, *([found.algorithm] if found.algorithm is not None else [])])),
             ("Needs", "; ".join(found.needed)),
             ("System", _counts(found)),
-            ("Annotations", ", ".join(_times(_line(type_), count) for type_, count in found.annotations.items())),
+            ("Annotations", ", ".join(annotations)),
         ]
     )
     sections = [
@@ -311,19 +289,6 @@ def _page(found: PackageInspection) -> list[str]:
         if content:
             lines += ["", title, *content]
     return lines
-
-
-def _variants(found: PackageInspection) -> str:
-    if len(found.variants) <= 1:
-        return ""
-    names = [f"{one.file} ({_line(one.name)})" for one in found.variants]
-    return f"{', '.join(names)}: `ssd=...` chooses one"
-
-
-def _experiment(found: PackageInspection) -> str:
-    times = [("start", found.start_time), ("stop", found.stop_time), ("step", found.step_size)]
-    parts = [f"{what} {short_number(value)} s" for what, value in times if value is not None]
-    return ", ".join([*parts, *([found.algorithm] if found.algorithm is not None else [])])
 
 
 def _counts(found: PackageInspection) -> str:
@@ -351,10 +316,6 @@ def _values(source: PackageParameters) -> list[str]:
     mapping = f"mapped by {source.mapping}" if source.mapping is not None else ""
     prefix = f"prefix '{_line(source.prefix)}'" if source.prefix else ""
     return [f"{source.file}:{source.line}", counted(source.parameters, "parameter"), f"of {element}", prefix, mapping]
-
-
-def _times(what: str, count: int) -> str:
-    return what if count == 1 else f"{what} ({count})"
 
 
 def _line(text: str) -> str:

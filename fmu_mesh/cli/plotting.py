@@ -1,4 +1,4 @@
-"""`plot`: draws a result file or a sweep; and the option `--plot` of the commands that run a mesh."""
+"""`plot`, `compare` and `recover`: result files; and the option `--plot` of the commands that run a mesh."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from msgspec.structs import asdict
+
+from ..api.recovering import recover
 from ..api.result import Result
 from ..api.result_reading import require_readable
 from ..errors import ConfigurationError, FmuMeshError
@@ -18,6 +21,7 @@ from ..run.run_plan import RunPlan
 from ..system.plan import Plan
 from ..text import listed
 from .arguments import Runs
+from .output.json_output import print_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,6 +29,9 @@ if TYPE_CHECKING:
     from ..sweeps.sweep_result import SweepResult
 
 __all__ = ["RUNS", "check_plot", "plot_results", "plotted_where_it_ends"]
+
+_DIFFERENT = 1
+"""The exit code for results that differ."""
 
 
 def _plot(arguments: argparse.Namespace) -> int:
@@ -131,4 +138,28 @@ def _state_of(result: str | None) -> tuple[int, int, int] | None:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-RUNS: Runs = {"plot": _plot}
+def _compare(arguments: argparse.Namespace) -> int:
+    if arguments.plot is not None:
+        require("matplotlib", "plots")
+    first, second = (Result(path.stem, file=path) for path in (arguments.first, arguments.second))
+    comparison = first.compare(second, rtol=arguments.rtol, atol=arguments.atol, variables=tuple(arguments.variables))
+    code = 0 if comparison.equal else _DIFFERENT
+    if arguments.json:
+        fields = {name: value for name, value in asdict(comparison).items() if name != "drawn"}
+        print_json({"equal": comparison.equal, "exit_code": code, **fields})
+    else:
+        print(comparison.text)
+    if arguments.plot is not None:
+        draw(comparison.plot(), arguments.plot)
+        if not arguments.json:
+            print(f"plot: {arguments.plot}")
+    return code
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    rows = recover(arguments.results)
+    print(f"{arguments.results}: {rows} rows")
+    return 0
+
+
+RUNS: Runs = {"plot": _plot, "compare": _compare, "recover": _recover}

@@ -1,4 +1,4 @@
-"""`launch`, `node`, `master`, `gateway` and `router`: the commands that start processes of a mesh."""
+"""`launch`, `rerun`, `node`, `master`, `gateway` and `router`: the commands that start processes of a mesh."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from msgspec.structs import replace
+
 from ..api.mesh_builder import Mesh
 from ..api.result import Result, result_of
 from ..api.run_handle import Run
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, FmuMeshError
 from ..run.events import Event, Reachable
+from ..run.options import RerunOptions
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
@@ -33,7 +36,7 @@ from .run_options import given_options, mesh_of
 if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
-__all__ = ["RUNS", "interrupted_by_signals", "run_mesh", "show_event"]
+__all__ = ["RUNS", "interrupted_by_signals", "run_mesh"]
 
 
 def _launch(arguments: argparse.Namespace) -> int:
@@ -68,14 +71,14 @@ def run_mesh(
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),
         interrupted_by_signals() as runs,
     ):
-        how["on_event"] = partial(show_event, reporter, display)
+        how["on_event"] = partial(_show_event, reporter, display)
         run = Run.start(plan, **how)
         runs.append(run)
         result = run.wait()
     _finish(plan.plan, result, arguments)
 
 
-def show_event(reporter: RunReporter, display: Display, event: Event) -> None:
+def _show_event(reporter: RunReporter, display: Display, event: Event) -> None:
     """Show an event of a run, and keep it for the report."""
     reporter.event(event)
     display.event(event)
@@ -167,4 +170,42 @@ def _router(arguments: argparse.Namespace) -> int:
     return 0
 
 
-RUNS: Runs = {"launch": _launch, "node": _node, "master": _master, "gateway": _gateway, "router": _router}
+def _rerun(arguments: argparse.Namespace) -> int:
+    from ..api.rerunning import planned_rerun  # noqa: PLC0415 as above
+
+    with RunReporter(wanted=arguments.json) as reporter:
+        again = planned_rerun(arguments.result, **given_options(arguments, RerunOptions))
+        reporter.planned(again.plan)
+        plan = again.plan.plan
+        if not arguments.quiet:
+            warn(plan)
+        with (
+            Display(plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+            interrupted_by_signals() as runs,
+        ):
+            run = Run.start(again.plan, on_event=partial(_show_event, reporter, display))
+            runs.append(run)
+            again.drive(run)
+            outcome = run.wait().outcome
+        assert outcome is not None  # it has run
+        for line in summary(plan, outcome):
+            print(line)
+        assert outcome.file is not None  # it records what the first run has recorded
+        comparison = again.first.compare(Result.read(outcome.file))
+        if not comparison.equal:
+            print(comparison.text)
+            raise FmuMeshError(f"the values are not those of '{arguments.result}'.")
+        # It was to end where the first run has ended, which may have been stopped.
+        reporter.event(replace(outcome, state="done"))
+        print(f"every value is that of '{arguments.result}'")
+    return 0
+
+
+RUNS: Runs = {
+    "launch": _launch,
+    "node": _node,
+    "master": _master,
+    "gateway": _gateway,
+    "router": _router,
+    "rerun": _rerun,
+}

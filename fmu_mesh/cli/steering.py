@@ -1,17 +1,23 @@
-"""`pause`, `resume`, `step`, `stop` and `wait`: a running mesh is told what to do, and waited for."""
+"""`pause`, `resume`, `step`, `stop`, `wait`, `logs` and `play`: a running mesh is steered, waited for and heard."""
 
 from __future__ import annotations
 
 import argparse
+import os
 import re
+import sys
 import time
 from typing import Final
 
 from ..api.attaching import attach
 from ..api.run_handle import Run
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, Interrupted
+from ..ros.bags.play_options import PlayOptions
+from ..text import listed, nearest
 from .arguments import Runs, whole
+from .mesh_arguments import LEVELS
 from .output.json_output import print_json
+from .run_options import given_options
 
 __all__ = ["RUNS"]
 
@@ -53,4 +59,54 @@ def _wait(arguments: argparse.Namespace) -> int:
     return 0
 
 
-RUNS: Runs = {"wait": _wait, **dict.fromkeys(("pause", "resume", "step", "stop"), _command)}
+def _logs(arguments: argparse.Namespace) -> int:
+    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
+        if arguments.instance is not None and arguments.instance not in (names := run.info().instances):
+            near = nearest(arguments.instance, names)
+            hint = f"Did you mean '{near}'?" if near is not None else f"There are: {listed(names)}."
+            raise ConfigurationError(f"mesh '{run.name}' has no instance '{arguments.instance}'.", hint=hint)
+        try:
+            for line in run.logs(follow=arguments.follow):
+                if arguments.instance in (None, line.instance) and _rank(line.status) >= _rank(arguments.level):
+                    if arguments.json:
+                        print_json(line)
+                        continue
+                    text = " ".join(line.message.split())
+                    print(f"{line.instance} at point {line.point}: {line.status.lower()}: {text}", flush=True)
+        except KeyboardInterrupt:
+            sys.stdout.flush()
+            os._exit(Interrupted.exit_code)  # as `watch` does: closing a session in order can take long
+    return 0
+
+
+def _rank(status: str) -> int:
+    """How severe a status is; one that FMI does not know is the least."""
+    return LEVELS.index(status.lower()) if status.lower() in LEVELS else 0
+
+
+def _play(arguments: argparse.Namespace) -> int:
+    from ..ros.bags.bag import Bag  # noqa: PLC0415 only this needs it
+
+    with (
+        Bag(arguments.bag) as bag,  # first: what is wrong with it is told before anything about meshes
+        attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run,
+    ):
+        played = run.play(bag, **given_options(arguments, PlayOptions))
+    names = ", ".join(played.topics)
+    print(f"played {played.values} values of {names} from point {played.first} to point {played.last}")
+    for several, why in (
+        (played.merged, "were followed by another one for the same point"),
+        (played.past, "were past already, and followed by another one"),
+        (played.beyond, "are at or after the end of the simulation"),
+    ):
+        if several:
+            print(f"{several} values {why}")
+    return 0
+
+
+RUNS: Runs = {
+    "wait": _wait,
+    "logs": _logs,
+    "play": _play,
+    **dict.fromkeys(("pause", "resume", "step", "stop"), _command),
+}

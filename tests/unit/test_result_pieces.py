@@ -117,7 +117,7 @@ def test_a_thinned_result_has_the_extremes_and_the_gaps(monkeypatch: pytest.Monk
 MEMORY = """
 import sys
 from fmu_mesh import Result
-import fmu_mesh.cli.main, fmu_mesh.cli.comparing, fmu_mesh.cli.plotting, matplotlib.figure
+import fmu_mesh.cli.main, fmu_mesh.cli.plotting, matplotlib.figure
 from matplotlib.backends import backend_agg
 
 def peak():
