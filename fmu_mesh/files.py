@@ -55,6 +55,7 @@ __all__ = [
     "unwritable",
     "version_at",
     "version_of",
+    "write_whole",
 ]
 
 T = TypeVar("T")
@@ -191,6 +192,21 @@ def replaced(path: Path) -> Iterator[Path]:
         draft.replace(target)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: str | bytes, what: str = "", *, make_folder: bool = False) -> None:
+    """Write a file in the place of an older one; ``what`` is in front of its name in the error.
+
+    Raises:
+        ConfigurationError: it cannot be written; the older one is as it was.
+    """
+    try:
+        if make_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(path) as draft:
+            draft.write_bytes(content if isinstance(content, bytes) else content.encode())
+    except OSError as error:
+        raise ConfigurationError(f"{what}'{path}' cannot be written: {error.strerror}") from error
 
 
 def remove_tree(folder: Path) -> None:

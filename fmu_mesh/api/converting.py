@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from .. import files
 from ..config.findings import Findings
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, Finding
+from ..files import write_whole
 from ..instances.configuration import examine_data
 from ..run.allowed_code import check_code
 from ..run.options import PlanOptions
@@ -80,11 +80,7 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
     text = "".join(f"# {line}\n" if line else "#\n" for line in _comment(source, ssd, given)) + mesh.to_yaml(
         target.parent
     )
-    try:
-        with files.replaced(target) as draft:
-            draft.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"'{target}' cannot be written: {error.strerror}") from error
+    write_whole(target, text)
     return *given.warnings, *(Finding(str(target), "", text, "") for text in told)
 
 

@@ -19,6 +19,7 @@ from ..config.mesh import LimitsConfig
 from ..config.plain_values import plain
 from ..config.yaml_text import written
 from ..errors import CallRefused, ConfigurationError, FmuError, LoadFailed
+from ..files import write_whole
 from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
@@ -433,10 +434,7 @@ class Mesh:
             ConfigurationError: the file cannot be written, or too much of the configuration is wrong to know its paths.
         """
         path = Path(path)
-        try:
-            path.write_text(self.to_yaml(path.parent), encoding="utf-8")
-        except OSError as error:
-            raise ConfigurationError(f"'{path}' cannot be written: {error.strerror}") from error
+        write_whole(path, self.to_yaml(path.parent))
 
     @checked
     def to_ssp(self, path: str | Path, *, version: Literal["1.0", "2.0"] | None = None) -> tuple[Finding, ...]:

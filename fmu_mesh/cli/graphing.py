@@ -8,7 +8,7 @@ from pathlib import Path
 from ..api.attaching import attach
 from ..api.mesh_builder import load
 from ..errors import ConfigurationError
-from ..files import replaced
+from ..files import write_whole
 from ..pictures.drawing import draw
 from ..pictures.system_graph import SystemGraph
 from ..run.options import VariantOptions
@@ -43,15 +43,13 @@ def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
     chooses = arguments.ssd is not None or arguments.ssv
     if of is None and chooses:
         raise ConfigurationError("--ssd and --ssv choose a variant of a package of SSP, and none is named")
-    if of is not None and (chooses or _is_configuration(Path(of))):
+    path = Path(of or "")
+    is_configuration = path.suffix.lower() in _CONFIGURATIONS or path.is_file() or names_package(path)
+    if of is not None and (chooses or is_configuration):
         given = given_options(arguments, VariantOptions)
         return load(of, ssd=arguments.ssd, ssv=arguments.ssv).graph(**given)
     with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:
         return run.graph()
-
-
-def _is_configuration(path: Path) -> bool:
-    return path.suffix.lower() in _CONFIGURATIONS or path.is_file() or names_package(path)
 
 
 def write(graph: SystemGraph, output: Path) -> None:
@@ -59,13 +57,8 @@ def write(graph: SystemGraph, output: Path) -> None:
     suffix = output.suffix.lower()
     if suffix in (".png", ".pdf"):
         draw(graph.figure(), output)
-        return
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(output) as draft:
-            draft.write_text(graph.svg() if suffix == ".svg" else f"{graph.text()}\n", encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"the graph '{output}' cannot be written: {error.strerror}.") from error
+    else:
+        write_whole(output, graph.svg() if suffix == ".svg" else f"{graph.text()}\n", "the graph ", make_folder=True)
 
 
 RUNS: Runs = {"graph": _graph}

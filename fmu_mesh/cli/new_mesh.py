@@ -76,12 +76,8 @@ def _new(arguments: argparse.Namespace) -> int:
     models = _models(paths, file.absolute().parent, quiet=arguments.quiet)
     text = configuration_for(models, mesh=_name(file.absolute().parent.name, ()), file=file, schema=schema.name)
     plan = planned(read_text(text, file), PlanOptions()).plan
-    try:
-        for path, content in ((file, text), (schema, schema_text(installed_config()))):
-            with files.replaced(path) as draft:
-                draft.write_text(content, encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"'{file}' cannot be written: {error.strerror}") from error
+    files.write_whole(file, text)
+    files.write_whole(schema, schema_text(installed_config()))
     print(f"{short_path(file)}: {len(plan.system.instances)} instances, {len(plan.connections)} connections")
     print(f"schema for editors: {short_path(schema)}")
     for model in models:

@@ -230,17 +230,14 @@ def _identities(mesh: Mesh, plan: RunPlan, wanted: Wanted) -> tuple[str, ...]:
     """The id of each variant; where a parameter changes which models there are, their files are looked at, too."""
     contents: dict[tuple[Any, ...], Mapping[str, str]] = {}
     identities = []
-    for number, values in enumerate(wanted.variants):
+    of_models = [name for name in wanted.names if name.startswith("instances.") and "instances" not in mesh.instances]
+    for number in range(len(wanted.variants)):
         parameters = wanted.parameters(number)
-        models = tuple(str(value) for name, value in zip(wanted.names, values, strict=True) if _names_model(mesh, name))
+        models = tuple(str(parameters[name]) for name in of_models)
         if models not in contents:
             contents[models] = _contents(mesh, wanted, parameters) if models else plan.contents
         identities.append(identity_of(wanted, parameters, contents[models]))
     return tuple(identities)
-
-
-def _names_model(mesh: Mesh, name: str) -> bool:
-    return name.startswith("instances.") and "instances" not in mesh.instances
 
 
 def _contents(mesh: Mesh, wanted: Wanted, parameters: Parameters) -> Mapping[str, str]:

@@ -152,16 +152,6 @@ def _floats(values: _Values) -> NDArray[np.float64]:
     return values.astype(np.float64)
 
 
-def _span(values: _Values, _: _Times) -> float | int:
-    least, largest = values.min().item(), values.max().item()
-    difference: float | int = largest - least  # of Python: whole numbers do not overflow
-    return difference
-
-
-def _rms(values: _Values, _: _Times) -> float:
-    return math.sqrt(np.mean(np.square(_floats(values))))
-
-
 def _integral(values: _Values, times: _Times) -> float:
     numbers = _floats(values)
     return float(np.sum(np.diff(times) * (numbers[1:] + numbers[:-1]) / 2.0))
@@ -178,8 +168,8 @@ _FUNCTIONS: Final[dict[str, Callable[[_Values, _Times], Any]]] = {
     "max": lambda values, _: values.max(),
     "mean": lambda values, _: np.mean(_floats(values)),
     "std": lambda values, _: np.std(_floats(values)),
-    "rms": _rms,
-    "span": _span,
+    "rms": lambda values, _: math.sqrt(np.mean(np.square(_floats(values)))),
+    "span": lambda values, _: values.max().item() - values.min().item(),  # of Python: whole numbers do not overflow
     "integral": _integral,
     "time_of_min": lambda values, times: _time_at(values, times, int(values.argmin())),
     "time_of_max": lambda values, times: _time_at(values, times, int(values.argmax())),

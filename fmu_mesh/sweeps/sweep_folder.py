@@ -26,7 +26,7 @@ from typing import Any, Final
 import msgspec
 
 from ..errors import ConfigurationError
-from ..files import decoded_json, is_file, replaced
+from ..files import decoded_json, is_file, replaced, write_whole
 from .variant_run import Cell, Row, curves_of, path_of
 from .variants import Parameters
 
@@ -174,11 +174,7 @@ class SweepFolder:
             if row is not None:
                 cells = cells_of(wanted, number, row, columns) | {"seconds": f"{row.seconds:.4f}"}
                 writer.writerow(map(_cell, cells.values()))
-        try:
-            with replaced(self.table) as draft:
-                draft.write_text(text.getvalue(), encoding="utf-8")
-        except OSError as error:
-            raise ConfigurationError(f"the table '{self.table}' cannot be written: {error.strerror}") from error
+        write_whole(self.table, text.getvalue(), "the table ")
 
 
 class RowFile:

@@ -27,7 +27,6 @@ from ..api.mesh_builder import Mesh
 from ..api.repeated_mesh import RepeatedMesh
 from ..api.result import Result
 from ..config.loading import PlainConfig
-from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, NotInOneProcess, from_report
 from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
@@ -161,8 +160,10 @@ class _Loaded:
         self.task = task
         self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
         self._reductions = [read_reduction(text) for text in self._task.reductions]
-        data, file, foreign = _with_one_record(self._task.data), self._task.file, self._task.foreign
-        self._mesh = Mesh.from_configuration(PlainConfig(data, file, foreign=foreign))
+        data = self._task.data
+        if isinstance(data, dict) and isinstance(records := data.get("record"), list):
+            data = {**data, "record": records[:1]}  # variants must not write into the same files
+        self._mesh = Mesh.from_configuration(PlainConfig(data, self._task.file, foreign=self._task.foreign))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self.hung = _Hung()
         self._bytes = 0
@@ -267,13 +268,6 @@ def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: boo
 def curves_of(folder: Path, identity: str) -> Path:
     """The file with the curves of a run, in the folder of the curves."""
     return folder / f"{identity}.csv"
-
-
-def _with_one_record(data: Plain) -> Plain:
-    """A configuration that records the first section only: variants must not write into the same files."""
-    if not isinstance(data, dict) or not isinstance(records := data.get("record"), list):
-        return data
-    return {**data, "record": records[:1]}
 
 
 def path_of(type_: type, value: object) -> object:

@@ -263,19 +263,15 @@ def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
         below = 1 << (count.bit_length() - 1)
         hint = f"Choose {below} or {2 * below}, or halton:{count}."
         raise ConfigurationError(f"'{sampler}': a Sobol sequence is balanced only for a power of 2.", hint=hint)
-    generator = _generator(seed)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ConfigurationError(f"the seed {shown(seed)} is no whole number of at least 0.")
+    generator = np.random.default_rng(seed)
     if name == "random":
         return generator.random((count, dimensions))
     with importing("scipy", f"samplers other than random:{count}"):
         from scipy.stats import qmc  # noqa: PLC0415  an extra, and slow to import
     shares: NDArray[np.float64] = getattr(qmc, SAMPLERS[name])(dimensions, seed=generator).random(count)
     return shares
-
-
-def _generator(seed: object) -> np.random.Generator:
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigurationError(f"the seed {shown(seed)} is no whole number of at least 0.")
-    return np.random.default_rng(seed)
 
 
 def _scaled(span: Range, shares: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,8 +12,7 @@ from typing import Any
 
 import msgspec
 
-from ...errors import ConfigurationError
-from ...files import replaced
+from ...files import write_whole
 from ...pictures.tables import table
 from ...printing import page
 from ...system.plan import RECORDER, Plan
@@ -31,12 +30,7 @@ def show_profile(plan: Plan, profile: MeshProfile, seconds: float, file: Path | 
     print(page(profile_page(plan, profile)))
     if file is None:
         return
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(file) as draft:
-            draft.write_bytes(msgspec.json.encode(trace(plan, profile, seconds)))
-    except OSError as error:
-        raise ConfigurationError(f"the trace file '{file}' cannot be written: {error.strerror}") from error
+    write_whole(file, msgspec.json.encode(trace(plan, profile, seconds)), "the trace file ", make_folder=True)
     print(f"trace: {file} (open it at ui.perfetto.dev or chrome://tracing)")
 
 
@@ -89,8 +83,13 @@ def critical_path(plan: Plan, profile: MeshProfile) -> list[str]:
         if name in seen:
             together = seen[seen.index(name) :]
             by_window = any(_main_reason(nodes[own])[0] == GRANT for own in together)
-            busiest = max((nodes[own] for own in together), key=_busy)
-            lines.append(_held_together(plan, busiest) if by_window else _round_trip(together))
+            busiest = max(
+                (nodes[own] for own in together), key=lambda own: (own.compute_s + own.transport_s) / own.seconds
+            )
+            window = f"the window of {plan.window} points holds them together; the busiest of them is '{busiest.node}'"
+            names = " and ".join(f"'{own}'" for own in together)
+            round_trip = f"{names} wait for each other: the messages between them set the pace"
+            lines.append(f"{window}: {_work(busiest)}" if by_window else round_trip)
             break
         seen.append(name)
         reason, part_s = _main_reason(node)
@@ -117,10 +116,6 @@ def _awaited(name: str, reason: str, following: str | None) -> str:
     return f"the grant, which {_HOLDERS.get(following, repr(following))} holds back"
 
 
-def _busy(node: NodeProfile) -> float:
-    return (node.compute_s + node.transport_s) / node.seconds
-
-
 def _waiting(node: NodeProfile) -> float:
     return node.waited_s / node.seconds
 
@@ -132,16 +127,6 @@ def _holder(profile: MeshProfile) -> str | None:
 
 def _work(node: NodeProfile) -> str:
     return f"{_share(node.compute_s, node.seconds)} compute, {_share(node.transport_s, node.seconds)} transport"
-
-
-def _held_together(plan: Plan, busiest: NodeProfile) -> str:
-    window = f"the window of {plan.window} points holds them together"
-    return f"{window}; the busiest of them is '{busiest.node}': {_work(busiest)}"
-
-
-def _round_trip(cycle: list[str]) -> str:
-    names = " and ".join(f"'{name}'" for name in cycle)
-    return f"{names} wait for each other: the messages between them set the pace"
 
 
 def summary_of(plan: Plan, profile: MeshProfile, seconds: float) -> dict[str, Any]:
