@@ -103,38 +103,29 @@ __all__ = [
     "sweep",
 ]
 
-_PLACES = {
-    "FMIAdapter": "adapter",
-    "Check": "api.mesh_check",
-    "Comparison": "api.comparison",
-    "Mesh": "api.mesh_builder",
-    "load": "api.mesh_builder",
-    "Component": "instances.python.component",
-    "Input": "instances.python.declarations",
-    "Output": "instances.python.declarations",
-    "Parameter": "instances.python.declarations",
-    "Result": "api.result",
-    "recover": "api.recovering",
-    "rerun": "api.rerunning",
-    "Run": "api.run_handle",
-    "Range": "sweeps.variants",
-    "Sample": "api.samples",
-    "System": "api.open_system",
-    "SystemGraph": "pictures.system_graph",
-    "SystemState": "api.open_system",
-    "simulate": "api.simulating",
-    "attach": "api.attaching",
-    "Inspection": "api.inspection",
-    "PackageInspection": "api.package_inspection",
-    "inspect": "api.inspection",
-    "inspect_package": "api.package_inspection",
-    "meshes": "api.attaching",
-    "component": "instances.python.component",
-    "Sweep": "sweeps.sweeping",
-    "SweepResult": "sweeps.sweep_result",
-    "sweep": "sweeps.sweeping",
+_NAMES = {
+    "adapter": ("FMIAdapter",),
+    "api.attaching": ("attach", "meshes"),
+    "api.comparison": ("Comparison",),
+    "api.inspection": ("Inspection", "inspect"),
+    "api.mesh_builder": ("Mesh", "load"),
+    "api.mesh_check": ("Check",),
+    "api.open_system": ("System", "SystemState"),
+    "api.package_inspection": ("PackageInspection", "inspect_package"),
+    "api.recovering": ("recover",),
+    "api.rerunning": ("rerun",),
+    "api.result": ("Result",),
+    "api.run_handle": ("Run",),
+    "api.samples": ("Sample",),
+    "api.simulating": ("simulate",),
+    "instances.python.component": ("Component", "component"),
+    "instances.python.declarations": ("Input", "Output", "Parameter"),
+    "pictures.system_graph": ("SystemGraph",),
+    "sweeps.sweep_result": ("SweepResult",),
+    "sweeps.sweeping": ("Sweep", "sweep"),
+    "sweeps.variants": ("Range",),
 }
-"""The modules of the public names; all others are exceptions."""
+"""The public names by their modules; all others are exceptions."""
 
 _OF_POSIX = ("fcntl", "resource", "pwd", "termios")
 
@@ -146,8 +137,9 @@ def __getattr__(name: str) -> object:
         raise AttributeError(msg)
     from importlib import import_module  # noqa: PLC0415 see above
 
+    module = next((module for module, names in _NAMES.items() if name in names), "errors")
     try:
-        value = getattr(import_module(f"{__name__}.{_PLACES.get(name, 'errors')}"), name)
+        value = getattr(import_module(f"{__name__}.{module}"), name)
     except ModuleNotFoundError as error:
         if error.name not in _OF_POSIX:
             raise

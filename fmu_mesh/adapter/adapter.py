@@ -29,7 +29,7 @@ from ..system.start_values import forbidden
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_types import is_float
 from .argument_checks import Arguments
-from .times import CallerClock, Instant, RosTime, SecondsClock, Time, clock_from
+from .times import CallerClock, Instant, Nanoseconds, NanosecondsClock, RosTime, SecondsClock, Time
 
 __all__ = ["FMIAdapter"]
 
@@ -228,7 +228,8 @@ class FMIAdapter:
             InitializationFailed: the FMU refuses a start value, or does not start.
         """
         self._demand("initialization", "exit_initialization_mode")
-        self._clock = clock_from(self._arguments.time(time))
+        start = self._arguments.time(time)
+        self._clock = NanosecondsClock(start.nanoseconds) if isinstance(start, Nanoseconds) else SecondsClock(start)
         early = {name: {self._on_fmu_clock(t): v for t, v in own.items()} for name, own in self._early_inputs.items()}
         self._enter()
         with self._fmu_called():

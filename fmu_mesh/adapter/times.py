@@ -15,11 +15,11 @@ __all__ = [
     "CallerClock",
     "Instant",
     "Nanoseconds",
+    "NanosecondsClock",
     "RosStamp",
     "RosTime",
     "SecondsClock",
     "Time",
-    "clock_from",
     "instant_of",
 ]
 
@@ -64,33 +64,12 @@ def instant_of(time: RosTime | RosStamp) -> Nanoseconds:
     return Nanoseconds(int(time.nanoseconds))
 
 
-class CallerClock(Protocol):
-    """Converts between the clock of the caller and that of the FMU, which starts at 0.0."""
-
-    def to_fmu(self, time: Instant) -> float | None:
-        """A time of the caller on the FMU's clock, in s; None if it is not a time of this kind of clock."""
-        ...
-
-    def from_fmu(self, time: float) -> float:
-        """A time of the FMU on the caller's clock, in s."""
-        ...
-
-    def nanoseconds_from_fmu(self, time: float) -> int:
-        """A time of the FMU on the caller's clock, in ns."""
-        ...
-
-    def resolution(self, time: float) -> float:
-        """The largest difference in s at which two times of the caller near the FMU's ``time`` count as equal."""
-        ...
-
-
-def clock_from(start: Instant) -> CallerClock:
-    """The clock of a caller whose time is ``start`` when the FMU's is 0.0."""
-    return NanosecondsClock(start.nanoseconds) if isinstance(start, Nanoseconds) else SecondsClock(start)
-
-
 class SecondsClock:
-    """A clock in seconds, which has ``start`` when the time of the FMU is 0.0."""
+    """The clock of a caller in seconds, which has ``start`` when the time of the FMU is 0.0.
+
+    `to_fmu` and `from_fmu` convert between both clocks, in s; a time of the other kind of clock is None. Two times near
+    the FMU's ``time`` count as equal if they differ by its `resolution`, in s, at most.
+    """
 
     def __init__(self, start: float) -> None:
         self._start = start
@@ -117,7 +96,7 @@ class SecondsClock:
 
 
 class NanosecondsClock:
-    """A clock in whole nanoseconds, as in ROS: exact for any start."""
+    """As `SecondsClock`, in whole nanoseconds, as in ROS: exact for any start."""
 
     def __init__(self, start: int) -> None:
         self._start = start
@@ -137,3 +116,6 @@ class NanosecondsClock:
     def resolution(self, time: float) -> float:
         """1 ns: a stamp is the time of a step, truncated or rounded to whole nanoseconds."""
         return 1.0 / _NANO + 8 * math.ulp(time)
+
+
+CallerClock = SecondsClock | NanosecondsClock

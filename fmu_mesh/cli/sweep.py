@@ -21,7 +21,7 @@ from ..sweeps.variants import Values, read_values
 from ..text import short_path, shown
 from .arguments import Runs
 from .output.json_output import Failure, failure_of, print_json
-from .output.progress import SweepProgressLine
+from .output.progress import ProgressLine, sweep_parts
 from .output.terminal import error_console, say, stdout_as_stderr
 from .run_arguments import HERE
 from .run_options import given_options, mesh_of
@@ -133,11 +133,13 @@ def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:
         if arguments.no_wait:
             say(f"`{sweep.again}` follows it, and `scancel {job.id}` ends it")
             return
-    line = SweepProgressLine(sweep.mesh, error_console, show=not (arguments.no_progress or arguments.quiet))
+    console = error_console if not (arguments.no_progress or arguments.quiet) else None
+    line = ProgressLine(sweep.mesh, sweep.progress.total, sweep_parts, console)
     line.start()
     try:
         while True:
-            line.update(sweep.progress)
+            progress = sweep.progress
+            line.update(progress.done, progress)
             try:
                 sweep.wait(_LOOK_S)
             except DeadlineExceeded:

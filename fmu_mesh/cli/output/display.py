@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
@@ -18,7 +18,7 @@ from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
-from .progress import RunProgressLine
+from .progress import ProgressLine, progress_parts
 from .terminal import error_console, say
 
 if TYPE_CHECKING:
@@ -47,7 +47,9 @@ class Display:
     def __init__(self, plan: Plan, *, show_progress: bool, quiet: bool = False, waits_for_nodes: bool = True) -> None:
         self._plan = plan
         self._quiet = quiet
-        self._progress = RunProgressLine(plan, lambda: self._console, show=show_progress and not quiet)
+        last = plan.grid.last_point if plan.grid.stop_time is not None else None
+        console = (lambda: self._console) if show_progress and not quiet else None
+        self._progress = ProgressLine(plan.system.config.mesh, last, partial(progress_parts, plan.grid), console)
         self._waits_for_nodes = waits_for_nodes
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()
@@ -173,7 +175,7 @@ class Display:
             self._console.print(Text.assemble((front, "dim"), (text, style)), soft_wrap=True)
 
     def _status(self, status: MeshStatus) -> None:
-        self._progress.status(status)
+        self._progress.update(status.point, status)
         if status.state in ("running", "paused", "stopping", "done"):
             self._show_address()
         if status.state == "paused":

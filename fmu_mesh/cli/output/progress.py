@@ -6,13 +6,11 @@ Owns which parts are left out on a narrow terminal. It never wraps: a wrapped li
 from __future__ import annotations
 
 import sys
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from ...pictures.tables import shortened
 from ...simtime import TimeGrid
-from ...system.plan import Plan
 from ...wire.views import MeshStatus
 from .terminal import may_draw
 
@@ -22,7 +20,10 @@ if TYPE_CHECKING:
 
     from ...sweeps.sweeping import SweepProgress
 
-__all__ = ["RunProgressLine", "SweepProgressLine", "progress_parts"]
+__all__ = ["ProgressLine", "progress_parts", "sweep_parts"]
+
+T = TypeVar("T")
+"""A status."""
 
 _LEAST_BAR: Final = 8
 _MOST_NAME: Final = 20
@@ -31,19 +32,24 @@ _ECHO: Final = 3
 """Columns for the `^C` that a terminal echoes, which would wrap the line."""
 
 
-class ProgressLine(ABC):
+class ProgressLine(Generic[T]):
     """One line at the bottom of a terminal, while it is started.
 
     Args:
         name: of what is going on.
-        console: returns where it is drawn, if standard error is a terminal: Rich is slow to import.
-        show: False never draws it.
+        total: how much there is to do; None if that is not known.
+        parts: of the last status, what fits into a number of columns beside the bar.
+        console: where it is drawn, if standard error is a terminal; None never draws it. Rich is slow to import.
     """
 
-    def __init__(self, name: str, console: Callable[[], Console], *, show: bool) -> None:
-        self._name = name
+    def __init__(
+        self, name: str, total: int | None, parts: Callable[[T, int], list[str]], console: Callable[[], Console] | None
+    ) -> None:
+        self._name, self._total, self._parts = name, total, parts
+        self._done = 0
+        self._status: T | None = None
         self._live: Live | None = None
-        if show and may_draw(sys.stderr) and console().is_terminal and not console().is_dumb_terminal:
+        if console is not None and may_draw(sys.stderr) and console().is_terminal and not console().is_dumb_terminal:
             from rich.live import Live  # noqa: PLC0415 see above
 
             self._live = Live(self, console=console(), transient=True, refresh_per_second=10)
@@ -58,14 +64,9 @@ class ProgressLine(ABC):
         if self._live is not None:
             self._live.stop()
 
-    @abstractmethod
-    def _parts(self, width: int) -> list[str]:
-        """What fits into ``width`` columns beside the bar."""
-
-    @property
-    @abstractmethod
-    def _completed(self) -> tuple[int, int | None]:
-        """How much is done, and how much there is; None if that is not known."""
+    def update(self, done: int, status: T) -> None:
+        """Show how much is done, and this status."""
+        self._done, self._status = done, status
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The line; Rich calls this ten times a second."""
@@ -75,7 +76,8 @@ class ProgressLine(ABC):
 
         width = max(options.max_width - _ECHO, 1)
         name = shortened(self._name, min(_MOST_NAME, width // 4))
-        parts = self._parts(width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP))
+        room = width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP)
+        parts = self._parts(self._status, room) if self._status is not None else ["starting"]
         padding = (0, len(_GAP), 0, 0)
         line = Table(
             width=width,
@@ -89,58 +91,9 @@ class ProgressLine(ABC):
         line.add_column(no_wrap=True)
         line.add_column(ratio=1, no_wrap=True)
         line.add_column(no_wrap=True)
-        completed, total = self._completed
-        bar = ProgressBar(total=total, completed=completed, pulse=total is None)
+        bar = ProgressBar(total=self._total, completed=self._done, pulse=self._total is None)
         line.add_row(Text(name, style="bold"), bar, Text(_GAP.join(parts)))
         yield line
-
-
-class RunProgressLine(ProgressLine):
-    """The progress line of a run."""
-
-    def __init__(self, plan: Plan, console: Callable[[], Console], *, show: bool) -> None:
-        super().__init__(plan.system.config.mesh, console, show=show)
-        self._grid = plan.grid
-        self._status: MeshStatus | None = None
-
-    def status(self, status: MeshStatus) -> None:
-        """Show this status of the mesh."""
-        self._status = status
-
-    def _parts(self, width: int) -> list[str]:
-        return progress_parts(self._grid, self._status, width)
-
-    @property
-    def _completed(self) -> tuple[int, int | None]:
-        point = self._status.point if self._status is not None else 0
-        return point, self._grid.last_point if self._grid.stop_time is not None else None
-
-
-class SweepProgressLine(ProgressLine):
-    """The progress line of a sweep."""
-
-    def __init__(self, name: str, console: Callable[[], Console], *, show: bool) -> None:
-        super().__init__(name, console, show=show)
-        self._progress: SweepProgress | None = None
-
-    def update(self, progress: SweepProgress) -> None:
-        """Show how far the sweep is."""
-        self._progress = progress
-
-    def _parts(self, width: int) -> list[str]:
-        progress = self._progress
-        if progress is None:
-            return ["starting"]
-        parts = [f"{progress.done} of {progress.total} runs"]
-        if progress.failed:
-            parts.append(f"{progress.failed} failed")
-        if progress.left is not None:
-            parts.append(f"{_duration(progress.left)} left")
-        return _fitting(parts, width)
-
-    @property
-    def _completed(self) -> tuple[int, int | None]:
-        return (self._progress.done, self._progress.total) if self._progress is not None else (0, None)
 
 
 def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> list[str]:
@@ -158,6 +111,16 @@ def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> lis
     elif grid.stop_time is not None and rate > 0.0:
         parts.append(f"{_duration((grid.last_point - status.point) / rate)} left")
     parts += [f"{rate:,.0f} points/s", f"factor {status.real_time_factor:.3g}"]
+    return _fitting(parts, width)
+
+
+def sweep_parts(progress: SweepProgress, width: int) -> list[str]:
+    """As `progress_parts`, of a sweep."""
+    parts = [f"{progress.done} of {progress.total} runs"]
+    if progress.failed:
+        parts.append(f"{progress.failed} failed")
+    if progress.left is not None:
+        parts.append(f"{_duration(progress.left)} left")
     return _fitting(parts, width)
 
 
