@@ -9,7 +9,7 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from ..config.base import ENDPOINT_PATTERN
 from ..errors import ConfigurationError
@@ -87,10 +87,15 @@ class CommandParser(argparse.ArgumentParser):
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
+class Part(Protocol):
+    """Adds an argument, or several, to a command or to a group of its arguments."""
+
+    def __call__(self, parser: argparse._ActionsContainer, /) -> object:
+        """Add them."""
+
+
 Runs = Mapping[str, Callable[[argparse.Namespace], int]]
 """What a module of commands offers: for each command the function that runs it and returns the exit code."""
-Part = Callable[[argparse._ActionsContainer], object]  # noqa: SLF001  the base of parsers and groups has no other name
-"""Adds an argument, or several, to a command or to a group of its arguments."""
 Parsers = Mapping[str, Sequence[Part]]
 """What a module of arguments offers: for each command its arguments, in the order of the help."""
 

@@ -28,7 +28,7 @@ from ..text import listed, nearest
 from .reductions import check_reductions, read_reduction
 from .sweep_folder import SweepFolder, Wanted, identity_of, is_sweep
 from .sweep_options import Own, SweepOptions
-from .variant_run import OwnReductions, Row, SweepTask, encoded_task, options_of_variant
+from .variant_run import Common, OwnReductions, Row, SweepTask, encoded_task, options_of_variant
 from .variants import Parameters, variants_of
 
 __all__ = ["Own", "PlannedSweep", "SweepOptions", "continued_sweep", "planned_sweep"]
@@ -154,17 +154,9 @@ def continued_sweep(
 def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, functions: OwnReductions) -> PlannedSweep:
     wanted = replace(wanted, identities=_identities(mesh, plan, wanted))
     columns = (*wanted.reductions, *functions)
-    task = SweepTask(
-        version=wanted.version,
-        data=wanted.data,
-        file=Path(wanted.file),
-        foreign=mesh.configuration.foreign,
-        options=wanted.options,
-        reductions=wanted.reductions,
-        curves=folder.curves if wanted.curves else None,
-        processes=wanted.processes,
-        reset=wanted.reset,
-    )
+    common = {name: getattr(wanted, name) for name in Common.__struct_fields__}
+    curves = folder.curves if wanted.curves else None
+    task = SweepTask(**common, folder=curves, foreign=mesh.configuration.foreign)
 
     def is_kept(row: Row) -> bool:
         """What failed may be right now, unless an FMU failed: that would fail again."""

@@ -27,7 +27,7 @@ import msgspec
 
 from ..errors import ConfigurationError
 from ..files import decoded_json, is_file, replaced, write_whole
-from .variant_run import Cell, Row, curves_of, path_of
+from .variant_run import Cell, Common, Row, curves_of, path_of
 from .variants import Parameters
 
 __all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
@@ -38,42 +38,28 @@ _TABLE: Final = "table.csv"
 _CURVES: Final = "runs"
 
 
-class Wanted(msgspec.Struct, frozen=True):
+class Wanted(Common, frozen=True, kw_only=True):
     """What was asked: `sweep.json`.
 
     Attributes:
-        version: version of fmu_mesh.
         mesh: name of the mesh.
-        file: file of the configuration, absolute.
-        data: the values of the configuration.
-        options: the options of each run that have another value than their default.
         names: names of the parameters.
         variants: for each variant the values of the parameters, in this order.
         recorded: names of the recorded variables.
-        reductions: columns that are calculated from the curves.
         identities: the id of each variant.
         units: unit of each recorded variable and of each parameter; None without one.
         curves: whether the curves of each run are kept.
-        processes: whether each run starts processes.
-        reset: whether instances are reset between two runs.
         most_instances: by the name of a model file, how many instances there may be at a time.
     """
 
-    version: str
     mesh: str
-    file: str
-    data: Any
-    options: dict[str, Any]
     names: tuple[str, ...]
     variants: tuple[tuple[Any, ...], ...]
     recorded: tuple[str, ...] = ()
-    reductions: tuple[str, ...] = ()
-    units: dict[str, str | None] = {}
+    units: dict[str, str | None] = msgspec.field(default_factory=dict)
     identities: tuple[str, ...] = ()
     curves: bool = True
-    processes: bool = False
-    reset: bool = False
-    most_instances: dict[str, int] = {}
+    most_instances: dict[str, int] = msgspec.field(default_factory=dict)
 
     def parameters(self, number: int) -> Parameters:
         """The parameters of a variant."""

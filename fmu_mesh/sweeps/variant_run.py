@@ -32,7 +32,7 @@ from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
 
-__all__ = ["Row", "SweepTask", "curves_of", "encoded_task", "options_of_variant", "path_of", "run_variant"]
+__all__ = ["Common", "Row", "SweepTask", "curves_of", "encoded_task", "options_of_variant", "path_of", "run_variant"]
 
 _GROWTH_BYTES = 256 * 2**20
 
@@ -43,29 +43,37 @@ OwnReductions = Mapping[str, Callable[[Result], object]]
 """Functions of the user by the name of their column."""
 
 
-class SweepTask(msgspec.Struct, frozen=True):
+class Common(msgspec.Struct, frozen=True, kw_only=True):
     """What all variants of a sweep have in common.
 
     Attributes:
         version: that of fmu_mesh, which all workers must have.
+        file: the file of the configuration, absolute.
         data: the values of the configuration.
-        file: the file of the configuration.
-        foreign: as in `PlainConfig`.
-        options: the options of each run.
-        reductions: what is calculated from the curves of each run.
-        curves: the folder for the curves of each run; None: they are not kept.
+        options: the options of each run that have another value than their default.
+        reductions: columns that are calculated from the curves of each run.
         processes: whether each run starts processes, as `launch` does.
         reset: whether instances are reset between two runs, and not made anew.
     """
 
     version: str
+    file: str
     data: Any
-    file: Path
     options: dict[str, Any]
     reductions: tuple[str, ...] = ()
-    curves: Path | None = None
     processes: bool = False
     reset: bool = False
+
+
+class SweepTask(Common, frozen=True, kw_only=True):
+    """What every worker gets.
+
+    Attributes:
+        folder: for the curves of each run; None: they are not kept.
+        foreign: as in `PlainConfig`.
+    """
+
+    folder: Path | None = None
     foreign: str = ""
 
 
@@ -163,7 +171,7 @@ class _Loaded:
         data = self._task.data
         if isinstance(data, dict) and isinstance(records := data.get("record"), list):
             data = {**data, "record": records[:1]}  # variants must not write into the same files
-        self._mesh = Mesh.from_configuration(PlainConfig(data, self._task.file, foreign=self._task.foreign))
+        self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
         self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
         self.hung = _Hung()
         self._bytes = 0
@@ -190,8 +198,8 @@ class _Loaded:
         if task.version != __version__:
             raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
         options = options_of_variant(task.options, self._mesh.instances, parameters)
-        if task.curves is not None:
-            options["output"] = curves_of(task.curves, identity)
+        if task.folder is not None:
+            options["output"] = curves_of(task.folder, identity)
         else:
             options["record"] = "memory"
         if not task.processes:

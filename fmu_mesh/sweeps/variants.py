@@ -249,7 +249,7 @@ def _listed_values(values: Values) -> Sequence[PlainValue] | None:
 # --- samplers
 
 
-def _shares(sampler: str, dimensions: int, seed: int) -> NDArray[np.float64]:
+def _shares(sampler: str, dimensions: int, seed: object) -> NDArray[np.float64]:
     """Numbers from 0 to 1, shape `(count, dimensions)`."""
     found = _SAMPLER.fullmatch(sampler)
     name, count = (found[1], int(found[2])) if found is not None else (sampler.partition(":")[0], 0)

@@ -98,7 +98,11 @@ def test_a_sweep_in_processes_has_the_rows_of_one_in_one_process(config: Path, t
     found = {}
     told: list[str] = []
     for processes in (False, True):
-        options = {"processes": processes, "folder": tmp_path / f"{processes}", "on_notice": told.append}
+        options: dict[str, Any] = {
+            "processes": processes,
+            "folder": tmp_path / f"{processes}",
+            "on_notice": told.append,
+        }
         with fmu_mesh.sweep(config, {"pendulum.d": [0.1, 0.4]}, **options) as running:
             found[processes] = running.wait(DEADLINE_S)
 
