@@ -211,18 +211,11 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         for causality, title in _CAUSALITIES
         if (count := len(description.with_causality(causality)))
     ]
-    times = [
-        f"{what} {short_number(value)} s"
-        for what, value in (
-            ("start", experiment.start_time),
-            ("stop", experiment.stop_time),
-            ("step", experiment.step_size),
-        )
-        if value is not None
-    ]
+    of_time = ("start", experiment.start_time), ("stop", experiment.stop_time), ("step", experiment.step_size)
+    times = [f"{what} {short_number(value)} s" for what, value in of_time if value is not None]
     states = [f"{description.continuous_states} continuous"] if description.continuous_states else []
     if indicators := description.event_indicators:
-        states.append(f"{indicators} event indicator{'s' if indicators > 1 else ''}")
+        states.append(counted(indicators, "event indicator"))
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
     platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"

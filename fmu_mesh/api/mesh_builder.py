@@ -329,10 +329,8 @@ class Mesh:
         )
         there = connections_of(self._plain)
         if source is target is None or len(connections_of(left)) == len(there):
-            wanted, names = (
-                f"{source or '*'} -> {target or '*'}",
-                [" -> ".join(map(str, ends_of(one))) for one in there],
-            )
+            wanted = f"{source or '*'} -> {target or '*'}"
+            names = [" -> ".join(map(str, ends_of(one))) for one in there]
             raise unknown(f"mesh '{self.name}' has no connection '{wanted}'", wanted, names)
         self._plain = left
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
 
 from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
@@ -34,7 +33,7 @@ from ..system.settable import check_settable, sources_of, why_not_settable
 from ..text import listed, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
-from ..variables.value_types import DTYPES, Value
+from ..variables.value_types import DTYPES
 
 __all__ = ["System", "SystemState"]
 
@@ -344,8 +343,8 @@ class System:
     def _getter(self, name: str) -> Callable[[int], Any]:
         instance, variable = self._found(name, elements=True)
         plain = self._local.getter(instance, name.removeprefix(f"{instance}."))
-        is_array = variable.shape and name == f"{instance}.{variable.name}"
-        read = partial(_as_array, plain, DTYPES[variable.type]) if is_array else plain
+        is_array, dtype = variable.shape and name == f"{instance}.{variable.name}", DTYPES[variable.type]
+        read = (lambda point: np.array(plain(point), dtype)) if is_array else plain
         self._getters[name] = read
         return read
 
@@ -418,10 +417,6 @@ class SystemState:
 def _opened(run: RunPlan, folder: Path, name: str) -> Guarded:
     opening = opening_of(run.plan, name, folder, _forward, run.showing)
     return Guarded(name, lambda: open_instance(opening), Unwatched(), run.plan.system.config.timeouts)
-
-
-def _as_array(read: Callable[[int], Value], dtype: DTypeLike, point: int) -> NDArray[Any]:
-    return np.array(read(point), dtype)
 
 
 def _forward(message: LogMessage) -> None:

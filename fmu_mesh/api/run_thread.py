@@ -105,9 +105,7 @@ class RunThread:
     def interrupt(self) -> None:
         """End the run; a second call does not wait for its processes."""
         with self._changing:
-            self._failure = self._failure or Interrupted("interrupted")
-            if self._runner is not None:
-                self._runner.interrupt()
+            self._fail(Interrupted("interrupted"))
 
     def over(self) -> bool:
         """False while it goes on.

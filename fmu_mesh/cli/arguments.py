@@ -9,6 +9,7 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NoReturn, Protocol
 
 from ..config.base import ENDPOINT_PATTERN
@@ -137,28 +138,19 @@ def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[Part, Part]:
     )
 
 
-def number(text: str) -> float:
-    """A finite number."""
-    value = _read(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+def _finite(text: str, *, least: float = -math.inf, above: float = -math.inf, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
+    if not (math.isfinite(value) and value >= least and value > above):
+        raise argparse.ArgumentTypeError(f"{text} is not {what}")
     return value
 
 
-def positive_seconds(text: str) -> float:
-    """A time in s above 0."""
-    value = _read(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a time above 0")
-    return value
-
-
-def tolerance(text: str) -> float:
-    """A finite number of 0 or more."""
-    value = _read(text)
-    if not (math.isfinite(value) and value >= 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number of 0 or more")
-    return value
+number = partial(_finite, what="a finite number")
+positive_seconds = partial(_finite, above=0.0, what="a time above 0")
+tolerance = partial(_finite, least=0.0, what="a number of 0 or more")
 
 
 def count(text: str) -> int:
@@ -189,13 +181,6 @@ def whole(text: str) -> int:
         return int(text)
     except ValueError:
         return 0
-
-
-def _read(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number") from None
 
 
 QUIET = switch("-q", "--quiet", text="print errors only")

@@ -139,10 +139,6 @@ def _keys(prefix: str, _given: argparse.Namespace) -> list[str]:
     return _with_end(_in_parts(_KEYS, prefix), "=")
 
 
-def _varied(prefix: str, given: argparse.Namespace) -> list[str]:
-    return [*_settable(prefix, given), *_keys(prefix, given)]
-
-
 def _reduced(prefix: str, given: argparse.Namespace) -> list[str]:
     from ..sweeps.reductions import FUNCTIONS  # noqa: PLC0415 slow, and only this needs it
 
@@ -224,7 +220,7 @@ _BY_NAME: Final[_Offers] = {
     "node": lambda _, given: readable_configuration(given.config, given.ssd).config.instances,
     "start_values": _settable,
     "config_values": _keys,
-    "vary": _varied,
+    "vary": lambda prefix, given: [*_settable(prefix, given), *_keys(prefix, given)],
     "reduce": _reduced,
     "sampler": _samplers,
     "mesh": _meshes,

@@ -38,7 +38,9 @@ def _dashboard(arguments: argparse.Namespace) -> int:
                 "and it is not encrypted\n"
             )
         print(f"dashboard: {url}", flush=True)
-        if not arguments.no_browser and _has_screen():
+        # Otherwise a browser would open in this terminal, and not in a window.
+        has_screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+        if not arguments.no_browser and has_screen:
             webbrowser.open(until_end.enter_context(_redirecting(url)))
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that the file below is removed
@@ -60,11 +62,6 @@ def _redirecting(url: str) -> Iterator[str]:
         file.write(f'<meta http-equiv="refresh" content="0; url={escape(url)}">\n')
         file.flush()
         yield Path(file.name).as_uri()
-
-
-def _has_screen() -> bool:
-    """Whether a browser opens in a window, and not in this terminal."""
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
 
 
 RUNS: Runs = {"dashboard": _dashboard}

@@ -203,18 +203,14 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
 
 
 def _row(own: InstanceStatus, before: InstanceStatus | None, step_size: float) -> list[str]:
-    if before is None or before.running_time >= own.running_time or before.point > own.point:  # it was restarted
-        before = InstanceStatus(own.instance, "", "", 0, 0.0, 0.0, 0.0)
-    wall_s = own.running_time - before.running_time
-    rate = (own.point - before.point) / wall_s if wall_s > 0.0 else 0.0
-    waited = (own.wait_time - before.wait_time) / wall_s if wall_s > 0.0 else 0.0
+    rate, _, waited = own.rates_since(before)
     return [
         own.instance,
         own.state,
         str(own.point),
         seconds(own.time),
         f"{1e6 * own.step_time:.3g} us",
-        f"{100.0 * min(waited, 1.0):.0f} %",
+        f"{100.0 * waited:.0f} %",
         f"{rate:.0f}",
         f"{rate * step_size:.3g}",
         str(own.restarts),

@@ -50,14 +50,8 @@ class InstanceTable:
 
 def _row(own: InstanceStatus, before: InstanceStatus | None) -> dict[str, Any]:
     """The row of an instance in the table; rates and shares are those of the last second."""
-    if before is None or before.running_time >= own.running_time or before.point > own.point:  # it was restarted
-        before = InstanceStatus(own.instance, "", "", 0, 0.0, 0.0, 0.0)
-    wall_s = own.running_time - before.running_time
-    points = own.point - before.point
-    rate = points / wall_s if wall_s > 0.0 else 0.0
-    waits = min(100.0, 100.0 * max(0.0, own.wait_time - before.wait_time) / wall_s) if wall_s > 0.0 else 0.0
-    steps_s = own.step_time * own.point - before.step_time * before.point
-    computes = min(100.0 - waits, 100.0 * max(0.0, steps_s) / wall_s) if wall_s > 0.0 else 0.0
+    rate, *shares = own.rates_since(before)
+    computes, waits = (100.0 * share for share in shares)
     return {
         "instance": own.instance,
         "state": own.state,

@@ -370,12 +370,8 @@ class _Room:
 
     def _cost(self, rectangle: tuple[float, float, float, float]) -> int:
         """How much a text covers there; the first and so nearest place of several with the same cost is taken."""
-        left, low, right, high = (
-            rectangle[0] - _FRAME,
-            rectangle[1] - _FRAME,
-            rectangle[2] + _FRAME,
-            rectangle[3] + _FRAME,
-        )
+        left, low = rectangle[0] - _FRAME, rectangle[1] - _FRAME
+        right, high = rectangle[2] + _FRAME, rectangle[3] + _FRAME
         is_outside = left < 0.0 or low < 0.0 or right > self._size[0] or high > self._size[1]
         cost = 10_000 * is_outside
         cost += 1_000 * sum(

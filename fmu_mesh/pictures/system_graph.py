@@ -248,17 +248,8 @@ def graph_of(
 def _live(node: GraphNode, status: InstanceStatus | None, before: InstanceStatus | None) -> GraphNode:
     if status is None:
         return replace(node, state=None, point=None, points_per_second=None, wait=None)
-    start: tuple[int, float, float] = (0, 0.0, 0.0)
-    if before is not None and before.running_time < status.running_time and before.point <= status.point:
-        start = before.point, before.running_time, before.wait_time
-    wall_s = status.running_time - start[1]
-    return replace(
-        node,
-        state=status.state,
-        point=status.point,
-        points_per_second=(status.point - start[0]) / wall_s if wall_s > 0.0 else 0.0,
-        wait=min((status.wait_time - start[2]) / wall_s, 1.0) if wall_s > 0.0 else 0.0,
-    )
+    rate, _, wait = status.rates_since(before)
+    return replace(node, state=status.state, point=status.point, points_per_second=rate, wait=wait)
 
 
 def _fitted(rows: Sequence[tuple[str, str, str, str]], indent: int) -> list[str]:

@@ -67,35 +67,29 @@ class Wanted(Common, frozen=True, kw_only=True):
 
 
 class SweepFolder:
-    """One folder, which may not exist yet; see above."""
+    """One folder, which may not exist yet; see above.
+
+    Attributes:
+        table: the file of the table.
+        curves: the folder of the curves.
+        wanted_file: the file that says what was asked.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-
-    @property
-    def table(self) -> Path:
-        """The file of the table."""
-        return self.path / _TABLE
-
-    @property
-    def curves(self) -> Path:
-        """The folder of the curves."""
-        return self.path / _CURVES
+        self.table = path / _TABLE
+        self.curves = path / _CURVES
+        self.wanted_file = path / _WANTED
 
     def curves_of(self, identity: str) -> Path:
         """The file with the curves of a run."""
         return curves_of(self.curves, identity)
 
-    @property
-    def wanted_file(self) -> Path:
-        """The file that says what was asked."""
-        return self.path / _WANTED
-
     def begin(self, wanted: Wanted) -> None:
         """Make the folder, and write down what is asked."""
         try:
             (self.curves if wanted.curves else self.path).mkdir(parents=True, exist_ok=True)
-            with replaced(self.path / _WANTED) as draft:
+            with replaced(self.wanted_file) as draft:
                 draft.write_bytes(msgspec.json.format(msgspec.json.encode(wanted, enc_hook=str)))
         except OSError as error:
             raise self._unwritable(error) from error
@@ -118,7 +112,7 @@ class SweepFolder:
         Raises:
             ConfigurationError: there is no sweep in this folder, or another version has written it.
         """
-        file = self.path / _WANTED
+        file = self.wanted_file
         try:
             return decoded_json(file.read_bytes(), Wanted, path_of)
         except OSError as error:

@@ -128,6 +128,20 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     running_time: float = 0.0
     refused: int = 0
 
+    def rates_since(self, before: InstanceStatus | None) -> tuple[float, float, float]:
+        """Points per second, and the shares of the time in steps and waiting, since an earlier status.
+
+        Without one, and after a restart, since the first point.
+        """
+        if before is None or before.running_time >= self.running_time or before.point > self.point:
+            before = InstanceStatus(self.instance, "", "", 0, 0.0, 0.0, 0.0)
+        wall_s = self.running_time - before.running_time
+        if wall_s <= 0.0:
+            return 0.0, 0.0, 0.0
+        waiting = min(max(0.0, self.wait_time - before.wait_time) / wall_s, 1.0)
+        steps_s = self.step_time * self.point - before.step_time * before.point
+        return (self.point - before.point) / wall_s, min(max(0.0, steps_s) / wall_s, 1.0 - waiting), waiting
+
 
 class LogLine(msgspec.Struct, frozen=True):
     """One line of `…/<instance>/log`, and of `…/mesh/log`, where ``number`` counts the lines of all from 1."""

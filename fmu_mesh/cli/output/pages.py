@@ -91,14 +91,12 @@ _PARTS = {"@record": "the recorder", "@mesh": "the master"}
 
 def mesh_info(info: MeshInfo) -> list[str]:
     """The information about a mesh."""
+    end = seconds(info.stop_time) if info.stop_time is not None else "an open end"
     return pairs(
         [
             ("mesh", info.mesh),
             ("configuration", info.config),
-            (
-                "simulation",
-                f"{seconds(info.start_time)} to {_end(info.stop_time)} in steps of {seconds(info.step_size)}",
-            ),
+            ("simulation", f"{seconds(info.start_time)} to {end} in steps of {seconds(info.step_size)}"),
             ("algorithm", info.algorithm),
             ("window", f"{info.window} points"),
             ("real-time factor", f"{info.real_time_factor:g}" if info.real_time_factor else "as fast as possible"),
@@ -115,6 +113,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
 def instance_info(info: InstanceInfo) -> list[str]:
     """The information about an instance, and its variables."""
     fmi = f"FMI {info.fmi_version}, " if info.fmi_version else ""
+    can = (name.removeprefix("can_").replace("_", " ") for name, own in info.capabilities.items() if own)
     facts = pairs(
         [
             ("instance", info.instance),
@@ -123,12 +122,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("made by", info.generation_tool or ""),
             ("FMU" if fmi else "file", info.fmu),
             ("step size", seconds(info.step_size)),
-            (
-                "can",
-                ", ".join(
-                    name.removeprefix("can_").replace("_", " ") for name, can in info.capabilities.items() if can
-                ),
-            ),
+            ("can", ", ".join(can)),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(f"{c.source} -> {c.target}{' (map)' if c.map else ''}" for c in info.connections)),
             ("clocks", ", ".join(map(str, info.clocks))),
@@ -152,10 +146,6 @@ def progress(status: MeshStatus) -> str:
 def seconds(time: float) -> str:
     """A time in s."""
     return f"{short_number(time)} s"
-
-
-def _end(stop_time: float | None) -> str:
-    return seconds(stop_time) if stop_time is not None else "an open end"
 
 
 def _type(view: VariableView) -> str:

@@ -23,6 +23,9 @@ from .terminal import stdout_as_stderr
 __all__ = ["RunReport", "RunReporter"]
 
 
+_AS_THE_OUTCOME = ("point", "time", "seconds", "rows", "file", "ended_by", "warnings")
+
+
 class ReportedFile(msgspec.Struct, frozen=True):
     """A result file and its number of rows."""
 
@@ -109,14 +112,8 @@ class RunReporter:
             mesh=self._run.mesh if self._run is not None else None,
             state="failed" if failure is not None else outcome.state,
             exit_code=failure.exit_code if failure is not None else 0,
-            point=outcome.point,
-            time=outcome.time,
-            seconds=outcome.seconds,
-            rows=outcome.rows,
-            file=outcome.file,
             restarts=self._restarts,
             error=failure,
-            ended_by=outcome.ended_by,
             files=tuple(ReportedFile(*own) for own in outcome.files),
-            warnings=outcome.warnings,
+            **{name: getattr(outcome, name) for name in _AS_THE_OUTCOME},
         )

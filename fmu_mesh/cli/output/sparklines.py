@@ -55,10 +55,11 @@ class Histories:
 
     def lines(self, width: int | None = None, signs: str = BLOCKS) -> list[str]:
         """A line for each variable, in at most ``width`` columns; without a width, of at most 40 values."""
-        rows = [
-            (name, _range(self._values[name]), f"{_text(sample.value)} {sample.unit or ''}".rstrip())
-            for name, sample in self._newest.items()
-        ]
+        rows = []
+        for name, sample in self._newest.items():
+            finite = [value for value in self._values[name] if math.isfinite(value)]
+            range_ = f"{min(finite):.4g}..{max(finite):.4g}" if finite else ""
+            rows.append((name, range_, f"{_text(sample.value)} {sample.unit or ''}".rstrip()))
         if not rows:
             return []
         names, ranges, values = (max(len(row[column]) for row in rows) for column in range(3))
@@ -105,12 +106,6 @@ def sparkline_signs(encoding: str | None) -> str:
     except (UnicodeEncodeError, LookupError):
         return PLAIN
     return BLOCKS
-
-
-def _range(values: Iterable[float]) -> str:
-    """Such as `-1.2..3.4`; empty without a finite value."""
-    finite = [value for value in values if math.isfinite(value)]
-    return f"{min(finite):.4g}..{max(finite):.4g}" if finite else ""
 
 
 def _text(value: Any) -> str:  # noqa: ANN401  the value of any variable
