@@ -265,7 +265,7 @@ class FMIAdapter:
             3.0 20.0
         """
         self._demand(None, "set_input_value")
-        converted = self._arguments.value(self._arguments.input(name), value)
+        converted = self._arguments.value(self._arguments.find(name, self._arguments.inputs, "an input"), value)
         instant = self._arguments.time(time)
         if self._mode == "initialization":
             self._early_inputs.setdefault(name, {})[instant] = converted
@@ -340,7 +340,7 @@ class FMIAdapter:
             CallRefused: the adapter is closed, or there is no such output.
             FmuError: the FMU refuses it; only `close` is allowed now.
         """
-        self._arguments.output(name)
+        self._arguments.find(name, self._arguments.outputs, "an output")
         return self.get_value(name)
 
     def get_value(self, name: str) -> Any:  # noqa: ANN401 what type it is, the FMU says
@@ -351,7 +351,7 @@ class FMIAdapter:
             FmuError: the FMU refuses it; only `close` is allowed now.
         """
         self._demand(None, "get_value")
-        self._arguments.any(name)
+        self._arguments.find(name, self._arguments.all, "a variable")
         self._enter()
         with self._fmu_called():
             return self._instance.get_values([name])[0]

@@ -35,28 +35,16 @@ class Arguments:
         self._tunable = {v.name: v for v in self.parameters.values() if v.variability == "tunable"}
         self._settable = {v.name: v for v in description.variables if v.settable_before_start}
 
-    def any(self, name: str) -> Variable:
-        """The variable called ``name``."""
-        return self._find(name, self.all, "a variable")
-
-    def input(self, name: str) -> Variable:
-        """The input called ``name``."""
-        return self._find(name, self.inputs, "an input")
-
-    def output(self, name: str) -> Variable:
-        """The output called ``name``."""
-        return self._find(name, self.outputs, "an output")
-
     def tunable(self, name: str) -> Variable:
         """The tunable parameter called ``name``."""
-        return self._find(name, self._tunable, "a tunable parameter")
+        return self.find(name, self._tunable, "a tunable parameter")
 
     def settable(self, name: str) -> Variable:
         """The variable called ``name``, which can be set before the start."""
         known = self.all.get(name)
         if known is not None and known.may_take_start_value:
             return known  # FMI forbids some of these, but some FMUs accept them
-        return self._find(name, self._settable, "settable before the start")
+        return self.find(name, self._settable, "settable before the start")
 
     def value(self, variable: Variable, value: Value) -> Value:
         """``value`` as a value of the variable's type and within its range."""
@@ -116,7 +104,8 @@ class Arguments:
     def _having(self, causality: Causality) -> dict[str, Variable]:
         return {variable.name: variable for variable in self._description.with_causality(causality)}
 
-    def _find(self, name: str, allowed: Mapping[str, Variable], role: str) -> Variable:
+    def find(self, name: str, allowed: Mapping[str, Variable], role: str) -> Variable:
+        """The variable called ``name`` among those of a role, which an error names."""
         if name in allowed:
             return allowed[name]
         expected = f"Possible here: {listed(tuple(allowed))}."

@@ -19,7 +19,7 @@ from .. import printing
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
-from ..pictures.tables import shortened, table, width_of
+from ..pictures.tables import shortened, table, width_of, wrapped
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs
 from .output.json_output import print_json
@@ -165,19 +165,7 @@ def page(look: Look, before: Look | None = None, *, width: int | None = None) ->
     if width is None:
         return [", ".join(head), "", *table(rows, heading=_HEADING)]
     head[0] = f"{shortened(status.mesh, width // 2)}: {status.state}"
-    return [*_lines(head, width), "", *_fitted(rows, width)]
-
-
-def _lines(parts: Sequence[str], width: int) -> list[str]:
-    """Parts with commas between them, in as many lines as needed."""
-    lines = [parts[0]]
-    for part in parts[1:]:
-        if len(lines[-1]) + len(part) + 3 > width:
-            lines[-1] += ","
-            lines.append(part)
-        else:
-            lines[-1] += f", {part}"
-    return lines
+    return [*wrapped(head, width), "", *_fitted(rows, width)]
 
 
 def _fitted(rows: list[list[str]], width: int) -> list[str]:

@@ -20,7 +20,7 @@ from ..text import counted
 from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
 from .graph_layout import INITIAL, going_back
 from .graph_pictures import figure_of_drawing, svg_of_drawing
-from .tables import html_table, shortened, table
+from .tables import html_table, shortened, table, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,8 +136,9 @@ class SystemGraph(msgspec.Struct, frozen=True):
                 lines.append(f"group {shortened(group, _COLUMNS - 30)}, one process")
             for node in nodes:
                 lines += self._lines_of(node, indent)
-        if self.cycles:
-            lines += ["", *(line for cycle in self.cycles for line in _wrapped("cycle", cycle))]
+        lines += [""] if self.cycles else []
+        for cycle in self.cycles:
+            lines += wrapped([shortened(name, _NAME) for name in cycle], _COLUMNS, "cycle  ")
         return page(line.rstrip() for line in lines)
 
     def __repr__(self) -> str:
@@ -261,14 +262,3 @@ def _fitted(rows: Sequence[tuple[str, str, str, str]], indent: int) -> list[str]
         f"{shortened(row[0], for_source)} -> {shortened(row[1], room - min(len(row[0]), for_source))}" for row in rows
     ]
     return table([(end, *row[2:]) for end, row in zip(ends, rows, strict=True)], indent=indent)
-
-
-def _wrapped(title: str, names: Sequence[str]) -> list[str]:
-    """Names after a title, in lines of at most 80 columns."""
-    lines = [f"{title} "]
-    for number, name in enumerate(names):
-        text = f" {shortened(name, _NAME)}" + ("," if number < len(names) - 1 else "")
-        if len(lines[-1]) + len(text) > _COLUMNS:
-            lines.append(" " * (len(title) + 1))
-        lines[-1] += text
-    return lines

@@ -8,7 +8,7 @@ from itertools import islice
 
 from ..text import counted, printable
 
-__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "width_of"]
+__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "width_of", "wrapped"]
 
 _GAP = "  "
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -38,6 +38,18 @@ def shortened(name: str, width: int) -> str:
         return name
     kept = max(width - len(_ELLIPSIS), 0)
     return f"{name[: kept - kept // 2]}{_ELLIPSIS}{name[len(name) - kept // 2 :]}"
+
+
+def wrapped(parts: Sequence[str], width: int, front: str = "") -> list[str]:
+    """Parts with commas between them after a front, in lines of at most ``width`` columns, unless a part is longer."""
+    lines = [front + parts[0]]
+    for part in parts[1:]:
+        lines[-1] += ","
+        if len(lines[-1]) + len(f" {part},") > width:
+            lines.append(" " * len(front) + part)
+        else:
+            lines[-1] += f" {part}"
+    return lines
 
 
 def pairs(items: Iterable[tuple[str, str]], *, indent: int = 0) -> list[str]:
