@@ -234,7 +234,6 @@ def _element(path: tuple[str, ...], element: Element, instance: str | None) -> P
 
 def _source(package: Package, path: tuple[str, ...], binding: Binding) -> PackageParameters:
     def inside(file: str) -> str:
-        """A file as the package names it."""
         return file.removeprefix(package.shown("")).lstrip("/")
 
     values, mapping = binding.values, binding.mapping

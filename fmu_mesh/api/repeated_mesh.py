@@ -178,7 +178,6 @@ class _CollectedRows:
             self._file.close()
 
     def result(self, outcome: Outcome) -> Result:
-        """What was recorded."""
         system, file = self._plan.plan.system, self._file.path if self._file is not None else None
         types = types_of(system) or {}
         parts = zip(*self._blocks, strict=True) if self._blocks else [[np.zeros(0, DTYPES[t])] for t in types.values()]

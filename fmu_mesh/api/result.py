@@ -398,7 +398,6 @@ class Result(Mapping[str, NDArray[Any]]):
         return Result(self.title, file=Path(file), outcome=outcome, system=self._system, record=number)
 
     def _drawn(self, other: Result, label: str, names: Sequence[str], x: str | None, *, difference: bool) -> Curves:
-        """What is drawn of a result, in the units of this one."""
         here, there = self._side, other._side
         wanted = [name for name in dict.fromkeys([*names, *([x] if x is not None else [])]) if name in other]
         rows = thinned(other._pieces(), wanted, in_order=x is not None)
@@ -411,7 +410,6 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @property
     def _side(self) -> Side:
-        """This result, as it is compared with another one."""
         return Side(
             str(short_path(self.file)) if self.file is not None else self.title,
             [*self],

@@ -291,7 +291,6 @@ def _end_all() -> None:
 
 
 def _make_folder(folder: Path, plan: RunPlan) -> None:
-    """Make the folder for results that stay in memory."""
     try:
         folder.mkdir(mode=0o700)
     except FileExistsError as error:
@@ -328,7 +327,6 @@ def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:
 
 
 def _log(event: Event) -> None:
-    """Log an event that the program does not ask for."""
     match event:
         case Log(line):
             level = _LEVELS.get(line.status, logging.ERROR)

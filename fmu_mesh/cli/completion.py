@@ -91,7 +91,6 @@ class _Offer(BaseCompleter):
         parser: argparse.ArgumentParser,  # noqa: ARG002 argcomplete passes it
         parsed_args: argparse.Namespace,
     ) -> Iterable[str]:
-        """As argcomplete calls it."""
         try:
             return [name for name in _offered(prefix, action, parsed_args) if name.isprintable()]
         except Exception:  # noqa: BLE001 whatever is wrong with a file, a shell shows no error while somebody types
@@ -156,7 +155,6 @@ def _samplers(_prefix: str, _given: argparse.Namespace) -> list[str]:
 
 
 def _columns(prefix: str, given: argparse.Namespace) -> list[str]:
-    """The variables of a result file, or of a sweep."""
     from ..api.result import Result  # noqa: PLC0415 as above
     from ..sweeps.sweep_folder import is_sweep  # noqa: PLC0415 as above
     from ..sweeps.sweep_result import SweepResult  # noqa: PLC0415 as above
@@ -166,7 +164,6 @@ def _columns(prefix: str, given: argparse.Namespace) -> list[str]:
 
 
 def _descriptions_in(_prefix: str, given: argparse.Namespace) -> Iterable[str]:
-    """The descriptions of the package that an argument names."""
     path = next((path for name in _PACKAGES if (path := getattr(given, name, None)) is not None), None)
     if path is None or (named := named_package(Path(path))) is None:
         return ()

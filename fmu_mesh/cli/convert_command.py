@@ -33,7 +33,6 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 
 def _launch(source: Path, ssd: str | None, target: Path) -> str:
-    """The command that runs what was written."""
     words = ["fmu-mesh", "launch", str(target)]
     named = named_package(source, ssd)
     if named is not None and target.suffix.lower() == ".ssp":

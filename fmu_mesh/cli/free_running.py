@@ -51,7 +51,6 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _mesh(arguments: argparse.Namespace) -> Mesh:
-    """The mesh of this one FMU."""
     simulation = {"stop_time": None, **SIMULATION}
     if arguments.step_size is not None:
         simulation["step_size"] = arguments.step_size

@@ -246,7 +246,6 @@ def _fits(source: str, target: str, descriptions: Mapping[str, ModelDescription]
 
 
 def _about(variable: Variable) -> str:
-    """Unit and description as a comment."""
     words = " ".join((variable.description or "").split())
     text = ", ".join(filter(None, (variable.unit, words)))
     return f"  # {textwrap.shorten(text, _COMMENT, placeholder=' ...')}" if text else ""

@@ -61,7 +61,6 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def _of_files(arguments: argparse.Namespace) -> Figure:
-    """A picture of one or several result files."""
     result, *others = (Result(path.stem, file=path) for path in arguments.results)
     if arguments.difference and (not others or arguments.x is not None):
         hint = "Name two result files." if not others else "Leave --x out."

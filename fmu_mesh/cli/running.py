@@ -79,7 +79,6 @@ def run_mesh(
 
 
 def _show_event(reporter: RunReporter, display: Display, event: Event) -> None:
-    """Show an event of a run, and keep it for the report."""
     reporter.event(event)
     display.event(event)
 

@@ -85,7 +85,6 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 
 def _planned(arguments: argparse.Namespace) -> PlannedSweep:
-    """Plan the sweep, or what is missing of one."""
     given = given_options(arguments, SweepOptions)
     if is_sweep(arguments.config):
         if given.keys() - _OF_FOLDER or any(getattr(arguments, name) for name in ("ssd", "ssv", "vary")):
@@ -171,7 +170,6 @@ def _report(sweep: Sweep | None, error: FmuMeshError | None) -> SweepReport:
 
 
 def _show(sweep: Sweep) -> None:
-    """Print the first failures, the table, and how fast it was."""
     failed, progress = sweep.result.failed, sweep.progress
     warned = [row for row in sweep.result if row.message and not row.exit_code]
     for rows, what in ((failed, "failed"), (warned, "warns")):

@@ -175,7 +175,6 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
     longest = max(len(row[0]) for row in (heading, *rows))
 
     def room() -> int:
-        """Columns for the name and the activity."""
         return width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4  # two gaps
 
     for name in _DISPENSABLE:

@@ -282,7 +282,6 @@ def _drawn_instance(node: GraphNode, plan: _Plan, cycle: int | None, *, is_live:
 
 @lru_cache(maxsize=16)
 def _planned(nodes: tuple[tuple[str, str, str], ...], edges: tuple[GraphEdge, ...], is_live: bool) -> _Plan:  # noqa: FBT001  the cache has it as part of its key
-    """Where everything lies."""
     return _Planning(nodes, edges, is_live=is_live).plan()
 
 
@@ -317,7 +316,6 @@ class _Planning:
         ]
 
     def plan(self) -> _Plan:
-        """All places."""
         outer = list(self._wires)
         inner = {group: self._inside(group, outer) for group in self._members}
         sizes = {

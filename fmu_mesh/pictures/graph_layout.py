@@ -119,7 +119,6 @@ class _Columns:
         self._width = self._height = 0.0
 
     def arrangement(self) -> Arrangement:
-        """Sort, place and connect."""
         self._sort()
         self._align()
         turns = self._turn_corners()
@@ -340,7 +339,6 @@ class _Lanes:
         return self._orders.setdefault(place, {})
 
     def room(self, place: int) -> float:
-        """How much they need."""
         count = len(self.of(place))
         return (count + 1) * self._step(place) if count else 0.0
 

@@ -90,7 +90,6 @@ def _model(plan: Plan, instance: SystemInstance) -> str:
 
 
 def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
-    """Each start value with its unit, and where it was written."""
     rows = [
         [
             f"{instance.name}.{name}",
@@ -142,7 +141,6 @@ def _free_inputs(plan: Plan) -> list[str]:
 
 
 def _scenario(plan: Plan) -> list[str]:
-    """What the scenario sets, and when."""
     rows = []
     for name, instance in plan.system.instances.items():
         for own in instance.scenario:

@@ -161,8 +161,6 @@ def figure_of(results: Sequence[Curves], picture: PictureOptions) -> Figure:
 
 
 class _Drawer:
-    """Draws one picture."""
-
     def __init__(self, figure: Figure, results: Sequence[Curves], picture: PictureOptions) -> None:
         self._figure, self._results, self._picture = figure, results, picture
         self._names = [
@@ -175,7 +173,6 @@ class _Drawer:
             raise CallRefused(f"'{x}' has texts, which are no horizontal axis", variable=x)
 
     def draw(self) -> None:
-        """Lay out the axes and draw into them."""
         panels = self._panels()
         least = _AXES_INCHES[1] * min(1.0, _FEW_AXES / len(panels))
         several = len(self._results) if len(self._results) > 1 else 0

@@ -270,7 +270,6 @@ class _Scale(NamedTuple):
         return cls(title, [float(place) for place in range(len(texts))], texts, logarithmic=False)
 
     def places(self, values: Sequence[PlainValue]) -> list[float]:
-        """The place of each value."""
         if not self.texts:
             return [float(value) for value in values if isinstance(value, int | float)]
         places = dict(zip(self.texts, self.marks, strict=True))

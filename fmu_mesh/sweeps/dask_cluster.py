@@ -77,7 +77,6 @@ class _DaskExecutor(Executor):
         self._under_way: dict[Future[Any], Any] = {}  # Dask forgets a job whose future is gone
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:  # noqa: ANN401  those of any function
-        """Run a job on any worker."""
         future: Future[T] = Future()
         self._under_way[future] = job = self._client.submit(fn, *args, pure=False, **kwargs)
         job.add_done_callback(partial(self._settle, future))

@@ -177,7 +177,6 @@ def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, fun
 
 
 def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
-    """Check that each parameter names a start value or a key of the configuration."""
     sections = [field.encode_name for field in msgspec.structs.fields(Config)]
     for name in names:
         first, dot, rest = name.partition(".")
@@ -267,7 +266,6 @@ def _usual_folder(mesh: Mesh, base: Mapping[str, Any]) -> Path:
 
 
 def _units(plan: RunPlan, names: Sequence[str]) -> dict[str, str | None]:
-    """The units of what is recorded, and of the parameters that are start values."""
     units = Result(plan.mesh, system=plan.plan.system).units
     for name in names:
         instance, _, variable = name.partition(".")

@@ -232,7 +232,6 @@ def _check_option(option: str) -> None:
 
 
 def _submitted(script: Path) -> str:
-    """What `sbatch` has printed for a script."""
     try:
         code, printed, errors = _run(["sbatch", "--parsable", script.name], _SUBMIT_S, folder=script.parent)
     except DeadlineExceeded as error:

@@ -101,7 +101,6 @@ class SlurmSweep(Sweep):
         return job
 
     def _run(self) -> None:
-        """See `Sweep`."""
         if self.job is not None:
             with self._table():
                 self._follow(self.job)

@@ -286,7 +286,6 @@ class SweepResult(Sequence[SweepRow]):
         return VariantCurve(result.times, result[name], colour)
 
     def _axis(self, name: str) -> str:
-        """The label of an axis."""
         unit = self._wanted.units.get(name)
         return in_unit(name, unit or "")
 

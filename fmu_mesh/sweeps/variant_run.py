@@ -152,7 +152,6 @@ class _Mine(threading.local):
         self._loaded: _Loaded | None = None
 
     def loaded_for(self, task: bytes) -> _Loaded:
-        """The models of a task."""
         if self._loaded is None or self._loaded.task != task or self._loaded.stuck:
             self._loaded = _Loaded(task)
         return self._loaded
@@ -193,7 +192,6 @@ class _Loaded:
         return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
 
     def run(self, identity: str, parameters: Parameters) -> Result:
-        """Run a variant."""
         task = self._task
         if task.version != __version__:
             raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
@@ -242,7 +240,6 @@ class _Hung:
         self._end: Result | BaseException | None = None
 
     def begin(self, ended: Future[Result]) -> None:
-        """A run begins."""
         self.ended, self._end = ended, None
 
     def over(self, end: Result | BaseException) -> None:

@@ -129,7 +129,6 @@ class _Worker:
         return started[-1].pid if started else None
 
     def submit(self, function: Callable[[], T]) -> Future[T]:
-        """Add a job."""
         job = _Job(function, Future())
         with self._changing:
             self.jobs.append(job)
@@ -137,7 +136,6 @@ class _Worker:
         return job.future
 
     def replace(self) -> None:
-        """End the process."""
         with self._changing:
             if self._closed:
                 return
@@ -150,7 +148,6 @@ class _Worker:
         old.shutdown(wait=False, cancel_futures=True)
 
     def shutdown(self, *, wait: bool, now: bool) -> None:
-        """End the process."""
         with self._changing:
             self._closed = True
             jobs = list(self.jobs) if now else []
@@ -217,7 +214,6 @@ class _Context(ForkServerContext):
         return self.started[-1]
 
     def kill(self) -> None:
-        """Kill the process."""
         for process in self.started:
             with suppress(ValueError):  # it is closed
                 process.kill()

@@ -163,7 +163,6 @@ class Display:
         self._print(f"{where}: {paragraph(line.message)}", style)
 
     def _output(self, name: str, text: str) -> None:
-        """Show a line of the output of a process."""
         if text:
             self._print(printable(text.expandtabs()), front=f"{name} | ")
 

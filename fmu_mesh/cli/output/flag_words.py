@@ -44,5 +44,4 @@ def _flag(name: str, value: str | None) -> str:
 
 
 def _value(text: str) -> str:
-    """A value as the command line takes it."""
     return text.strip("[]'").replace("', '", ", ").removesuffix(".0")
