@@ -20,9 +20,9 @@ __all__ = [
     "PACKAGE",
     "QUIET",
     "SSD",
+    "ArgumentPart",
     "CommandParser",
     "Parsers",
-    "Part",
     "Runs",
     "argument",
     "count",
@@ -88,7 +88,7 @@ class CommandParser(argparse.ArgumentParser):
         return [name for name, action in self._option_string_actions.items() if action.help != argparse.SUPPRESS]
 
 
-class Part(Protocol):
+class ArgumentPart(Protocol):
     """Adds an argument, or several, to a command or to a group of its arguments."""
 
     def __call__(self, parser: argparse._ActionsContainer, /) -> object:
@@ -97,21 +97,21 @@ class Part(Protocol):
 
 Runs = Mapping[str, Callable[[argparse.Namespace], int]]
 """What a module of commands offers: for each command the function that runs it and returns the exit code."""
-Parsers = Mapping[str, Sequence[Part]]
+Parsers = Mapping[str, Sequence[ArgumentPart]]
 """What a module of arguments offers: for each command its arguments, in the order of the help."""
 
 
-def argument(name: str, metavar: str, text: str, **details: Any) -> Part:  # noqa: ANN401 the arguments of argparse
+def argument(name: str, metavar: str, text: str, **details: Any) -> ArgumentPart:  # noqa: ANN401 the arguments of argparse
     """An argument with a value: its name, what stands for the value in the help, and the help."""
     return lambda parser: parser.add_argument(name, metavar=metavar, help=text, **details)
 
 
-def switch(*names: str, text: str) -> Part:
+def switch(*names: str, text: str) -> ArgumentPart:
     """A flag without a value."""
     return lambda parser: parser.add_argument(*names, action="store_true", help=text)
 
 
-def group(title: str, *parts: Part) -> Part:
+def group(title: str, *parts: ArgumentPart) -> ArgumentPart:
     """Arguments with a title in the help."""
 
     def add(parser: argparse._ActionsContainer) -> None:
@@ -122,12 +122,12 @@ def group(title: str, *parts: Part) -> Part:
     return add
 
 
-def json_switch(text: str = "JSON, one object per line") -> Part:
+def json_switch(text: str = "JSON, one object per line") -> ArgumentPart:
     """`--json`."""
     return switch("--json", text=text)
 
 
-def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[Part, Part]:
+def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ArgumentPart]:
     """The flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
     where = "Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host"
     return (

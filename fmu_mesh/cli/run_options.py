@@ -12,7 +12,7 @@ from ..config.call_options import CallOptions, option_fields
 from ..config.mesh import MAX_WINDOW
 from ..errors import ConfigurationError
 from ..run.options import PlanOptions, RunOptions
-from .arguments import PACKAGE, Part, argument, count, endpoint, group, number, whole
+from .arguments import PACKAGE, ArgumentPart, argument, count, endpoint, group, number, whole
 from .output.terminal import teller
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def add_options(
         parser.add_argument(flag, **details)
 
 
-def options(*names: str, of: type[CallOptions] = RunOptions, **words: Mapping[str, str]) -> Part:
+def options(*names: str, of: type[CallOptions] = RunOptions, **words: Mapping[str, str]) -> ArgumentPart:
     """The flags of options; see `add_options`."""
     return lambda parser: add_options(parser, *names, options=of, **words)
 
