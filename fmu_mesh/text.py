@@ -18,6 +18,7 @@ __all__ = [
     "EXPRESSION",
     "WILDCARDS",
     "counted",
+    "did_you_mean",
     "is_pattern",
     "listed",
     "matched",
@@ -64,6 +65,12 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
         longer = [candidate for candidate in folded if candidate.startswith(wanted)]
         close = longer if len(longer) == 1 else []
     return folded[close[0]] if close else None
+
+
+def did_you_mean(name: str, names: Iterable[str], otherwise: str | None = None) -> str | None:
+    """The hint for a name that is not there: the most similar one, or something else if none is similar."""
+    near = nearest(name, names)
+    return f"Did you mean '{near}'?" if near is not None else otherwise
 
 
 def nearest_file(path: Path) -> str | None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import CallRefused
-from ..text import listed, nearest
+from ..text import did_you_mean, listed
 from ..variables.model_description import Causality, ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
 from .times import Instant, RosStamp, RosTime, Time, instant_of
@@ -113,10 +113,9 @@ class Arguments:
         if known is not None:
             kind = f"{known.variability} {known.causality}"
             raise self.refusal(f"this {kind} is not {role}.", expected, name)
-        near = nearest(str(name), allowed)
         if (clock := self._description.clock(str(name))) is not None:
             raise self.refusal(f"{clock}.")
-        raise self.refusal(f"there is no variable '{name}'.", f"Did you mean '{near}'?" if near else expected)
+        raise self.refusal(f"there is no variable '{name}'.", did_you_mean(str(name), allowed, expected))
 
 
 def _plain(value: object) -> object:

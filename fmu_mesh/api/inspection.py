@@ -19,7 +19,7 @@ from ..instances.registry import KINDS, describe
 from ..pictures.tables import html_table, pairs
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package
-from ..text import counted, listed, matching, nearest, nearest_file, short_number, shown
+from ..text import counted, did_you_mean, listed, matching, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 
 __all__ = ["SHOWN_VARIABLES", "Inspection", "inspect", "with_way_out"]
@@ -90,9 +90,7 @@ class Inspection(msgspec.Struct, frozen=True, omit_defaults=False):
             if (clock := self.description.clock(pattern)) is not None:
                 raise UnknownName(f"{clock}.", hint="The page without `--variables` lists the clocks.")
             if not matching(pattern, names):
-                near = nearest(pattern, names)
-                hint = f"Did you mean '{near}'?" if near else None
-                raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=hint)
+                raise UnknownName(f"'{self.file}' has no variable '{pattern}'", hint=did_you_mean(pattern, names))
         return page(_page(self, width, variables, everything=everything))
 
     def __str__(self) -> str:

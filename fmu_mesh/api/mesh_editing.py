@@ -20,7 +20,7 @@ from ..config.loading import PlainConfig
 from ..config.plain_values import plain as plain_value
 from ..errors import CallRefused, ConfigurationError, UnknownName
 from ..instances.configuration import examine_data
-from ..text import listed, nearest, shown
+from ..text import did_you_mean, listed, shown
 
 __all__ = [
     "check_part",
@@ -169,8 +169,7 @@ def ends_of(connection: Any) -> tuple[Any, Any]:  # noqa: ANN401  as a file has 
 
 def unknown(what: str, name: str, there: Sequence[str]) -> UnknownName:
     """The error for a name that is not there; suggests the nearest one."""
-    near = nearest(name, there)
-    return UnknownName(what, hint=f"Did you mean '{near}'?" if near else f"There are: {listed(there)}.")
+    return UnknownName(what, hint=did_you_mean(name, there, f"There are: {listed(there)}."))
 
 
 def _is_inside(path: str, outer: str) -> bool:

@@ -30,7 +30,7 @@ from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..system.settable import check_settable, sources_of, why_not_settable
-from ..text import listed, nearest, option_text, shown
+from ..text import did_you_mean, listed, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
 from ..variables.value_types import DTYPES
@@ -353,8 +353,7 @@ class System:
         instances = self._run.plan.system.instances
         instance, _, rest = str(name).partition(".")
         if instance not in instances:
-            near = nearest(instance, instances)
-            hint = f"Did you mean '{near}'?" if near else f"There are {listed(list(instances))}."
+            hint = did_you_mean(instance, instances, f"There are {listed(list(instances))}.")
             raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
         description = instances[instance].description
         variable = description.variable_of(rest) if elements else description.variable(rest)

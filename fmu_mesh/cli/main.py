@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import ConfigurationError, FmuMeshError
 from ..printing import guard_streams
 from ..run.limits import needed_mib
-from ..text import nearest
+from ..text import did_you_mean
 from .arguments import CommandParser, Runs
 
 __all__ = ["COMMANDS", "command_parser", "main"]
@@ -132,11 +132,9 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
 def _unknown(name: str) -> ConfigurationError:
     """The error for a first argument that is not a command, such as a file."""
     suffix = PurePath(name).suffix
-    near = nearest(name, COMMANDS)
+    hint = did_you_mean(name, COMMANDS, "`fmu-mesh --help` lists them.")
     if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
         hint = f"Did you mean `fmu-mesh {'simulate' if suffix == '.fmu' else 'launch'} {name}`?"
-    else:
-        hint = f"Did you mean '{near}'?" if near is not None else "`fmu-mesh --help` lists them."
     return ConfigurationError(f"there is no command '{name}'.", hint=hint)
 
 

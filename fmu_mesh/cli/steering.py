@@ -13,7 +13,7 @@ from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import ConfigurationError, Interrupted
 from ..ros.bags.play_options import PlayOptions
-from ..text import listed, nearest
+from ..text import did_you_mean, listed
 from .arguments import Runs, whole
 from .mesh_arguments import LEVELS
 from .output.json_output import print_json
@@ -62,8 +62,7 @@ def _wait(arguments: argparse.Namespace) -> int:
 def _logs(arguments: argparse.Namespace) -> int:
     with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
         if arguments.instance is not None and arguments.instance not in (names := run.info().instances):
-            near = nearest(arguments.instance, names)
-            hint = f"Did you mean '{near}'?" if near is not None else f"There are: {listed(names)}."
+            hint = did_you_mean(arguments.instance, names, f"There are: {listed(names)}.")
             raise ConfigurationError(f"mesh '{run.name}' has no instance '{arguments.instance}'.", hint=hint)
         try:
             for line in run.logs(follow=arguments.follow):

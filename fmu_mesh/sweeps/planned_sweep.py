@@ -24,11 +24,11 @@ from ..run.allowed_code import check_owner
 from ..run.one_process import apart
 from ..run.options import VariantOptions
 from ..run.run_plan import RunPlan
-from ..text import listed, nearest
+from ..text import did_you_mean, listed, nearest
 from .reductions import check_reductions, read_reduction
 from .sweep_folder import SweepFolder, Wanted, identity_of, is_sweep
 from .sweep_options import Own, SweepOptions
-from .variant_run import Common, OwnReductions, Row, SweepTask, encoded_task, options_of_variant
+from .variant_run import Common, OwnReductions, Row, SweepTask, curves_of, options_of_variant
 from .variants import Parameters, variants_of
 
 __all__ = ["Own", "PlannedSweep", "SweepOptions", "continued_sweep", "planned_sweep"]
@@ -160,7 +160,7 @@ def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, fun
 
     def is_kept(row: Row) -> bool:
         """What failed may be right now, unless an FMU failed: that would fail again."""
-        has_curves = not wanted.curves or folder.curves_of(row.id).is_file()
+        has_curves = not wanted.curves or curves_of(folder.curves, row.id).is_file()
         is_whole = row.exit_code == 0 and has_curves and set(columns) <= {*row.values}
         return is_whole or row.exit_code == FmuError.exit_code
 
@@ -170,7 +170,7 @@ def _planned(mesh: Mesh, plan: RunPlan, wanted: Wanted, folder: SweepFolder, fun
         plan=plan,
         columns=columns,
         functions=functions,
-        task=encoded_task(task),
+        task=msgspec.msgpack.encode(task, enc_hook=str),
         at_once=_at_once(plan, wanted.most_instances),
         found={identity: row for identity, row in folder.rows().items() if is_kept(row)},
     )
@@ -245,8 +245,7 @@ def _at_once(plan: RunPlan, most_instances: Mapping[str, int]) -> int | None:
     for name, most in most_instances.items():
         needed = models.count(name)
         if not needed:
-            near = nearest(name, models)
-            hint = f"Did you mean '{near}'?" if near else f"There are {listed(sorted({*models}))}."
+            hint = did_you_mean(name, models, f"There are {listed(sorted({*models}))}.")
             raise ConfigurationError(f"no instance has the model '{name}'", hint=hint)
         if most < needed:
             text = f"one run needs {needed} instances of '{name}', and {most} may exist at a time"

@@ -27,7 +27,7 @@ import msgspec
 
 from ..errors import ConfigurationError
 from ..files import decoded_json, is_file, replaced, write_whole
-from .variant_run import Cell, Common, Row, curves_of, path_of
+from .variant_run import Cell, Common, Row, path_of
 from .variants import Parameters
 
 __all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
@@ -80,10 +80,6 @@ class SweepFolder:
         self.table = path / _TABLE
         self.curves = path / _CURVES
         self.wanted_file = path / _WANTED
-
-    def curves_of(self, identity: str) -> Path:
-        """The file with the curves of a run."""
-        return curves_of(self.curves, identity)
 
     def begin(self, wanted: Wanted) -> None:
         """Make the folder, and write down what is asked."""

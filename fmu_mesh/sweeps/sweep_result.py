@@ -16,9 +16,9 @@ from ..pictures.result_drawing import in_unit
 from ..pictures.sweep_drawing import VariantCurve, curves_figure, heat_map_figure
 from ..pictures.tables import html_table
 from ..system.system import ResolvedSystem
-from ..text import listed, nearest
+from ..text import did_you_mean, listed
 from .sweep_folder import SweepFolder, Wanted, cells_of
-from .variant_run import Cell, Row
+from .variant_run import Cell, Row, curves_of
 from .variants import Parameters
 
 if TYPE_CHECKING:
@@ -216,8 +216,7 @@ class SweepResult(Sequence[SweepRow]):
         if name in self.columns:
             return [row.values.get(name) for _, row in self._found]
         there = [*self.names, *self.columns]
-        near = nearest(name, there)
-        hint = f"Did you mean '{near}'?" if near else f"There are {listed(there)}."
+        hint = did_you_mean(name, there, f"There are {listed(there)}.")
         raise UnknownName(f"the sweep has no parameter or column '{name}'", hint=hint)
 
     def curves(self, index: int) -> Result:
@@ -293,14 +292,10 @@ class SweepResult(Sequence[SweepRow]):
         return SweepRow(
             variant=number,
             parameters=self._wanted.parameters(number),
-            exit_code=row.exit_code,
-            message=row.message,
-            values=row.values,
-            seconds=row.seconds,
-            worker=row.worker,
             file=self._curves_of(row),
+            **{name: getattr(row, name) for name in ("exit_code", "message", "values", "seconds", "worker")},
         )
 
     def _curves_of(self, row: Row) -> Path | None:
-        file = self._folder.curves_of(row.id)
+        file = curves_of(self._folder.curves, row.id)
         return file if self._wanted.curves and file.is_file() else None

@@ -257,9 +257,10 @@ class ExecutorSweep(Sweep):
     ) -> None:
         super().__init__(planned, part)
         self._executor = executor
-        self._workers = max(
-            1, min(workers or usual_workers(planned), len(self._waiting), planned.at_once or len(self._waiting))
-        )
+        if not workers:  # one for each processor that this process may use; fewer where a run has several processes
+            processes = len(planned.plan.plan.nodes) + 1 if planned.wanted.processes else 1
+            workers = len(os.sched_getaffinity(0)) // processes
+        self._workers = max(1, min(workers, len(self._waiting), planned.at_once or len(self._waiting)))
         self._tries: Counter[int] = Counter()
         self._ended: SimpleQueue[Future[Row]] = SimpleQueue()
         self._thread.start()
@@ -382,9 +383,3 @@ def sweep(
         raise CallRefused(text, hint=_GUARD)
     planned = planned_sweep(mesh, vary, **options.given())
     return ExecutorSweep(planned, executor=options.executor, workers=options.workers)
-
-
-def usual_workers(planned: PlannedSweep) -> int:
-    """One worker for each processor that this process may use; fewer where a run has several processes."""
-    processors = len(os.sched_getaffinity(0))
-    return processors // (len(planned.plan.plan.nodes) + 1) if planned.wanted.processes else processors

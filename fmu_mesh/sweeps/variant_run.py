@@ -32,7 +32,7 @@ from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
 
-__all__ = ["Common", "Row", "SweepTask", "curves_of", "encoded_task", "options_of_variant", "path_of", "run_variant"]
+__all__ = ["Common", "Row", "SweepTask", "curves_of", "options_of_variant", "path_of", "run_variant"]
 
 _GROWTH_BYTES = 256 * 2**20
 
@@ -100,11 +100,6 @@ class Row(msgspec.Struct, frozen=True):
     worker: str
     spent: bool = False
     machine: str = ""
-
-
-def encoded_task(task: SweepTask) -> bytes:
-    """A task for `run_variant`."""
-    return msgspec.msgpack.encode(task, enc_hook=str)
 
 
 def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:

@@ -20,6 +20,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
+from fmu_mesh.sweeps.variant_run import curves_of
 from fmu_mesh.sweeps.worker_pool import WorkerLost, WorkerPool
 from fmus.build import build
 from tests.fmus.helpers import NO_COMPILER
@@ -268,7 +269,7 @@ def test_resume_runs_what_is_missing_and_the_table_is_the_same(config: Path, tmp
     (folder.path / "rows.jsonl").write_bytes(torn)  # killed while it wrote the sixth row
     identities = SweepFolder(folder.path).wanted().identities
     lost = next(identity for identity in identities if identity in torn.decode())
-    folder.curves_of(lost).unlink()
+    curves_of(folder.curves, lost).unlink()
 
     with fmu_mesh.sweep(config, VARY, reduce=REDUCE, folder=folder.path, resume=True) as running:
         result = running.wait(DEADLINE_S)

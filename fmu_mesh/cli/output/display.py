@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
-from ...errors import FmuMeshError, from_report
+from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
 from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
@@ -87,8 +87,8 @@ class Display:
                 self._status(status)
             case Log(line):
                 self.log(line)
-            case OutputLine(process, text):
-                self._output(process, text)
+            case OutputLine(process, text) if text:
+                self._print(printable(text.expandtabs()), front=f"{process} | ")
             case Restarted(error, number, most):
                 again = f"The run starts again from its first point (restart {number} of {most})."
                 say(str(from_report(error).instead_of_hint(again)))
@@ -115,13 +115,9 @@ class Display:
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
         if outcome.ended_by is not None and not self._quiet:
-            self.ended(from_report(outcome.ended_by))
+            self._print(str(from_report(outcome.ended_by)))
         for warning in outcome.warnings if outcome.state == "failed" else ():
             say(f"warning: {warning}")
-
-    def ended(self, early: FmuMeshError) -> None:
-        """Show why a run ended before its last point without a failure."""
-        self._print(str(early))
 
     def log(self, line: LogLine) -> None:
         """Show one log message of an FMU. After five times, the same text is only counted.
@@ -161,10 +157,6 @@ class Display:
         style = _STYLES.get(line.status, "dim")
         where = f"{line.instance} at point {line.point}"
         self._print(f"{where}: {paragraph(line.message)}", style)
-
-    def _output(self, name: str, text: str) -> None:
-        if text:
-            self._print(printable(text.expandtabs()), front=f"{name} | ")
 
     def _print(self, text: str, style: str = "", *, front: str = "") -> None:
         """Print printable text, after a dim ``front``; nobody needs it so much that a full disk ends the run."""
