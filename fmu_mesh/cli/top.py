@@ -19,7 +19,7 @@ from .. import printing
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
-from ..pictures.tables import shortened, table, width_of, wrapped
+from ..pictures.tables import shortened, table, wrapped
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs
 from .output.json_output import print_json
@@ -175,7 +175,8 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
     longest = max(len(row[0]) for row in (heading, *rows))
 
     def room() -> int:
-        return width - width_of([row[1:-1] for row in rows], heading[1:-1]) - 4  # two gaps
+        others = table([row[1:-1] for row in rows], heading=heading[1:-1])
+        return width - max(map(len, others), default=0) - 4  # two gaps
 
     for name in _DISPENSABLE:
         if room() >= min(longest, _LEAST_NAME if name == "state" else _GOOD_NAME) + _LEAST_ACTIVITY:

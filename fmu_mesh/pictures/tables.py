@@ -8,7 +8,7 @@ from itertools import islice
 
 from ..text import counted, printable
 
-__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "width_of", "wrapped"]
+__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "wrapped"]
 
 _GAP = "  "
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -24,11 +24,6 @@ def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None
         cells.insert(0, list(heading))
     widths = {column: max(len(row[column]) for row in cells) for column in shown}
     return [" " * indent + _GAP.join(row[column].ljust(widths[column]) for column in shown).rstrip() for row in cells]
-
-
-def width_of(rows: Iterable[Sequence[str]], heading: Sequence[str]) -> int:
-    """The width of a table in columns of a terminal."""
-    return max(map(len, table(rows, heading=heading)), default=0)
 
 
 def shortened(name: str, width: int) -> str:

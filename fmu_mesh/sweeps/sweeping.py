@@ -54,12 +54,7 @@ _GUARD: Final = 'Write `if __name__ == "__main__":` before what your program doe
 
 
 class SweepPart(NamedTuple):
-    """One of several parts of a sweep, such as a task of an array of jobs.
-
-    Attributes:
-        number: from 1 on.
-        of: how many there are.
-    """
+    """One of several parts of a sweep, numbered from 1 on, such as a task of an array of jobs."""
 
     number: int
     of: int
