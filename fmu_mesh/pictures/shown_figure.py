@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from io import BytesIO
 
 from matplotlib.figure import Figure
-
-from .drawing import silently
 
 __all__ = ["ShownFigure"]
 
@@ -20,6 +19,7 @@ class ShownFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         picture = BytesIO()
-        with silently():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a character that is not in the font is drawn as a box
             self.savefig(picture, format="png")
         return picture.getvalue()
