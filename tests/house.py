@@ -389,7 +389,6 @@ ALLOWED: dict[str, dict[str, str]] = {
     },
     "small_modules_with_one_importer": {
         "pictures/shown_figure.py": "it derives from a class of matplotlib, which is an extra, and slow to import",
-        "api/offered_variables.py": "the command line reads models only through the library",
     },
     "large_modules": {
         "adapter/adapter.py": "one public class, and half of it are docstrings",

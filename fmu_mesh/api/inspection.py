@@ -13,18 +13,25 @@ import msgspec
 from .. import files
 from ..config.call_options import checked
 from ..config.instance_sections import KIND
+from ..config.loading import LoadedConfig
 from ..errors import CallRefused, LoadFailed, UnknownName
-from ..instances.fmi.archive.archive import sha256_of, size_of
-from ..instances.fmi.archive.reading import read_description
-from ..instances.fmi.archive.system_libraries import missing_libraries
+from ..instances.configuration import examine_data
 from ..instances.registry import KINDS, describe
 from ..pictures.tables import html_table, pairs
 from ..printing import page, printable
-from ..ssp.configuration_files import names_package
+from ..ssp.configuration_files import names_package, read_configuration
 from ..text import counted, did_you_mean, listed, matching, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 
-__all__ = ["SHOWN_VARIABLES", "Inspection", "inspect", "with_way_out"]
+__all__ = [
+    "SHOWN_VARIABLES",
+    "Inspection",
+    "inspect",
+    "readable_configuration",
+    "variables_of_fmu",
+    "variables_of_instance",
+    "with_way_out",
+]
 
 SHOWN_VARIABLES: Final = 20
 """Variables of one causality on a page that does not list all."""
@@ -139,6 +146,8 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
         LoadFailed: it is no such model; says why.
         CallRefused: no installed package offers this kind.
     """
+    from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of  # noqa: PLC0415 it imports FMPy
+
     file, names = Path(path), KINDS.names()
     if kind is not None and kind not in names:
         raise CallRefused(f"no installed package offers the kind of instance '{kind}'; there are {listed(names)}")
@@ -309,3 +318,24 @@ def _start(variable: Variable) -> str:
             item = next((item for item, value in variable.items if value == start), None)
             text = f"{item} ({start})" if item is not None else shown(start)
     return f"= {text} {unit}".rstrip()
+
+
+# --- to complete names: a wrong part of a file hides no other, and no code runs
+
+
+def readable_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str] = ()) -> LoadedConfig:
+    """What can be read of a configuration; see `read_configuration`."""
+    return examine_data(read_configuration(path, ssd, ssv))[0]
+
+
+def variables_of_instance(loaded: LoadedConfig, name: str) -> tuple[Variable, ...]:
+    """The variables of an instance; none if there is no such instance, or only its code knows them."""
+    section = loaded.config.instances.get(name)
+    if section is None or section.names_code or section.interpreter is not None:
+        return ()
+    return describe(loaded.resolve(section.path), section, loaded.config.limits).variables
+
+
+def variables_of_fmu(path: Path) -> tuple[Variable, ...]:
+    """The variables of an FMU."""
+    return describe(path, msgspec.convert({KIND: "fmu", "fmu": str(path)}, KINDS.section("fmu"))).variables

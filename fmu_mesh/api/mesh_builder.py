@@ -30,6 +30,7 @@ from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
 from ..variables.model_description import ModelDescription
+from .inspection import with_way_out
 from .mesh_check import Check, check_of
 from .mesh_editing import (
     check_part,
@@ -164,8 +165,6 @@ class Mesh:
         try:
             description = known.describe(file, own, LimitsConfig(), on_notice)
         except LoadFailed as error:
-            from .inspection import with_way_out  # noqa: PLC0415  it imports FMPy
-
             raise with_way_out(error, file) from error
         own_name = name if name is not None else description.model_identifier
         given = simulation(description) if callable(simulation) else simulation

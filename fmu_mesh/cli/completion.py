@@ -20,7 +20,7 @@ from argcomplete.finders import CompletionFinder
 from argcomplete.shell_integration import shellcode
 from msgspec.structs import fields
 
-from ..api.offered_variables import readable_configuration, variables_of_fmu, variables_of_instance
+from ..api.inspection import readable_configuration, variables_of_fmu, variables_of_instance
 from ..config.mesh import Config, SimulationConfig
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
