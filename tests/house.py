@@ -391,7 +391,6 @@ ALLOWED: dict[str, dict[str, str]] = {
         "pictures/shown_figure.py": "it derives from a class of matplotlib, which is an extra, and slow to import",
     },
     "large_modules": {
-        "adapter/adapter.py": "one public class, and half of it are docstrings",
         "instances/fmi/fmu_instance.py": "one class",
         "api/mesh_builder.py": "one public class, and half of it are docstrings with examples",
         "api/result.py": "one public class, and half of it are docstrings with examples",

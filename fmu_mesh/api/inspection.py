@@ -146,7 +146,9 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
         LoadFailed: it is no such model; says why.
         CallRefused: no installed package offers this kind.
     """
-    from ..instances.fmi import missing_libraries, read_description, sha256_of, size_of  # noqa: PLC0415 it imports FMPy
+    from ..instances.fmi.archive.archive import sha256_of, size_of  # noqa: PLC0415  these import FMPy
+    from ..instances.fmi.archive.reading import read_description  # noqa: PLC0415  as above
+    from ..instances.fmi.archive.system_libraries import missing_libraries  # noqa: PLC0415  as above
 
     file, names = Path(path), KINDS.names()
     if kind is not None and kind not in names:
