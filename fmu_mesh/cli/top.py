@@ -129,12 +129,12 @@ def _follow(run: Run, courses: _Courses, *, as_json: bool) -> int:
         while not ended.is_set():
             try:
                 look = run.all_status()
-            except MeshLost:
-                break
             except DeadlineExceeded:
                 if ended.is_set():
                     break
                 raise
+            except MeshLost:  # it has ended since
+                break
             if not screen.drawn:
                 _show_once(look, courses, as_json=as_json)
             for _ in range(courses.per_look):
