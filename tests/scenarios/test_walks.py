@@ -10,7 +10,7 @@ from tests.walks import WALKS, walked
 MOST = {
     "start value": (36, 102),
     "SSP parameter": (45, 121),
-    "error of a component": (28, 70),
+    "error of a component": (29, 70),
 }
 
 
