@@ -102,10 +102,9 @@ def _names(variables: int) -> list[str]:
 def _writer(format_: str, path: Path, variables: int) -> _Writer:
     if format_.startswith("hdf5"):
         return _Hdf5(path, [f"model.{name}" for name in _names(variables)], format_.partition("-")[2] or None)
-    from fmu_mesh.results.formats import result_format  # noqa: PLC0415  as above
-
     from fmu_mesh.config.loading import LoadedConfig, read_text  # noqa: PLC0415  what a format costs counts for it alone
     from fmu_mesh.instances.configuration import examine_data  # noqa: PLC0415  as above
+    from fmu_mesh.results.formats import result_format  # noqa: PLC0415  as above
     from fmu_mesh.results.recording import Recording  # noqa: PLC0415  as above
     from fmu_mesh.variables.model_description import ModelDescription, Variable  # noqa: PLC0415  as above
 

@@ -10,12 +10,12 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from fmu_mesh.results.formats import followed
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError, Finding, FmuMeshError
 from fmu_mesh.results.csv_file import CsvFile
+from fmu_mesh.results.formats import followed
 from fmu_mesh.results.parquet_file import ParquetFile
 from fmu_mesh.ros.bags.bag import Bag
 from fmu_mesh.ros.bags.mcap_file import McapFile

@@ -11,10 +11,10 @@ import signal
 from pathlib import Path
 
 import pytest
-from fmu_mesh.results.formats import result_format
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.results.formats import result_format
 from tests.helpers import Place, wait_until, write_config
 
 KILLS = int(os.environ.get("FMU_MESH_KILLS", "3"))

@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from fmu_mesh.results.formats import check_record
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -22,6 +21,7 @@ from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.instances.configuration import installed_config
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
 from fmu_mesh.instances.registry import KINDS
+from fmu_mesh.results.formats import check_record
 from fmu_mesh.system.system import build
 from fmu_mesh.text import nearest, option_text
 from fmu_mesh.variables.model_description import ModelDescription, Variable

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fmu_mesh.results.formats import read_result
 from numpy.typing import NDArray
 
 from fmu_mesh.files import Kept
 from fmu_mesh.results.arrays_file import ArraysFile
+from fmu_mesh.results.formats import read_result
 from fmu_mesh.variables.value_types import VariableType
 
 TYPES: dict[str, VariableType] = {"a.x": "Float64", "a.flag": "Boolean", "a.text": "String"}

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fmu_mesh.results.formats import followed
 
 from fmu_mesh.dashboard.result_source import as_floats
+from fmu_mesh.results.formats import followed
 from fmu_mesh.results.recording import Columns, Tail
 
 HEADING = b'time,a.x,"a.der(x,2)",a.flag\n'

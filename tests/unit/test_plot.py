@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fmu_mesh.results.formats import read_result
 from matplotlib import image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,6 +25,7 @@ from fmu_mesh.cli.plotting import plot_results, plotted_where_it_ends
 from fmu_mesh.errors import ConfigurationError, StepFailed
 from fmu_mesh.pictures.drawing import reduced
 from fmu_mesh.pictures.result_drawing import Curves, PictureOptions, figure_of
+from fmu_mesh.results.formats import read_result
 from fmu_mesh.results.recording import Columns
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.system.records import RecordPlan

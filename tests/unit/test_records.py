@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fmu_mesh.results.formats import result_endings
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,6 +13,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.loading import LoadedConfig, read_text
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data
+from fmu_mesh.results.formats import result_endings
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.overriding import with_options
 from fmu_mesh.system.records import RecordPlan

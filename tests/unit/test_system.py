@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fmu_mesh.results.formats import check_record, warn_of_endings
 from msgspec.structs import replace
 
 from fmu_mesh.config.loading import LoadedConfig, read_file
 from fmu_mesh.config.yaml_text import resolve
 from fmu_mesh.errors import ConfigurationError, Finding
 from fmu_mesh.instances.configuration import examine_data
+from fmu_mesh.results.formats import check_record, warn_of_endings
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.system import ResolvedSystem, build
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType

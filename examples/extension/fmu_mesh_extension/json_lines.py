@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from fmu_mesh.results.tails import LineTail
 from numpy.typing import NDArray
 
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept, open_alone, opened
 from fmu_mesh.results.recording import Columns, Recording
+from fmu_mesh.results.tails import LineTail
 from fmu_mesh.variables.value_types import DTYPES, VariableType
 
 _BUFFER_BYTES = 1 << 16
