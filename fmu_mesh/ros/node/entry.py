@@ -151,14 +151,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     try:
         rclpy.init(args=None if arguments is None else [sys.argv[0], *arguments])
-        node = create_node()
+        node, executor = create_node(), executors.SingleThreadedExecutor()
     except Exception as error:  # noqa: BLE001 rclpy raises many types for wrong arguments, and each says which
         print(f"fmu_mesh.ros.node: {_wrong_arguments(error)}", file=sys.stderr)  # noqa: T201 as above
         with _Deadline(f"ROS was not shut down within {_END_S:g} s", ConfigurationError.exit_code):
             rclpy.try_shutdown()
         return ConfigurationError.exit_code
     try:
-        executor = executors.SingleThreadedExecutor()
         with _Autostart(node, executor):
             rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
@@ -176,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         exit_code = managed.failure.exit_code if managed.failure is not None else 0 if returned else FmuError.exit_code
         # All that is the node's own is closed: nothing is lost if the middleware does not end.
         with _Deadline(f"ROS was not shut down within {_END_S:g} s", exit_code):
+            executor.shutdown(0.0)  # otherwise the garbage collector destroys its parts in any order, with a message
             node.destroy_node()
             rclpy.try_shutdown()
     if not returned:
