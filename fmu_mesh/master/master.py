@@ -29,6 +29,7 @@ does not share this memory gets grants and reports its progress by messages.
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 from contextlib import ExitStack
@@ -193,7 +194,7 @@ class Master:
 
     def _decide(self, now: float) -> float:
         """Do what there is to do; return for how long there is nothing more if nothing arrives, in s."""
-        states, pause_s = self._states, 0.0
+        states, pause_s = self._states, math.inf
         while True:
             paced = states.wanted
             if states.takes_commands:
