@@ -231,9 +231,14 @@ def option_fields(options: type[CallOptions]) -> dict[str, Option]:
 @cache
 def _description(key: str) -> str:
     """What the configuration says about a key, as help: no full stop, and nothing about null, which no option takes."""
+    section, _, name = key.partition(".")
+    text: str = next(meta.description for meta in _hints(section)[name].__metadata__)
+    return f"{text[0].lower()}{text[1:]}".partition("; null:")[0].removesuffix(".")
+
+
+@cache
+def _hints(section: str) -> dict[str, Any]:
+    """The types of the keys of a section: evaluated once, because many options ask for it at start-up."""
     from .mesh import Config  # noqa: PLC0415  slow to import, and only for the help
 
-    section, _, name = key.partition(".")
-    hints = get_type_hints(kinds_of(get_type_hints(Config)[section])[0], include_extras=True)
-    text: str = next(meta.description for meta in hints[name].__metadata__)
-    return f"{text[0].lower()}{text[1:]}".partition("; null:")[0].removesuffix(".")
+    return get_type_hints(kinds_of(get_type_hints(Config)[section])[0], include_extras=True)
