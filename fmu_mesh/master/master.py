@@ -201,11 +201,14 @@ class Master:
                 paced, pause_s = self._pacer.limit(paced, states.granting.slowest)
             stopped = self._members.stopped() if states.silent_s(now) > states.deadlines.step else ()
             before, actions = states.state, states.decide(now, paced, stopped)
+            if not states.moves:  # at once: to publish takes as long as thousands of points
+                self._clock.stop()
             if states.state != before and not states.is_over:
                 self._server.publish_status(at_once=True)
+            if states.moves:
+                self._clock.start()
             for action in actions:
                 self._do(action)
-            (self._clock.start if states.moves else self._clock.stop)()
             if not actions:
                 break
         if self._watch is not None and states.takes_commands:
