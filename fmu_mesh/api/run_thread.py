@@ -43,7 +43,7 @@ from ..wire.views import MeshStatus
 from .result import Result, result_of, types_of
 
 if TYPE_CHECKING:
-    from ..run.local import InProcessRun
+    from ..run.in_process import InProcessRun
 
 __all__ = ["RunThread", "check_memory"]
 
@@ -203,7 +203,7 @@ class RunThread:
     def _run_once(self, plan: RunPlan) -> Outcome:
         kind: type[Launcher | InProcessRun] = Launcher
         if not self._settings.processes:
-            from ..run.local import InProcessRun  # noqa: PLC0415 it needs all that nodes do
+            from ..run.in_process import InProcessRun  # noqa: PLC0415 it needs all that nodes do
 
             kind = InProcessRun
         with self._changing:

@@ -2,7 +2,7 @@
 
 It uses the same plan as the nodes but none of their code. A distributed run must give bit-for-bit the same result. Owns
 the order of calls at a point and the state of the whole system. Knows no files, no wall clock and no deadlines:
-`local.py` records and watches what this module steps, and `fmu_mesh.api.open_system` gives it to a program.
+`in_process.py` records and watches what this module steps, and `fmu_mesh.api.open_system` gives it to a program.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place, write_config
 from tests.planning import prepare

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.equivalence.reference import Reference, as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place

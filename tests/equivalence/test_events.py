@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.fmus.event_fmus import Version
 from tests.helpers import Place

@@ -16,7 +16,7 @@ from fmpy.fmi2 import FMU2Slave
 
 from examples import integrated_node
 from fmu_mesh import FMIAdapter
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.planning import prepare
 

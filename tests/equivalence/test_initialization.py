@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fmu_mesh.errors import LoopNotConverged
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from tests.helpers import Place, rows_of, write_config
 from tests.planning import prepare
 

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from fmu_mesh.errors import FmuError, StepFailed
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.system.plan import Plan
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 from tests.planning import prepare

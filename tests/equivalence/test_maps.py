@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import fmu_mesh
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from tests.equivalence.plain_loop import Wire, run_plainly
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.fmus.packing import repacked

@@ -18,7 +18,7 @@ from fmu_mesh.node.engine import PlainEngine
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings import native
 from fmu_mesh.rings.host_memory import HostMemory
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.local_system import opening_of
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.system.plan import NodePlan, Plan

@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 import fmu_mesh
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.wire.session import Wiring, open_session
 from tests.helpers import DEADLINE_S, FMUS, Place, wait_until, write_config

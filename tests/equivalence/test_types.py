@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import Place

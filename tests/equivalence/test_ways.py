@@ -12,7 +12,7 @@ import yaml
 
 from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
 from tests.helpers import Place, wait_until, write_config

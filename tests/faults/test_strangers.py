@@ -27,7 +27,7 @@ from fmu_mesh.errors import ErrorReport
 from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.native import NEVER
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport

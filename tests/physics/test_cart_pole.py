@@ -18,7 +18,7 @@ import yaml
 from gymnasium.utils.env_checker import check_env
 
 import fmu_mesh
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place
 from tests.planning import prepare

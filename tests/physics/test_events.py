@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from tests.fmus.event_fmus import Version
 from tests.helpers import rows_of, write_config
 from tests.planning import prepare

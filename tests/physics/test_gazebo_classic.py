@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place, rows_of
 from tests.planning import prepare

@@ -21,7 +21,7 @@ from fmu_mesh.instances.gazebo.gazebo_classic import GazeboClassicInstance
 from fmu_mesh.instances.gazebo.gazebo_section import GazeboClassicConfig
 from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout

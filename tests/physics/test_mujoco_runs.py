@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place
 from tests.planning import prepare

@@ -29,7 +29,7 @@ from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.results.record_files import open_result
 from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.repeated import RepeatedRuns
 from fmu_mesh.run.run_plan import RunPlan

@@ -16,7 +16,7 @@ from fmu_mesh.config.instance_sections import KIND
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan

@@ -23,7 +23,7 @@ from fmu_mesh.instances.contract import LogMessage
 from fmu_mesh.instances.fmi.loaded_fmu import LoadedFmu
 from fmu_mesh.results.record_files import open_result
 from fmu_mesh.rings import native
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.preparing import KnownModels
 from fmu_mesh.run.repeated import RepeatedRuns

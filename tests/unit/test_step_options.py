@@ -11,7 +11,7 @@ import yaml
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.pictures.plan_page import plan_page
-from fmu_mesh.run.local import LocalMesh
+from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.system.plan import Plan
 from tests.fmus.event_fmus import Version
 from tests.fmus.helpers import find_fmu
