@@ -18,7 +18,7 @@ from ..config.call_options import takes
 from ..errors import CallRefused, FmuError, FmuMeshError
 from ..files import Kept, remove_tree
 from ..results.record_files import open_result
-from ..results.recording import Columns
+from ..results.recording import Columns, ResultFile
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
@@ -110,7 +110,7 @@ class RepeatedMesh:
         self._rows = rows = _CollectedRows(plan)
         runs = self._runs(plan.mesh)
         try:
-            outcome = runs.run(plan, rows)
+            outcome = runs.run(plan, rows.open)
         except FmuMeshError as error:
             point = runs.point
             time, warnings = plan.plan.grid.time(point), runs.warnings
@@ -143,12 +143,16 @@ class _CollectedRows:
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
-        self._file = None
-        if memory_of(plan) is None:
-            self._file = open_result(plan.loaded, plan.plan.system)
+        self._file: ResultFile | None = None
         self._times: list[NDArray[np.float64]] = []
         self._blocks: list[list[NDArray[Any]]] = []
         self.rows = 0
+
+    def open(self) -> list[ResultFile]:
+        """This object, whose file is open now."""
+        if memory_of(self._plan) is None:
+            self._file = open_result(self._plan.loaded, self._plan.plan.system)
+        return [self]
 
     @property
     def path(self) -> Path:

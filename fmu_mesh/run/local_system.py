@@ -1,8 +1,8 @@
 """All instances of a plan in this process, stepped point by point in the plainest way: the reference of invariant 1.
 
-It uses the same plan as the nodes but none of their code. A distributed run must give bit-for-bit the same result. Owns
-the order of calls at a point and the state of the whole system. Knows no files, no wall clock and no deadlines:
-`in_process.py` records and watches what this module steps, and `fmu_mesh.api.open_system` gives it to a program.
+It uses the same plan as the nodes but none of their code. Any other run must give bit-for-bit the same result. Owns the
+order of calls at a point and the state of the whole system. Knows no files, no wall clock and no deadlines:
+`fmu_mesh.api.open_system` gives it to a program, and tests compare all runs with a loop over it (ADR 73).
 """
 
 from __future__ import annotations

@@ -1,9 +1,13 @@
-"""Many runs of one mesh in this process, one after another: for sweeps, optimizers and calibration.
+"""Runs of a mesh in this process, one after another: `launch --local`, sweeps, optimizers and calibration.
 
-The instances of a run are stepped as those of one node, in bursts, and their rows go from the rings to the result file
-as those of a recorder do. So a run takes milliseconds, and gives bit-for-bit the result of `LocalMesh`. Between two
+The instances of a run are stepped as those of one node, in bursts, and their rows go from the rings to the result files
+as those of a recorder do. So a short run takes milliseconds, and its floats are those of `LocalSystem`. Between two
 runs there are no instances, but the libraries of their models stay loaded (`fmu_mesh.instances.kept_models`).
 """
+
+# Threads: that of the runs calls FMUs, and nobody else does (ADR 12). `interrupt` comes from any thread and rings the
+# bell of the engine, so that a wait for the wall clock or a burst ends. The thread of `CallWatch` takes a hang: the
+# thread of the runs is inside an FMU then and changes nothing, so the rows can be saved from outside.
 
 from __future__ import annotations
 
@@ -11,11 +15,11 @@ import logging
 import shutil
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from msgspec.structs import replace
 
@@ -35,6 +39,7 @@ from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..rings import native
 from ..rings.host_memory import HostMemory
+from ..system.layout import row_bytes
 from ..system.plan import Plan, make_plan
 from .local_system import opening_of
 from .one_process import OneProcess
@@ -49,6 +54,8 @@ log = logging.getLogger(__name__)
 
 _NODE = "instances"
 _SCRATCH = "scratch"
+# Of rows that are wider, a few are in memory.
+_WIDE_ROW_BYTES = 2**20
 _WRITE_ROWS = 2048
 # After this time without a step, the deadline of a step is looked at.
 _LONGEST_SLEEP_S = 0.5
@@ -67,7 +74,7 @@ class RepeatedRuns:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     runs = RepeatedRuns(Path(folder))
         ...     for damping in (0.001, 0.1):
-        ...         print(runs.run(mesh.plan(start_values={"pendulum.d": damping}, stop_time=1.0), None).point)
+        ...         print(runs.run(mesh.plan(start_values={"pendulum.d": damping}, stop_time=1.0), list).point)
         ...     runs.close()
         500
         500
@@ -75,7 +82,8 @@ class RepeatedRuns:
     Args:
         folder: an existing private folder; FMUs are extracted below it.
         log: called with every log message of a model.
-        on_hang: called on another thread if a model does not return in time. All complete rows are in the result file.
+        progress: called with the last point reached, about every millisecond.
+        on_hang: called on another thread if a model does not return in time. All complete rows are in the result files.
             The thread that is inside the model cannot be stopped, so the caller has to end the process.
         reset: whether instances stay between runs and are reset, where their models can be reset.
         before_close: called with how a run has ended, before its instances are closed. With it, ``on_hang`` is also
@@ -88,13 +96,14 @@ class RepeatedRuns:
         folder: Path,
         *,
         log: Callable[[LogMessage], None] = lambda _message: None,
+        progress: Callable[[int], None] = lambda _point: None,
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         reset: bool = False,
         before_close: Callable[[Outcome | BaseException], None] | None = None,
         open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
         models = KeptModels(folder, resets=reset)
-        self._around = _Surroundings(folder / _SCRATCH, models, log, open_instance, before_close)
+        self._around = _Surroundings(folder / _SCRATCH, models, log, progress, open_instance, before_close)
         self._on_hang = on_hang
         self._threads = LimitedThreads()
         self._process = OneProcess()
@@ -103,33 +112,28 @@ class RepeatedRuns:
         self._run: _Run | None = None
         self._stop: str | None = None
 
-    def run(self, run: RunPlan, result: ResultFile | None) -> Outcome:
+    def run(self, run: RunPlan, open_files: Callable[[], Sequence[ResultFile]]) -> Outcome:
         """Run a plan from the first to the last point.
 
         Args:
             run: the plan; its nodes and its window are not used.
-            result: gets a row for each point, and is closed here; None: nothing is recorded.
+            open_files: opens the first result files of the plan, or all, or none; each is closed here.
 
         Raises:
             FmuMeshError: a model failed, the run was interrupted, or this system cannot run in one process. The rows
                 that were recorded before are kept.
         """
-        writer = RowWriter(result, GrowthWatch(run.plan))
         try:
             if self._around.open_instance is None:
                 self._process.check(run.plan, run.contents)
-            self._run = current = _Run(run, writer, self._around)
-            if self._stop is not None:
-                current.interrupt(self._stop)
-            self._around.scratch.mkdir(mode=0o700, exist_ok=True)
-            return current.run(self._watch_here(), self._threads)
-        except FmuMeshError as error:
-            writer.close()
-            error.with_hint(writer.kept())
-            raise
+            with closing(RowWriter(open_files(), GrowthWatch(run.plan))) as writer:
+                self._run = current = _Run(run, writer, self._around)
+                if self._stop is not None:
+                    current.interrupt(self._stop)
+                self._around.scratch.mkdir(mode=0o700, exist_ok=True)
+                return current.run(self._watch_here(), self._threads)
         finally:
             self._stop = None
-            writer.close()
             if self._around.scratch.is_dir() and any(self._around.scratch.iterdir()):
                 shutil.rmtree(self._around.scratch, ignore_errors=True)
 
@@ -153,9 +157,17 @@ class RepeatedRuns:
         return self._run.writer.warnings if self._run is not None else ()
 
     @property
-    def rows(self) -> int:
-        """Rows of the last run."""
-        return sum(rows for _, rows in self._run.writer.counted) if self._run is not None else 0
+    def files(self) -> tuple[tuple[str, int], ...]:
+        """Each result file of the last run, and the number of its rows."""
+        return self._run.writer.counted if self._run is not None else ()
+
+    def save(self, error: FmuMeshError) -> None:
+        """From another thread, where that of the runs does not return from a model: keep all complete rows.
+
+        ``error`` gets the point of the step that does not return, and the sentence about the rows.
+        """
+        if self._run is not None:
+            self._run.save(error)
 
     def close(self) -> None:
         """Free all models, and remove their files; on the thread of the runs. May be called twice."""
@@ -182,8 +194,7 @@ class RepeatedRuns:
     def _take_hang(self, error: FmuError) -> None:
         """From the watching thread, which ends then."""
         self._watch = None
-        if self._run is not None:
-            self._run.save(error)
+        self.save(error)
         self._on_hang(error)
 
 
@@ -197,6 +208,7 @@ class _Surroundings(NamedTuple):
     scratch: Path
     models: KeptModels
     log: Callable[[LogMessage], None]
+    progress: Callable[[int], None]
     open_instance: Callable[[str], Instance] | None
     before_close: Callable[[Outcome | BaseException], None] | None
 
@@ -212,7 +224,7 @@ class _Run:
     def __init__(self, run: RunPlan, writer: RowWriter, surroundings: _Surroundings) -> None:
         self.point = 0
         self._run = run
-        self._plan = plan = _in_one_node(run.plan)
+        self._plan = plan = _in_one_node(run.plan, len(writer.counted))
         self._node = plan.nodes[_NODE]
         self._last = plan.grid.last_point
         self.writer = writer
@@ -257,12 +269,12 @@ class _Run:
     def _outcome(self) -> Outcome:
         """How a run ended that did not fail."""
         writer, end = self.writer, self._first[1] if self._first is not None else None
-        outcome = outcome_at(
-            self._plan, self.point, writer.counted, None, end, seconds=self._seconds, warnings=writer.warnings
-        )
-        return replace(outcome, file=writer.counted[0][0] if writer.counted else None)
+        files, warnings = writer.counted, writer.warnings
+        return outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
 
     def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
+        if isinstance(error, FmuMeshError):
+            error.with_hint(self.writer.kept())
         if self._around.before_close is not None:
             self._around.before_close(error or self._outcome())
 
@@ -307,11 +319,12 @@ class _Run:
         writer, window = self.writer, self._plan.window
         pacer = Pacer(self._plan, self._plan.system.config.simulation.real_time_factor)
         pacer.start(0)
-        many = min(_WRITE_ROWS, window // 2)
+        many = max(1, min(_WRITE_ROWS, window // 2))
         stepped_at = time.monotonic()
         while True:
             self.point = point = min(engine.covered, self._last)
             writer.write(point + 1, many)
+            self._around.progress(point)
             if self._stop is not None:
                 raise Interrupted(self._stop, point=point, time=self._node.grid.time(point))
             if point >= self._last:
@@ -360,8 +373,8 @@ class _Run:
         self.point = min(engine.covered, self._last)
         self.writer.write(self.point + 1, 1)
 
-    def save(self, error: FmuError) -> None:
-        """From the watching thread. This is safe: the main thread is blocked in a model."""
+    def save(self, error: FmuMeshError) -> None:
+        """See `RepeatedRuns.save`. This is safe: the thread of the runs is blocked in a model."""
         engine = self._engine
         if engine is not None:
             runner = engine.current
@@ -381,12 +394,14 @@ class _Run:
         self._engine = None
 
 
-def _in_one_node(plan: Plan) -> Plan:
-    """The plan of the same system with all instances in one node and one result file, without a window."""
+def _in_one_node(plan: Plan, files: int) -> Plan:
+    """The plan of the same system with all instances in one node and the first ``files`` result files."""
     system = plan.system
-    config = replace(system.config, simulation=replace(system.config.simulation, window="auto"))
+    rows = [row_bytes(item.outputs) for node in plan.nodes.values() for item in node.instances]
+    window: int | Literal["auto"] = 1 if max(rows, default=0) > _WIDE_ROW_BYTES else "auto"
+    config = replace(system.config, simulation=replace(system.config.simulation, window=window))
     instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
-    return make_plan(replace(system, config=config, instances=instances, records=system.records[:1]))
+    return make_plan(replace(system, config=config, instances=instances, records=system.records[:files]))
 
 
 def _nothing_comes(_left_s: float) -> None:

@@ -1,16 +1,17 @@
-"""Writes the rows of a run in this process, from the rings of its instances into the result file.
+"""Writes the rows of a run in this process, from the rings of its instances into the result files.
 
 Knows neither how the instances are stepped nor when the run ends.
 """
 
-# Two threads meet here: the one that steps and writes, and the one that watches it, which closes the file if a call of
-# an FMU does not return. The lock and its deadline are those of `fmu_mesh.recorder.row_buffer`; see ADR 50 and 60.
+# Two threads meet here: the one that steps and writes, and the one that watches it, which closes the files if a call of
+# an FMU does not return. Both write under a lock. If the disk does not answer either, the watching thread gives up
+# after half a second: a process that ends must not wait for it. The files are ADR 50 and 60.
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from ..node.stepping import Runner
 from ..recorder.recorder import RecordedSource
@@ -28,19 +29,19 @@ _OTHER_WRITER_S = 0.5
 
 
 class RowWriter:
-    """Writes the rows of a run, from its rings into the result file.
+    """Writes the rows of a run, from its rings into the result files.
 
     Args:
-        file: the file; None: nothing is recorded.
+        files: the files; empty: nothing is recorded.
         growth: looks at all rows.
 
     Attributes:
         written: number of points whose rows are written.
     """
 
-    def __init__(self, file: ResultFile | None, growth: GrowthWatch | None = None) -> None:
+    def __init__(self, files: Sequence[ResultFile], growth: GrowthWatch | None = None) -> None:
         self.written = 0
-        self._files = RecordFiles([file] if file is not None else [], growth)
+        self._files = RecordFiles(files, growth)
         self._sources: list[RecordedSource] = []
         self._rows = 1
         self._flushed = 0.0
@@ -57,12 +58,11 @@ class RowWriter:
             sources[link.source] = RecordedSource(link, plan.grid.last_point, [rows], None)
         self._rows = min(place.rows for place in node.rings)
         self._sources = list(sources.values())
-        records = node.records[: len(self._files.counted)]
-        self._files.begin(plan.grid, records, lambda instance, variable: sources[instance].column(variable))
+        self._files.begin(plan.grid, node.records, lambda instance, variable: sources[instance].column(variable))
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:
-        """The file and its number of rows, if there is one."""
+        """The path and the number of rows of each file."""
         return self._files.counted
 
     @property
@@ -79,7 +79,7 @@ class RowWriter:
         """Write the rows of all points before ``end``, if they are ``many``, or were not written for 0.2 s.
 
         Raises:
-            ConfigurationError: the file cannot be written.
+            ConfigurationError: a file cannot be written.
         """
         now = time.monotonic()
         is_late = now - self._flushed > _FLUSH_S
@@ -96,10 +96,10 @@ class RowWriter:
             self._flushed = now if is_late else self._flushed
 
     def close(self) -> None:
-        """Close the file; from any thread, and nothing happens if it is closed.
+        """Close the files; from any thread, and nothing happens if they are closed.
 
         Raises:
-            ConfigurationError: the file cannot be written.
+            ConfigurationError: a file cannot be written.
         """
         if not self._writing.acquire(timeout=_OTHER_WRITER_S):
             return  # another thread is writing to a disk that does not answer

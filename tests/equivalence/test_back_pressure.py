@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place, write_config
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 POINTS = 12_000
@@ -44,5 +44,5 @@ def test_a_chain_of_eight_with_slow_end_runs_through_with_nothing_lost(way: str,
     local = place.folder / "local.csv"
     members["slow"]["start_values"] = {"slow": 0.0}  # the same values, sooner
     write_config(place.folder, instances=members, connections=connections, stop_time=POINTS * 0.001, name="quick")
-    LocalMesh(prepare(place.folder / "quick.yaml", PlanOptions(output=local))).run()
+    PlainRun(prepare(place.folder / "quick.yaml", PlanOptions(output=local))).run()
     assert config.with_suffix(".csv").read_bytes() == local.read_bytes()

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.equivalence.reference import Reference, as_bits, read_csv, reference_of, run_fmpy
 from tests.helpers import FMUS, Place
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -74,7 +74,7 @@ def launched(place: Place, config: Path, *arguments: str) -> bytes:
 def in_this_process(place: Place, config: Path) -> bytes:
     """The result of the same plan in one process."""
     output = place.folder / "local.csv"
-    LocalMesh(prepare(config, PlanOptions(output=output))).run()
+    PlainRun(prepare(config, PlanOptions(output=output))).run()
     return output.read_bytes()
 
 

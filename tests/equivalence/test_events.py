@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import yaml
 
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.fmus.event_fmus import Version
 from tests.helpers import Place
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 EventFmu = Callable[..., Path]
@@ -28,7 +28,7 @@ def both_ways(place: Place, content: Mapping[str, Any], *arguments: str) -> tupl
     config.write_text(yaml.safe_dump({"mesh": "m", **content}, sort_keys=False), encoding="utf-8")
     launched = place.start("launch", config, "--no-progress", "--output", place.folder / "launched.csv", *arguments)
     assert launched.wait(50.0) == 0, launched.errors
-    LocalMesh(prepare(config, PlanOptions(output=place.folder / "local.csv"))).run()
+    PlainRun(prepare(config, PlanOptions(output=place.folder / "local.csv"))).run()
     return (place.folder / "launched.csv").read_bytes(), (place.folder / "local.csv").read_bytes()
 
 

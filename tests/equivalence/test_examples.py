@@ -16,8 +16,8 @@ from fmpy.fmi2 import FMU2Slave
 
 from examples import integrated_node
 from fmu_mesh import FMIAdapter
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,7 +38,7 @@ def rows_of(path: Path) -> Rows:
 
 def local_rows(config: Path, output: Path) -> Rows:
     """The result of a configuration that runs in this process."""
-    LocalMesh(prepare(config, PlanOptions(output=output))).run()
+    PlainRun(prepare(config, PlanOptions(output=output))).run()
     return rows_of(output)
 
 

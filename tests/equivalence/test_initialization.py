@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from fmu_mesh.errors import LoopNotConverged
-from fmu_mesh.run.in_process import LocalMesh
 from tests.helpers import Place, rows_of, write_config
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 CONNECTIONS = ("pendulum.a -> sum.u1", "sum.y -> a.u", "a.y -> b.u", "b.y -> sum.u2", "b.y -> end.u")
@@ -35,7 +35,7 @@ def test_a_loop_over_processes_starts_with_consistent_values_and_equals_one_proc
 
     assert place.run("launch", config, "--no-progress").wait() == 0
     distributed = result.read_bytes()
-    LocalMesh(prepare(config)).run()
+    PlainRun(prepare(config)).run()
 
     assert distributed == result.read_bytes()
     _, angle, *_, total, first, second, after = rows_of(result)[0]
@@ -56,5 +56,5 @@ def test_loop_that_does_not_converge_ends_run_with_its_names_and_residuals(place
     assert "Lower `initialization.relaxation` (now 1)" in process.message
     place.assert_nothing_left()
     with pytest.raises(LoopNotConverged) as caught:
-        LocalMesh(prepare(config)).run()
+        PlainRun(prepare(config)).run()
     assert caught.value.message in process.message

@@ -6,16 +6,20 @@ import re
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from fmu_mesh.errors import FmuError, StepFailed
-from fmu_mesh.run.in_process import LocalMesh
+from fmu_mesh.config.loading import LoadedConfig
+from fmu_mesh.errors import FmuError, Interrupted, StepFailed
+from fmu_mesh.results.record_files import open_results
+from fmu_mesh.run.repeated import RepeatedRuns
+from fmu_mesh.run.run_plan import RunPlan
 from fmu_mesh.system.plan import Plan
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
-from tests.planning import prepare
+from tests.planning import plan_run
 from tests.scenarios.scenario import Counter, Scenario
 
 MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
@@ -84,41 +88,42 @@ def test_without_a_result_file_an_output_may_be_unconnected(place: Place, option
 
 
 class Ended(Counter):
-    """An instance in whose fourth step the process is ended from outside, as by Ctrl-C when an FMU does not return.
+    """An instance whose fourth step is given up from outside, as by Ctrl-C when an FMU does not return.
 
     Args:
-        clean_up: what is called then, on another thread.
+        give_up: what is called then, on another thread.
     """
 
-    def __init__(self, plan: Plan, name: str, clean_up: Callable[[], None]) -> None:
+    def __init__(self, plan: Plan, name: str, give_up: Callable[[], None]) -> None:
         super().__init__(plan, name)
-        self._clean_up = clean_up
+        self._give_up = give_up
 
     def do_step(self, step: int) -> None:
         if step == 3:
-            thread = threading.Thread(target=self._clean_up)
+            thread = threading.Thread(target=self._give_up)
             thread.start()
             thread.join()
             raise StepFailed("the process has ended here", instance="b")
         super().do_step(step)
 
 
-def test_rows_before_a_hanging_step_are_kept_when_the_process_is_ended(tmp_path: Path) -> None:
+def test_rows_before_a_hanging_step_are_kept_when_the_run_is_given_up(tmp_path: Path) -> None:
     result = tmp_path / "result.csv"
     plan = Scenario(("a -> b",), points=10).plan(record=True)
     records = (msgspec.structs.replace(plan.system.records[0], file=str(result)),)
     plan = msgspec.structs.replace(plan, system=msgspec.structs.replace(plan.system, records=records))
+    loaded = LoadedConfig(plan.system.config, Path())
     found: list[str] = []
 
-    def clean_up() -> None:
-        mesh.clean_up()
+    def give_up() -> None:
+        runs.save(Interrupted("interrupted"))
         found.append(result.read_text())
 
-    mesh = LocalMesh(
-        plan, open_instance=lambda name: Ended(plan, name, clean_up) if name == "b" else Counter(plan, name)
+    runs = RepeatedRuns(
+        tmp_path, open_instance=lambda name: Ended(plan, name, give_up) if name == "b" else Counter(plan, name)
     )
-    with pytest.raises(StepFailed):
-        mesh.run()
+    with closing(runs), pytest.raises(StepFailed):
+        runs.run(RunPlan(loaded, plan, {}), lambda: open_results(loaded, plan.system))
 
     assert found == ["time,a.point,b.point\n" + "".join(f"{k}.0,{k}.0,{k}.0\n" for k in range(4))]
     assert result.read_text() == found[0]
@@ -126,14 +131,16 @@ def test_rows_before_a_hanging_step_are_kept_when_the_process_is_ended(tmp_path:
 
 def test_what_lasts_between_two_points_is_no_hang(tmp_path: Path) -> None:
     """A slow disk, or whoever hears of the progress: the instance that stepped last has returned."""
-    plan = prepare(write_config(tmp_path, stop_time=2.0, timeouts={"step": 0.5}))
+    run = plan_run(write_config(tmp_path, stop_time=2.0, timeouts={"step": 0.5}))
     hangs: list[FmuError] = []
     waited: list[bool] = []
 
     def progress(point: int) -> None:
-        if point == 1023:
+        if point > 0 and not waited:
             waited.append(threading.Event().wait(1.5))
 
-    outcome = LocalMesh(plan, progress=progress, on_hang=hangs.append).run()
+    (folder := tmp_path / "runs").mkdir()
+    with closing(RepeatedRuns(folder, progress=progress, on_hang=hangs.append)) as runs:
+        outcome = runs.run(run, lambda: open_results(run.loaded, run.plan.system))
 
     assert (outcome.point, waited, hangs) == (2000, [False], [])

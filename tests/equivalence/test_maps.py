@@ -13,11 +13,11 @@ import pytest
 import yaml
 
 import fmu_mesh
-from fmu_mesh.run.in_process import LocalMesh
 from tests.equivalence.plain_loop import Wire, run_plainly
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import Place
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
@@ -147,7 +147,7 @@ def test_values_are_mapped_as_in_a_plain_loop_in_all_processes() -> None:
         fmus = fmus_in(place.folder)
         config = written(place.folder, fmus)
         result = place.folder / "maps.csv"
-        LocalMesh(prepare(config)).run()
+        PlainRun(prepare(config)).run()
         local = result.read_bytes()
         width = 1 + len(RECORDED)
 
@@ -168,7 +168,7 @@ def test_without_the_library_of_c_a_map_gives_the_same() -> None:
     with Place() as place:
         config = written(place.folder, fmus_in(place.folder), grouped=("x", "z", "y"))
         result = place.folder / "maps.csv"
-        LocalMesh(prepare(config)).run()
+        PlainRun(prepare(config)).run()
         local = result.read_bytes()
         place.environment = {**place.environment, "FMU_MESH_LIBRARY": "none"}
 
@@ -206,6 +206,6 @@ def test_a_value_that_is_no_item_ends_the_run_with_its_names(target: str, librar
         assert "instance y.enumeration_in" in process.message
         assert "point 3" in process.message
         with pytest.raises(fmu_mesh.StepFailed) as caught:
-            LocalMesh(prepare(config)).run()
+            PlainRun(prepare(config)).run()
         assert (caught.value.instance, caught.value.variable, caught.value.point) == ("y", "enumeration_in", 3)
         assert caught.value.message == expected

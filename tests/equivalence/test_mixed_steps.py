@@ -18,11 +18,11 @@ from fmu_mesh.node.engine import PlainEngine
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings import native
 from fmu_mesh.rings.host_memory import HostMemory
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.local_system import opening_of
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.system.plan import NodePlan, Plan
 from tests.helpers import FMUS, rows_of
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 from tests.scenarios.engines import EngineMesh, MakeEngine, burst_engine
 
@@ -109,7 +109,7 @@ def test_fmus_and_components_in_one_burst_get_the_values_of_the_reference(
     config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     output = tmp_path / "local.csv"
     plan = prepare(config, PlanOptions(output=output))
-    LocalMesh(plan).run()
+    PlainRun(plan).run()
     with output.open(encoding="utf-8", newline="") as file:
         header = next(csv.reader(file))
     reference = np.array(rows_of(output))

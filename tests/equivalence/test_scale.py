@@ -14,10 +14,10 @@ import pytest
 import zenoh
 
 import fmu_mesh
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.wire.session import Wiring, open_session
 from tests.helpers import DEADLINE_S, FMUS, Place, wait_until, write_config
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 
@@ -35,7 +35,7 @@ def test_many_instances_give_the_floats_of_one_process(instances: int, groups: i
     assert place.run("launch", config, "--no-progress", deadline_s=200.0).wait() == 0
 
     local = place.folder / "local.csv"
-    LocalMesh(prepare(config, PlanOptions(output=local))).run()
+    PlainRun(prepare(config, PlanOptions(output=local))).run()
     assert config.with_suffix(".csv").read_bytes() == local.read_bytes()
     place.assert_nothing_left()
 

@@ -15,10 +15,10 @@ import pytest
 import yaml
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import Place
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 pytestmark = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
@@ -175,7 +175,7 @@ def test_every_type_is_same_over_wire_and_in_one_process_and_right() -> None:
     with Place() as place:
         config = written(place.folder)
         local = place.folder / "local.csv"
-        LocalMesh(prepare(config, PlanOptions(output=local))).run()
+        PlainRun(prepare(config, PlanOptions(output=local))).run()
         process = place.run("launch", config, "--no-progress")
         assert process.wait() == 0, process.errors
         content = (place.folder / "result.csv").read_bytes()

@@ -12,10 +12,10 @@ import yaml
 
 from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
 from tests.helpers import Place, wait_until, write_config
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 shares = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")
@@ -23,7 +23,7 @@ shares = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_crea
 
 def local_result(place: Place, config: Path) -> bytes:
     output = place.folder / "local.csv"
-    LocalMesh(prepare(config, PlanOptions(output=output))).run()
+    PlainRun(prepare(config, PlanOptions(output=output))).run()
     return output.read_bytes()
 
 

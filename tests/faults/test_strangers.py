@@ -27,11 +27,11 @@ from fmu_mesh.errors import ErrorReport
 from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.native import NEVER
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 WAYS = pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
@@ -86,7 +86,7 @@ def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, **si
 
 def local_result(place: Place, config: Path) -> bytes:
     output = place.folder / "local.csv"
-    LocalMesh(prepare(config, PlanOptions(output=output))).run()
+    PlainRun(prepare(config, PlanOptions(output=output))).run()
     return output.read_bytes()
 
 

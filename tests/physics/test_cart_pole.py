@@ -18,9 +18,9 @@ import yaml
 from gymnasium.utils.env_checker import check_env
 
 import fmu_mesh
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "cart_pole"
@@ -43,7 +43,7 @@ def run(folder: Path, start: dict[str, float], *, pushed: bool) -> dict[str, lis
         content["connections"].remove("policy.force -> cart.force")
     config, output = folder / "balance.yaml", folder / "result.csv"
     config.write_text(yaml.safe_dump(content), encoding="utf-8")
-    LocalMesh(prepare(config, PlanOptions(output=output))).run()
+    PlainRun(prepare(config, PlanOptions(output=output))).run()
     return columns(output)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fmu_mesh.run.in_process import LocalMesh
 from tests.fmus.event_fmus import Version
 from tests.helpers import rows_of, write_config
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 EventFmu = Callable[..., Path]
@@ -43,7 +43,7 @@ def simulated(
         simulation={"step_size": step_size},
         record={"file": "m.csv", "variables": [f"m.{name}" for name in variables]},
     )
-    LocalMesh(prepare(config)).run()
+    PlainRun(prepare(config)).run()
     return rows_of(folder / "m.csv")
 
 
@@ -111,7 +111,7 @@ def test_an_input_that_jumps_over_a_level_is_integrated_as_an_event(
         record={"file": "m.csv", "variables": ["integral.s", "integral.above", "integral.last_change"]},
     )
 
-    LocalMesh(prepare(config)).run()
+    PlainRun(prepare(config)).run()
 
     rows = rows_of(tmp_path / "m.csv")
     assert [row[1] for row in rows] == pytest.approx([0.0, 0.0, 0.5, 1.5, 3.0, 5.0, 7.5], rel=1e-6)
@@ -159,7 +159,7 @@ def test_the_integral_of_a_ramp_is_right_if_the_input_changes_linearly(
     content["connections"] = [{"from": "ramp.s", "to": "square.u", "extrapolation": "linear", "delay": delay}]
     config.write_text(yaml.safe_dump(content), encoding="utf-8")
 
-    LocalMesh(prepare(config)).run()
+    PlainRun(prepare(config)).run()
 
     # With a delay of one point, the slope of the first step is not known yet: there the input is 0.
     missing = 0.005 if delay else 0.0

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place, rows_of
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
 
 def columns(config: Path, output: Path, *start_values: str) -> dict[str, Array]:
     """The result of a run in this process."""
-    LocalMesh(prepare(config, PlanOptions(start_values=start_values, output=output))).run()
+    PlainRun(prepare(config, PlanOptions(start_values=start_values, output=output))).run()
     with output.open(newline="") as file:
         header, *rows = csv.reader(file)
     table = np.array(rows, dtype=np.float64)

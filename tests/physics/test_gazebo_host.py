@@ -21,11 +21,11 @@ from fmu_mesh.instances.gazebo.gazebo_classic import GazeboClassicInstance
 from fmu_mesh.instances.gazebo.gazebo_section import GazeboClassicConfig
 from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from tests.helpers import FMUS
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 WORLDS = Path(__file__).resolve().parents[2] / "configs" / "worlds"
@@ -477,7 +477,7 @@ record: {{file: result.csv, variables: [motor.jointTorque, world.elbow.effort_ap
         encoding="utf-8",
     )
 
-    LocalMesh(prepare(config, PlanOptions())).run()
+    PlainRun(prepare(config, PlanOptions())).run()
 
     rows = [line.split(",") for line in (tmp_path / "result.csv").read_text(encoding="utf-8").splitlines()[1:]]
     assert [float(applied) for _, _, applied in rows[1:]] == [float(torque) for _, torque, _ in rows[1:]]

@@ -15,9 +15,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import Place
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,7 +51,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
             folder = tmp_path_factory.mktemp("run")
             config = changed(name, folder, replaced)
             output = folder / "result.csv"
-            LocalMesh(prepare(config, PlanOptions(start_values=start_values, output=output))).run()
+            PlainRun(prepare(config, PlanOptions(start_values=start_values, output=output))).run()
             known[key] = columns_of(output)
         return known[key]
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "path_filter.yaml"
@@ -36,7 +36,7 @@ def columns(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], dict[
         output = folder / f"{slope_speed}.csv"
         if not output.exists():
             options = PlanOptions(start_values=(f"filter.slopeSpeed={slope_speed!r}",), output=output)
-            LocalMesh(prepare(CONFIG, options)).run()
+            PlainRun(prepare(CONFIG, options)).run()
         with output.open(newline="") as file:
             header, *rows = csv.reader(file)
         table = np.array(rows, dtype=np.float64)

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.options import PlanOptions
 from tests.fmus.reference import Pendulum, angle_after
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -45,7 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
             output = folder / f"{len(known)}.csv"
             everything = ("record.variables=null",)
             options = PlanOptions(start_values=start_values, config_values=everything, output=output)
-            LocalMesh(prepare(CONFIGS / f"{name}.yaml", options)).run()
+            PlainRun(prepare(CONFIGS / f"{name}.yaml", options)).run()
             known[key] = columns_of(output)
         return known[key]
 

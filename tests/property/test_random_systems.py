@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,9 @@ from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.errors import LoopNotConverged, StepFailed, TerminationRequested
 from fmu_mesh.instances.registry import decode_section
-from fmu_mesh.results.record_files import open_result
+from fmu_mesh.results.record_files import open_results
 from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.repeated import RepeatedRuns
 from fmu_mesh.run.run_plan import RunPlan
@@ -39,6 +38,7 @@ from fmu_mesh.system.plan import Plan, make_plan
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
+from tests.plain_run import PlainRun
 from tests.scenarios.simulated import SimulatedMesh
 
 STEP_SIZE = 0.1
@@ -456,10 +456,10 @@ def test_any_system_gives_the_reference_result_in_one_process(drawn: Drawn) -> N
         expected = expected_of(drawn, plan)
     except LoopNotConverged:
         with pytest.raises(LoopNotConverged):
-            run(drawn, plan, lambda open_instance: LocalMesh(plan, open_instance=open_instance).run())
+            run(drawn, plan, lambda open_instance: PlainRun(plan, open_instance=open_instance).run())
         return
 
-    result = run(drawn, plan, lambda open_instance: LocalMesh(plan, open_instance=open_instance).run())
+    result = run(drawn, plan, lambda open_instance: PlainRun(plan, open_instance=open_instance).run())
 
     assert bits(result) == bits(expected)
 
@@ -517,11 +517,12 @@ def test_any_system_gives_the_reference_result_in_each_of_many_runs(library: boo
             expected = []
         for _ in range(2):
             kept = Kept()
+            files = partial(list[Kept], [kept] if drawn.recorded else [])
             if not expected:
                 with pytest.raises(LoopNotConverged):
-                    runs.run(run_plan, kept)
+                    runs.run(run_plan, files)
                 continue
-            outcome = runs.run(run_plan, kept)
+            outcome = runs.run(run_plan, files)
 
             rows = len(range(drawn.first, drawn.last_point + 1, drawn.every)) if drawn.recorded else 0
             assert (outcome.point, outcome.rows) == (drawn.last_point, rows)
@@ -592,12 +593,12 @@ def test_many_runs_end_where_a_run_point_by_point_ends(
         file = Path(folder, "rows.csv")
         plan = with_file(plan, file)
         loaded = LoadedConfig(plan.system.config, Path())
-        expected = ended(LocalMesh(plan, open_instance=instance, loaded=loaded).run), written()
+        expected = ended(PlainRun(plan, open_instance=instance, loaded=loaded).run), written()
         runs = RepeatedRuns(Path(folder), open_instance=instance)
         run_plan = RunPlan(loaded, plan, {})
         for _ in range(2):
-            result = open_result(loaded, plan.system)
-            assert (ended(lambda result=result: runs.run(run_plan, result)), written()) == expected  # type: ignore[misc]  # the result of this loop
+            found = ended(lambda: runs.run(run_plan, lambda: open_results(loaded, plan.system)))
+            assert (found, written()) == expected
         runs.close()
     event("ended early" if len(expected[0]) == 3 or expected[0][3] is not None else "to the end")
 

@@ -16,13 +16,13 @@ from fmu_mesh.config.instance_sections import KIND
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.connections import Connection
 from fmu_mesh.system.plan import Plan, make_plan
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import ModelDescription, Value, Variable
+from tests.plain_run import PlainRun
 from tests.scenarios.simulated import SimulatedMesh
 
 __all__ = ["Counter", "Scenario", "text", "variable"]
@@ -108,13 +108,13 @@ class Scenario:
     def in_one_loop(self) -> str:
         """The steps of the reference, in its order."""
         plan, lines = self.plan(), list[str]()
-        LocalMesh(plan, open_instance=lambda name: Counter(plan, name, steps=lines)).run()
+        PlainRun(plan, open_instance=lambda name: Counter(plan, name, steps=lines)).run()
         return text(lines)
 
     def initialization(self) -> str:
         """The calls of Initialization Mode, in the order of the reference."""
         plan, lines = self.plan(), list[str]()
-        LocalMesh(plan, open_instance=lambda name: Counter(plan, name, initialization=lines)).run()
+        PlainRun(plan, open_instance=lambda name: Counter(plan, name, initialization=lines)).run()
         return text(lines)
 
     def initialization_on_nodes(self, *, seed: int = 0) -> dict[str, list[str]]:

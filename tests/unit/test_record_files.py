@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.files import Kept
-from fmu_mesh.recorder.row_buffer import RowBuffer
 from fmu_mesh.results.record_files import ReadColumn, RecordFiles
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.records import RecordPlan
@@ -125,34 +124,3 @@ def test_files_of_a_run_that_has_not_begun_are_only_closed() -> None:
     record.close()
 
     assert file.calls == ["close"]
-
-
-def test_a_buffer_of_single_values_writes_all_files() -> None:
-    files = [ListFile("a.csv"), ListFile("b.csv")]
-    plans = [RecordPlan("a.csv", (("i", "x"), ("i", "s"))), RecordPlan("b.csv", (("i", "n"), ("i", "x")), 1, 2)]
-    buffer = RowBuffer(files, GRID, plans, ["Float64", "String", "Int32"])
-
-    for point in range(7):
-        buffer.add([0.25 * point, f"s{point}", point])
-        if point == 2:
-            buffer.write(flush=True)
-    buffer.close()
-
-    assert files[0].lines == [(1.0 + 0.5 * k, 0.25 * k, f"s{k}") for k in range(7)]
-    assert files[1].lines == [(1.0 + 0.5 * k, k, 0.25 * k) for k in (1, 3, 5)]
-    assert buffer.counted == (("a.csv", 7), ("b.csv", 3))
-
-
-def test_a_buffer_whose_disk_gets_full_keeps_the_rows_of_other_files() -> None:
-    files = [ListFile("a.csv", room=2), ListFile("b.csv")]
-    buffer = RowBuffer(files, GRID, [RecordPlan(file.path.name, (("i", "x"),)) for file in files], ["Float64"])
-    for point in range(4):
-        buffer.add([float(point)])
-
-    with pytest.raises(ConfigurationError, match=r"'a.csv' cannot be written"):
-        buffer.write()
-    buffer.add([4.0])
-    buffer.close()
-
-    assert [row[1] for row in files[0].lines] == [0.0, 1.0]
-    assert [row[1] for row in files[1].lines] == [0.0, 1.0, 2.0, 3.0, 4.0]

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,8 @@ from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import ConfigurationError, FmuMeshError, Interrupted, LoadFailed
 from fmu_mesh.instances.contract import LogMessage
 from fmu_mesh.instances.fmi.loaded_fmu import LoadedFmu
-from fmu_mesh.results.record_files import open_result
+from fmu_mesh.results.record_files import open_results
 from fmu_mesh.rings import native
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.run.outcome import Outcome
 from fmu_mesh.run.preparing import KnownModels
 from fmu_mesh.run.repeated import RepeatedRuns
@@ -32,6 +32,7 @@ from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import rows_of, wait_until, write_config
 from tests.onnx_models import write_network
+from tests.plain_run import PlainRun
 
 ENGINES = pytest.mark.parametrize(
     "library",
@@ -63,12 +64,11 @@ def repeating(folder: Path, **options: Any) -> Iterator[RepeatedRuns]:  # noqa: 
 
 
 def repeated(runs: RepeatedRuns, plan: RunPlan) -> Outcome:
-    system = plan.plan.system
-    return runs.run(plan, open_result(plan.loaded, system) if system.result_file else None)
+    return runs.run(plan, partial(open_results, plan.loaded, plan.plan.system))
 
 
 def local(plan: RunPlan) -> Outcome:
-    return LocalMesh(plan.plan, loaded=plan.loaded).run()
+    return PlainRun(plan.plan, loaded=plan.loaded).run()
 
 
 def ended(plan: RunPlan, run: Callable[[RunPlan], Outcome]) -> Ended:
@@ -422,7 +422,7 @@ def test_a_run_is_interrupted_and_the_next_is_not(tmp_path: Path) -> None:
         thread = threading.Thread(target=run)
         thread.start()
         wait_until(lambda: runs.point > 100, "points")
-        assert runs.rows > 0
+        assert runs.files[0][1] > 0
         asked = time.monotonic()
         runs.interrupt("enough")
         thread.join(10)
@@ -464,12 +464,12 @@ def test_of_an_fmu_that_hangs_the_rows_are_kept(tmp_path: Path, faulty: Path) ->
     script = tmp_path / "hanging.py"
     script.write_text(
         "import os, sys\nfrom pathlib import Path\nimport fmu_mesh\n"
-        "from fmu_mesh.run.repeated import RepeatedRuns\nfrom fmu_mesh.results.record_files import open_result\n\n"
+        "from fmu_mesh.run.repeated import RepeatedRuns\nfrom fmu_mesh.results.record_files import open_results\n\n"
         "def end(error):\n    print(error, flush=True)\n    os._exit(3)\n\n"
         f"mesh, runs = fmu_mesh.load({str(config)!r}), RepeatedRuns(Path({str(tmp_path / 'runs')!r}), on_hang=end)\n"
         "for hang_at in (1e9, 1.0):\n"
         "    plan = mesh.plan(start_values={'faulty.hang_at': hang_at})\n"
-        "    print(runs.run(plan, open_result(plan.loaded, plan.plan.system)).point, flush=True)\n"
+        "    print(runs.run(plan, lambda: open_results(plan.loaded, plan.plan.system)).point, flush=True)\n"
     )
 
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)

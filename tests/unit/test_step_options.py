@@ -11,10 +11,10 @@ import yaml
 
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.pictures.plan_page import plan_page
-from fmu_mesh.run.in_process import LocalMesh
 from fmu_mesh.system.plan import Plan
 from tests.fmus.event_fmus import Version
 from tests.fmus.helpers import find_fmu
+from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 EventFmu = Callable[..., Path]
@@ -186,4 +186,4 @@ def test_two_instances_of_an_fmu_that_allows_one_share_no_process(event_fmu: Eve
 
     assert "'one' and 'two' cannot run in one process: the FMU " in message
     with pytest.raises(ConfigurationError, match="'one' and 'two' cannot run in one process"):
-        LocalMesh(apart).run()
+        PlainRun(apart).run()
