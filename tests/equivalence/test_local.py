@@ -107,7 +107,7 @@ class Ended(Counter):
         super().do_step(step)
 
 
-def test_rows_before_a_hanging_step_are_kept_when_the_run_is_given_up(tmp_path: Path) -> None:
+def test_rows_before_a_hanging_step_are_kept(tmp_path: Path) -> None:
     result = tmp_path / "result.csv"
     plan = Scenario(("a -> b",), points=10).plan(record=True)
     records = (msgspec.structs.replace(plan.system.records[0], file=str(result)),)
