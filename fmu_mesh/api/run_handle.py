@@ -1,5 +1,9 @@
 """A running mesh in the hands of a program: look, set, steer, wait."""
 
+# Threads: a `Run` may be used from any. `_opening` is held while the way into the mesh is opened or closed; it can be
+# taken again, because whoever asks for the end may be the first who needs the way. The end of a mesh that somebody else
+# started is followed on a thread "end"; that of an own run comes from its `RunThread`.
+
 from __future__ import annotations
 
 import threading

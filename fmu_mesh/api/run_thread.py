@@ -3,6 +3,11 @@
 The kernel ends the children of a run with the thread that started them, so that thread lives as long as they do.
 """
 
+# Threads: the one of the run starts its processes, and waits for them; any other one asks for its end, also a signal
+# handler, which may interrupt another handler: so `_changing` can be taken again. It orders "begin" and "end": a run
+# that is ended before its first process is started never starts one. `future` and `reached` are what others wait for.
+# At the end of the program, `_end_all` ends what still runs, or its processes would be killed in the middle of a row.
+
 from __future__ import annotations
 
 import atexit

@@ -6,6 +6,9 @@ none after a deadline. An error means that there is nothing to offer. argcomplet
 another way; names with line breaks or control characters are left out.
 """
 
+# Signals: a shell waits for this process, and a call into Zenoh may last. So SIGALRM ends the process at the deadline,
+# whatever the main thread is doing; nothing has been written then, which means that there is nothing to offer.
+
 from __future__ import annotations
 
 import argparse

@@ -1,5 +1,8 @@
 """`dashboard`: a page in a browser that shows running meshes and steers them."""
 
+# Signals: SIGTERM ends the command as Ctrl-C does, by an exception on the main thread, so that the note with the token
+# is removed. Other threads are those of NiceGUI's server.
+
 from __future__ import annotations
 
 import argparse

@@ -1,5 +1,9 @@
 """`launch`, `rerun`, `node`, `master`, `gateway` and `router`: the commands that start processes of a mesh."""
 
+# Signals: the first SIGINT or SIGTERM ends the run in order, and the second does not wait for its processes. The run
+# has a thread of its own (`fmu_mesh.api.run_thread`), so the handler only tells it; before there is one, the handler
+# raises KeyboardInterrupt. The handlers of before come back with the end of the run.
+
 from __future__ import annotations
 
 import argparse

@@ -4,6 +4,9 @@ Owns the rates and shares, which are those between two looks (at the first look 
 columns fit into a terminal.
 """
 
+# Threads: the main one draws, and a thread "values" asks the mesh for the chosen variables, because an answer may take
+# longer than a page is shown. `_lock` is for the courses, which one extends and the other draws.
+
 from __future__ import annotations
 
 import argparse

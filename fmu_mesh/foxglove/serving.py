@@ -1,5 +1,9 @@
 """A mesh in Foxglove for as long as the user wants: it may start later, end, and start again."""
 
+# Threads of a shown mesh: the one of `show` sends values, `_follow_status` and `_follow_log` send what they hear, and
+# `_ask` asks for values that are not published now. The SDK calls the parameters on threads of its own. `_questions`
+# and `_answers` are queues, so nobody holds a lock while the mesh is asked. All end with the mesh or after a deadline.
+
 from __future__ import annotations
 
 import queue

@@ -1,6 +1,7 @@
 """The program of a child process that describes a model: `python -Pm fmu_mesh.instances MODULE REQUEST`.
 
-`fmu_mesh.instances.child_question` starts it. ``answer_to`` of the module answers, on standard output.
+`fmu_mesh.instances.child_question` starts it. ``answer_to`` of the module answers, on standard output. A thread waits
+for the end of standard input, which is that of the asking process: a model may not return (ADR 56).
 """
 
 import os

@@ -30,8 +30,8 @@ __all__ = [
 # Who meets here: every thread of the process. Working directory, locale, umask, environment and signal handlers are
 # those of all threads; the locale of `uselocale`, the blocked signals and the floating-point mode are those of one. So
 # the thread that called the FMU looks, and two threads that look at once may each undo what the FMU of the other one
-# did. Our own threads change only the working directory, while a library is loaded: `FOLDER` is the lock for that. ADR
-# 12.
+# did. Our own threads change only the working directory, while a library is loaded: `FOLDER` is the lock for that
+# (ADR 12).
 #
 # C is asked, not Python: `os.environ` is a copy, and `signal` and `locale` know what Python itself has set. An FMU
 # changes what C has.

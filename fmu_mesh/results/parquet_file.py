@@ -15,9 +15,9 @@ the run is in the metadata of a batch, and at the end of the Parquet file togeth
 # waits for its group owns its memory, because `write` gets arrays that are overwritten. pyarrow itself starts no
 # thread (`fmu_mesh.system.arrow` says why).
 #
-# What may go wrong: a full disk stops the draft, and the stream goes on alone, as its rows are what survives (ADR
-# 62); a stream that cannot be written is cut off after its last whole batch. Compressing everything at the end was
-# given up: it took 1 s for 500 MB, in a process that says nothing meanwhile.
+# What may go wrong: a full disk stops the draft, and the stream goes on alone, as its rows are what survives
+# (ADR 62); a stream that cannot be written is cut off after its last whole batch. Compressing everything at the end
+# was given up: it took 1 s for 500 MB, in a process that says nothing meanwhile.
 
 from __future__ import annotations
 

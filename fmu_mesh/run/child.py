@@ -3,6 +3,10 @@
 Does not know what a mesh is. What happens is posted to the launcher's thread.
 """
 
+# Threads for each child: two read its pipes, because one that is full would stop it, and one waits for its end and for
+# the readers. They post to the launcher's thread, which alone decides (ADR 71). A reader ends when all that have the
+# pipe are gone: what an FMU has forked may keep it open, so others of the child's group are ended after it.
+
 from __future__ import annotations
 
 import os

@@ -3,6 +3,10 @@
 `Mesh.run` and `Mesh.start` give them to `on_event`.
 """
 
+# Threads: whoever has an event puts it into `_waiting`, and a thread "events" writes, because the launcher may be
+# stopped. Only the outcome is waited for (ADR 71). It writes to the descriptor itself: the lock of a buffered file
+# would keep the process from ending.
+
 from __future__ import annotations
 
 import os

@@ -4,7 +4,7 @@
 a second where an FMU does not return.
 """
 
-# Who meets here (ADR 0012, ADR 0073). The thread that called `InProcessRun.run` only waits. A thread of the run does all the
+# Who meets here (ADR 12, 73). The thread that called `InProcessRun.run` only waits. A thread of the run does all the
 # work, and alone calls FMUs. The thread of `CallWatch` takes a hang: the thread of the run is inside an FMU then and
 # changes nothing, so that the rows can be saved from outside. `interrupt` may come from any thread or a signal handler;
 # a thread "grace" gives up if the run does not come to its next point.

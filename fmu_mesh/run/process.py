@@ -4,6 +4,11 @@ A process that was started by `launch` ends with it (design, invariant 5): the k
 and its standard input ends. A thread carries out a request to end, because the main thread may be inside an FMU.
 """
 
+# Threads and signals: the main thread may be in an FMU for long, so no handler does anything: the number of a signal
+# goes through the wakeup descriptor to a thread "signals", and the end of standard input is seen by a thread "stdin".
+# Each asks the main thread to end, and after the grace cleans up and ends the process; the lock `ending` lets only one
+# of them do it. The parent of a forked process is the fork server, which may be stopped: it is woken first (ADR 71).
+
 from __future__ import annotations
 
 import ctypes

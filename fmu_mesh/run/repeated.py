@@ -5,7 +5,7 @@ as those of a recorder do. So a short run takes milliseconds, and its floats are
 runs there are no instances, but the libraries of their models stay loaded (`fmu_mesh.instances.kept_models`).
 """
 
-# Threads: that of the runs calls FMUs, and nobody else does (ADR 0012). `interrupt` comes from any thread and rings the
+# Threads: that of the runs calls FMUs, and nobody else does (ADR 12). `interrupt` comes from any thread and rings the
 # bell of the engine, so that a wait for the wall clock or a burst ends. The thread of `CallWatch` takes a hang: the
 # thread of the runs is inside an FMU then and changes nothing, so the rows can be saved from outside.
 

@@ -5,7 +5,7 @@ Knows neither how the instances are stepped nor when the run ends.
 
 # Two threads meet here: the one that steps and writes, and the one that watches it, which closes the files if a call of
 # an FMU does not return. Both write under a lock. If the disk does not answer either, the watching thread gives up
-# after half a second: a process that ends must not wait for it. The files are ADR 0050 and ADR 0060.
+# after half a second: a process that ends must not wait for it. The files are ADR 50 and 60.
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """What all workers of this host import before they run anything: they start fast, and share its memory.
 
-The fork server of `multiprocessing` imports it, and a worker of Dask.
+The fork server of `multiprocessing` imports it, and a worker of Dask, where the signal of Ctrl-C is ignored (ADR 59).
 """
 
 import signal

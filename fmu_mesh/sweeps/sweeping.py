@@ -12,6 +12,10 @@ A sweep, in pseudocode::
 What schedules is the executor: processes of this host by default, or any `concurrent.futures.Executor`.
 """
 
+# Threads: the one of the sweep gives variants to the executor, and alone writes rows (ADR 59). Threads of the executor
+# only put the futures that have ended into a queue. The thread of the user follows, or cancels: an Event that is looked
+# at between two rows.
+
 from __future__ import annotations
 
 import os

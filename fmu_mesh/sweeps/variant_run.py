@@ -4,6 +4,10 @@ A worker keeps the models of the sweep that it works for loaded, one set for eac
 has a thread of its own, because an FMU may not return: then the row says so, and that thread is left.
 """
 
+# Threads of a worker: that of the executor waits for a row, and a thread "variants" runs them, because an FMU may not
+# return: then the row says so, and that thread is left (ADR 59). The queue between them has one job at a time. The
+# watch over calls of FMUs is a third thread, which ends the wait (`_Hung`).
+
 from __future__ import annotations
 
 import base64

@@ -5,6 +5,11 @@ process is replaced. The processes are forked from the fork server of `multiproc
 need. They end with the process that uses them, and the fork server ends with them.
 """
 
+# Threads: each pool of the standard library has one that calls `_ended`, and the sweep's thread submits. `_changing` of
+# a worker is held while its jobs or its pool change; it can be taken again, because a future that has ended already
+# calls back at once. Jobs of a lost process are given to the next one in their order, but for the one that ran (ADR
+# 59). Processes: a worker ignores SIGINT, which is for the program that uses it, and ends with it (`_end_with_user`).
+
 from __future__ import annotations
 
 import ast

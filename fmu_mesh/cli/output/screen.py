@@ -4,6 +4,9 @@ Owns the state of the terminal that is restored at the end of the block, also at
 was shown before.
 """
 
+# Signals: SIGTERM is raised as SystemExit on the main thread, so that the terminal is restored. A signal that cannot be
+# handled leaves the terminal as it is; `reset` helps.
+
 from __future__ import annotations
 
 import os
