@@ -3,11 +3,6 @@
 `fmu_mesh.node.answering` has the answers. `status` is answered while an FMU hangs.
 """
 
-# Threads: the server's own carries out jobs in their order, and alone declares and publishes; the main thread steps and
-# only posts jobs, so that no call of Zenoh delays a step; threads of Zenoh post what has arrived. The main thread reads
-# and sets values between two steps (`Answers`), and the server answers `status` meanwhile, from numbers that the burst
-# writes once. There is one thread for all variables and not one for each (ADR 68).
-
 from __future__ import annotations
 
 import queue

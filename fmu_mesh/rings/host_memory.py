@@ -3,10 +3,6 @@
 Shared memory is anonymous: the master makes it, and other processes of the same user open it through `/proc`.
 """
 
-# Threads and processes: any of them may ring a bell, and only its owner sleeps. Counters are raised by one writer each
-# (ADR 58). With the library, a bell is a futex in the memory, also between processes. Without it, the memory is that of
-# one process, and `_lock` with `_rung` is the bell. A wake-up that is lost costs the time limit of the sleep.
-
 from __future__ import annotations
 
 import ctypes

@@ -8,10 +8,6 @@ There are three steps; each is a query with an answer:
 * **ready** to the master, which answers when all nodes are ready.
 """
 
-# Threads: "register" asks the master while the main thread loads FMUs; `_admitted` is what the main thread waits for.
-# Threads of Zenoh tell that a token is gone, which is a question and not an end yet (ADR 67). Other flags are set once,
-# by one thread, and read by the main thread in its own time.
-
 from __future__ import annotations
 
 import os

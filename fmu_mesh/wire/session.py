@@ -1,8 +1,5 @@
 """Opens Zenoh sessions: the only `zenoh.open` of the project, and the reason for every setting."""
 
-# Threads: Zenoh closes a session on a thread of its own here, and is left behind if that takes too long: an endpoint
-# that accepts a connection and says nothing would hold the end of a process for ten seconds (ADR 4 has the settings).
-
 from __future__ import annotations
 
 import json

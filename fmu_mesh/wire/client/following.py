@@ -5,10 +5,6 @@ lost where values come faster than they are taken: `Follower`, whose variables s
 `ValueStream` the newest.
 """
 
-# Threads: values arrive on threads of Zenoh, and one other takes them. `_lock` is for what waits between them, and is
-# never held while Zenoh is called: undeclaring waits for a callback that runs. Callbacks are direct, or zenoh-python
-# would start a thread for each variable (ADR 68).
-
 from __future__ import annotations
 
 import queue

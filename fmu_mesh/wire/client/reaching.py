@@ -4,10 +4,6 @@ Makes a `MeshClient` for each running mesh, from the notes in the runtime folder
 in client mode: they connect to the master, which routes their messages to and from the nodes.
 """
 
-# Threads: each session is opened on a thread "open", so that several meshes are looked for at once, and an endpoint
-# that does not answer costs its deadline and no more (the settings are ADR 4). A process that ends while such a thread
-# is inside Zenoh may abort, so whoever waits for it waits a little longer than the deadline.
-
 from __future__ import annotations
 
 import threading
