@@ -6,6 +6,10 @@ A walk runs a mesh with `launch`. The value is a number or a text that occurs no
 processes and threads that Python starts, looks at each function of fmu_mesh when it is entered and when it returns. It
 is on the way if the value is in an argument or in what it returns: itself, in a text, or up to `DEPTH` containers and
 Structs deep. Functions on threads of Zenoh are not seen, and neither are comprehensions.
+
+The way of a value to an FMU leads through the process that reads the file, and those from which the process of the FMU
+was forked, until the FMU has it. What other processes, or these later, have of it is not on the way: the metadata of
+the result. The way of an error leads to the terminal, through all processes.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ DEPTH = 4
 
 _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGE = f"{_ROOT / 'fmu_mesh'}{os.sep}"
+_OVER = "over"
 _NUMBER, _TEXT = 1.2345678, "the message of this one error"
 _MOST_ITEMS = 200
 """Of a container: longer ones have rows, and the value is no row."""
@@ -49,7 +54,7 @@ class _Walk(msgspec.Struct, frozen=True):
     Attributes:
         value: what is followed.
         folder: of the file into which all processes write.
-        until: the walk is over when a function of this name returns in this folder; empty: with the process.
+        until: the walk is over when a function of this name has returned in this folder; empty: with the processes.
     """
 
     value: float | str
@@ -59,6 +64,24 @@ class _Walk(msgspec.Struct, frozen=True):
     @property
     def file(self) -> Path:
         return Path(self.folder) / "functions"
+
+    def note(self, name: str) -> None:
+        """Note a function, and the process that has entered it."""
+        # Opened each time: a forked process closes files that it does not know, and its end flushes nothing.
+        with self.file.open("a", encoding="utf-8") as functions:
+            functions.write(f"{os.getpid()} {os.getppid()} {name}\n")
+
+    def functions(self) -> set[str]:
+        """The functions on the way, of all that are noted."""
+        noted = [tuple(line.split(" ", 2)) for line in self.file.read_text(encoding="utf-8").splitlines()]
+        over = next((number for number, (*_, name) in enumerate(noted) if name == _OVER), None)
+        if over is None:
+            return {name for *_, name in noted if name}
+        parents = {process: parent for process, parent, _ in noted}
+        way = [noted[over][0]]
+        while (parent := parents.get(way[-1])) is not None:
+            way.append(parent)
+        return {name for process, _, name in noted[:over] if name and process in way}
 
 
 def follow(file: str) -> None:
@@ -75,12 +98,11 @@ def follow(file: str) -> None:
         values = [argument] if event == "return" else frame.f_locals.values()
         if name not in seen and any(_holds(value, walk.value, DEPTH) for value in values):
             seen.add(name)
-            # Opened each time: a forked process closes files that it does not know, and its end flushes nothing.
-            with walk.file.open("a", encoding="utf-8") as functions:
-                functions.write(f"{name}\n")
+            walk.note(name)
         if event == "return" and code.co_name == walk.until[0] and path.startswith(walk.until[1]):
-            sys.setprofile(None)
+            walk.note(_OVER)
 
+    walk.note("")  # so that its parent is known
     threading.setprofile(hook)
     sys.setprofile(hook)
 
@@ -126,7 +148,7 @@ def walked(name: str) -> Walked:
         fails = walk.value == _TEXT
         if (done.returncode == 0) == fails or (_TEXT in done.stderr) != fails:
             raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)
-        functions = sorted(set(walk.file.read_text(encoding="utf-8").splitlines()))
+        functions = sorted(walk.functions())
     return Walked(sorted({function.partition(": ")[0] for function in functions}), functions)
 
 
@@ -137,7 +159,7 @@ _GAIN = _ROOT / "fmus/Gain.fmu"
 def _start_value(folder: Path) -> tuple[_Walk, str, *tuple[str, ...]]:
     """A start value, from the file to the FMU."""
     instances = {"gain": {"fmu": str(_GAIN), "start_values": {"k": _NUMBER}}}
-    return _Walk(_NUMBER, str(folder), _UNTIL_IT_IS_SET), _configuration(folder, instances), "--local"
+    return _Walk(_NUMBER, str(folder), _UNTIL_IT_IS_SET), _configuration(folder, instances)
 
 
 def _ssp_parameter(folder: Path) -> tuple[_Walk, str, *tuple[str, ...]]:
@@ -164,7 +186,6 @@ def _ssp_parameter(folder: Path) -> tuple[_Walk, str, *tuple[str, ...]]:
     return (
         _Walk(_NUMBER, str(folder), _UNTIL_IT_IS_SET),
         "walk.ssp",
-        "--local",
         *("--step-size", "0.01", "--algorithm", "jacobi"),
     )
 

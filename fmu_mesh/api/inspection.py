@@ -333,7 +333,7 @@ def readable_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str
 def variables_of_instance(loaded: LoadedConfig, name: str) -> tuple[Variable, ...]:
     """The variables of an instance; none if there is no such instance, or only its code knows them."""
     section = loaded.config.instances.get(name)
-    if section is None or section.names_code or section.interpreter is not None:
+    if section is None or section.runs_code:
         return ()
     return describe(loaded.resolve(section.path), section, loaded.config.limits).variables
 

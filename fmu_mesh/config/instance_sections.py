@@ -120,6 +120,11 @@ class InstanceSection:
         return str(getattr(self, key_of(self)))
 
     @property
+    def runs_code(self) -> bool:
+        """Whether code runs that the section names: its own, or another Python."""
+        return self.names_code or self.interpreter is not None
+
+    @property
     def retries_steps(self) -> bool:
         """Whether a step that the model discards is repeated in smaller steps."""
         return False

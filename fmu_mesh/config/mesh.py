@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
-from fmu_mesh.config.instance_sections import InstanceSection
+from fmu_mesh.config.instance_sections import InstanceSection, PhysicsSection
 from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
 from fmu_mesh.config.scenario_section import ScenarioConfig
 
@@ -346,6 +346,11 @@ class Config(Base, frozen=True, kw_only=True):
         if isinstance(self.record, RecordConfig):
             return {"record": self.record}
         return {f"record[{index}]": section for index, section in enumerate(self.record)}
+
+    @property
+    def engines(self) -> dict[str, PhysicsSection]:
+        """The sections of the physics engines by instance name."""
+        return {name: section for name, section in self.instances.items() if isinstance(section, PhysicsSection)}
 
     def not_finite(self, section: InstanceSection) -> Literal["stop", "record"]:
         """What an output that is NaN or infinite means for an instance of this mesh."""

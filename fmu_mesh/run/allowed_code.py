@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..config.findings import Findings
-from ..config.instance_sections import InstanceSection, key_of
+from ..config.instance_sections import key_of
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 
@@ -34,7 +34,7 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
     """
     source = loaded.foreign or _other_owner(loaded.file)
     for name, section in loaded.config.instances.items():
-        if not _names_code(section):
+        if not section.runs_code:
             continue
         key, path = key_of(section), loaded.resolve(section.path) if section.path else None
         found, expected = f"Python code, in {source}", "a file of your own, or `allow_code=True`"
@@ -54,7 +54,7 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
 
 def names_code(loaded: LoadedConfig) -> bool:
     """Whether a configuration names code."""
-    return any(map(_names_code, loaded.config.instances.values()))
+    return any(section.runs_code for section in loaded.config.instances.values())
 
 
 def check_owner(path: Path, what: str) -> None:
@@ -67,10 +67,6 @@ def check_owner(path: Path, what: str) -> None:
         raise ConfigurationError(
             f"{what} belongs to another user", hint="`allow_code=True` runs it, with the Python code that it may name."
         )
-
-
-def _names_code(section: InstanceSection) -> bool:
-    return section.names_code or section.interpreter is not None
 
 
 def _other_owner(file: Path) -> str:

@@ -47,19 +47,18 @@ class _Coupling(msgspec.Struct, frozen=True):
 
 
 def coupled_connections(
-    config: Config, variables: Variables, explicit: Sequence[Connection], findings: Findings
+    engines: Mapping[str, PhysicsSection], variables: Variables, explicit: Sequence[Connection], findings: Findings
 ) -> tuple[Connection, ...]:
     """The connections that follow from the sections of all physics engines, beside the ``explicit`` ones of the file.
 
     An instance without a model description gets none.
     """
     found: list[Connection] = []
-    couplings = [*_couplings(config)]
     # Controllers first: actuators take their efforts.
-    for coupling in sorted(couplings, key=lambda coupling: isinstance(coupling.config, ActuatorConfig)):
+    for coupling in sorted(_couplings(engines), key=lambda coupling: isinstance(coupling.config, ActuatorConfig)):
         found += _connect(coupling, variables, [*explicit, *found], findings)
         if isinstance(coupling.config, ActuatorConfig):
-            _check_command(config, coupling, findings)
+            _check_command(engines[coupling.engine], coupling, findings)
     return tuple(found)
 
 
@@ -70,14 +69,14 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     because the engine does not use it. Some of the descriptions, with arrays in their sizes, may be missing.
     """
     ignored = Findings("")  # `fmu_mesh.system.system` reports them
-    variables = Variables(descriptions, config.instances)
+    engines, variables = config.engines, Variables(descriptions, [*config.instances])
     explicit = resolve_connections(config.connections, variables, ignored)
-    connections = (*explicit, *coupled_connections(config, variables, explicit, ignored))
+    connections = (*explicit, *coupled_connections(engines, variables, explicit, ignored))
     driven = {f"{c.target_instance}.{c.target.name}": _FREE for c in connections}
     # Also the target of a connection whose source does not exist.
     driven |= {connection.target: _FREE for connection in config.connections}
-    for name, engine in config.instances.items():
-        for actuator in engine.actuators if isinstance(engine, PhysicsSection) else ():
+    for name, engine in engines.items():
+        for actuator in engine.actuators:
             if actuator.enabled:
                 own = actuator.variable_names.get("actuatorInput", "actuatorInput")
                 instead = (
@@ -87,20 +86,18 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     return driven
 
 
-def _check_command(config: Config, coupling: _Coupling, findings: Findings) -> None:
+def _check_command(engine: PhysicsSection, coupling: _Coupling, findings: Findings) -> None:
     """Refuse a start value of an effort command that the engine does not use because there is an actuator."""
     command = coupling.reads["actuatorInput"]
-    if command in config.instances[coupling.engine].start_values:
+    if command in engine.start_values:
         own = coupling.config.variable_names.get("actuatorInput", "actuatorInput")
         found = f"a start value for '{command}', although the joint has the actuator '{coupling.config.name}'"
         path = f"instances.{coupling.engine}.start_values.{command}"
         findings.add(path, found, f"a start value of '{coupling.config.instance}.{own}'")
 
 
-def _couplings(config: Config) -> Iterator[_Coupling]:
-    for name, engine in config.instances.items():
-        if not isinstance(engine, PhysicsSection):
-            continue
+def _couplings(engines: Mapping[str, PhysicsSection]) -> Iterator[_Coupling]:
+    for name, engine in engines.items():
         sections: tuple[tuple[str, Sequence[AnyCoupling]], ...] = (
             ("controllers", engine.controllers),
             ("actuators", engine.actuators),

@@ -114,7 +114,10 @@ def plan_initialization(system: ResolvedSystem, connections: Sequence[Connection
 
 
 def check_loops(
-    plan: InitializationPlan, connections: Sequence[Connection], system: ResolvedSystem, findings: Findings
+    plan: InitializationPlan,
+    connections: Sequence[Connection],
+    descriptions: Mapping[str, ModelDescription],
+    findings: Findings,
 ) -> None:
     """Refuse parameters of FMI 1.0 in a loop: they cannot be set again after the initialization.
 
@@ -124,7 +127,7 @@ def check_loops(
     wrong = False
     for c in connections:
         target, source = c.target_instance, (c.source_instance, c.source.name)
-        if not c.initial_only or not system.instances[target].description.fmi_version.startswith("1"):
+        if not c.initial_only or not descriptions[target].fmi_version.startswith("1"):
             continue
         if any(source in loop.outputs and any(name == target for name, _ in loop.outputs) for loop in plan.loops):
             found = f"{c}, whose value depends on '{target}' itself in the initialization"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import msgspec
 
 from ..config.findings import Findings
-from ..config.instance_sections import InstanceSection
 from ..variables.model_description import ModelDescription
 from .connections import Connection
 
@@ -29,15 +28,18 @@ class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def check_extrapolation(
     connections: Sequence[Connection],
-    sections: Mapping[str, InstanceSection],
+    retrying: Collection[str],
     descriptions: Mapping[str, ModelDescription],
     findings: Findings,
 ) -> None:
-    """Add a finding for every `extrapolation: linear` whose target cannot take the derivative of an input."""
+    """Add a finding for every `extrapolation: linear` whose target cannot take the derivative of an input.
+
+    Discarded steps of the ``retrying`` instances are retried.
+    """
     for connection in connections:
         if connection.extrapolation == "linear":
             target = connection.target_instance
-            reason = _cannot_extrapolate(connection, descriptions[target], retries=sections[target].retries_steps)
+            reason = _cannot_extrapolate(connection, descriptions[target], retries=target in retrying)
             if reason is not None:
                 found = f"linear for {connection}, but {reason}"
                 findings.add(f"{connection.path}.extrapolation", found, "hold")

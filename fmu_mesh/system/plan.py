@@ -222,11 +222,14 @@ def make_plan(
     """
     findings = Findings(system.config.mesh) if findings is None else findings
     algorithm = system.config.simulation.algorithm
-    connections, closing, order, cycles = execution_order(system.instances, system.connections, algorithm, findings)
+    names = [*system.instances]
+    connections, closing, order, cycles = execution_order(names, system.connections, algorithm, findings)
     initialization = plan_initialization(system, connections)
-    check_loops(initialization, connections, system, findings)
+    descriptions = {name: own.description for name, own in system.instances.items()}
+    check_loops(initialization, connections, descriptions, findings)
     outputs = _output_layouts(system, connections)
-    points = window_of(system, outputs.values(), window)
+    configured = window if window is not None else system.config.simulation.window
+    points = window_of(configured, outputs.values())
     plan = Plan(
         system=system,
         connections=connections,

@@ -129,14 +129,15 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
         for name, description in descriptions.items()
         if name in config.instances
     }
-    variables = Variables(descriptions, config.instances)
+    variables = Variables(descriptions, [*config.instances])
     grid = _grid(config, collected)
     instances = _instances(loaded, descriptions, collected)
     forbidden_start_values(config, descriptions, collected, strict=True)
     _check_nodes(config, descriptions, claims, collected)
     connections = resolve_connections(config.connections, variables, collected)
-    check_extrapolation(connections, config.instances, descriptions, collected)
-    connections += coupled_connections(config, variables, connections, collected)
+    retrying = {name for name, section in config.instances.items() if section.retries_steps}
+    check_extrapolation(connections, retrying, descriptions, collected)
+    connections += coupled_connections(config.engines, variables, connections, collected)
     if obstacles is not None:
         obstacles.explain(collected.places)
     of_files = collected if obstacles is None else obstacles
@@ -147,7 +148,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     _check_zenoh(loaded, collected)
     if len(collected):
         collected.merge(obstacles or ())
-        execution_order(instances, connections, config.simulation.algorithm, collected)  # for its findings
+        execution_order([*instances], connections, config.simulation.algorithm, collected)  # for its findings
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
         missing = [name for name in config.instances if name not in descriptions]

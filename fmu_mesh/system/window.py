@@ -5,10 +5,10 @@ Owns what memory bounds: narrow rows may wait in thousands, of wide ones (images
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
+from typing import Literal
 
 from .layout import Layout, row_bytes
-from .system import ResolvedSystem
 
 __all__ = [
     "AUTO_WINDOW_POINTS",
@@ -45,18 +45,17 @@ def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
     return max(window, min(RECORDER_WINDOW, _ROOM_BYTES // max(sum(row_sizes), 1)))
 
 
-def window_of(system: ResolvedSystem, outputs: Iterable[Layout], asked: int | None = None) -> int:
+def window_of(configured: int | Literal["auto"], outputs: Collection[Layout]) -> int:
     """The window of a mesh in points; `auto` is as large as the memory for the rows allows.
 
     A large window costs memory only. Values do not depend on it, and a pause takes effect soon at every window: see
-    `fmu_mesh.master.granting`. So of wide rows, a window that is configured is only as large as memory should be. One
-    that is ``asked`` for counts instead of that of the configuration.
+    `fmu_mesh.master.granting`. So of wide rows, a window that is configured is only as large as memory should be.
+    ``outputs`` are those of each instance.
     """
-    configured = asked if asked is not None else system.config.simulation.window
     widest = max(1, *(layout.row_size for layout in outputs))
     if configured != "auto":
         return min(configured, max(_LEAST_POINTS, _MOST_BYTES // widest))
-    points = min(AUTO_WINDOW_POINTS, max(STEADY_POINTS, AUTO_WINDOW_ROWS // len(system.instances)))
+    points = min(AUTO_WINDOW_POINTS, max(STEADY_POINTS, AUTO_WINDOW_ROWS // len(outputs)))
     return max(_LEAST_POINTS, min(points, _ROOM_BYTES // widest))
 
 

@@ -8,8 +8,8 @@ from tests.walks import WALKS, walked
 
 # They only get smaller. The error takes a few functions more if the recorder hears of it before it has ended.
 MOST = {
-    "start value": (36, 102),
-    "SSP parameter": (45, 121),
+    "start value": (30, 88),
+    "SSP parameter": (39, 107),
     "error of a component": (29, 70),
 }
 
