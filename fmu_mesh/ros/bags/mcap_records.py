@@ -14,9 +14,8 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, NamedTuple, Self
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
@@ -74,29 +73,32 @@ def finish_mcap(path: Path, kept: Kept) -> int:
     return rows
 
 
-class _PlacedChunk:
-    """A chunk without its data, and the message indexes that follow it.
+class _PlacedChunk(NamedTuple):
+    """Where a chunk is, and the number of messages of each channel in it."""
 
-    Attributes:
-        length: of its record.
-        indexes: the offset of the message index of each channel.
-        index_length: of all of these records.
-        counts: the number of messages of each channel.
-    """
+    index: ChunkIndex
+    counts: Counter[int]
 
-    def __init__(self, offset: int, length: int, chunk: Chunk) -> None:
-        self.offset = offset
-        self.length = length
-        self.compressed_size = len(chunk.data)
-        self.chunk = replace(chunk, data=b"")
-        self.indexes: dict[int, int] = {}
-        self.index_length = 0
-        self.counts: dict[int, int] = {}
+    @classmethod
+    def at(cls, offset: int, length: int, chunk: Chunk) -> Self:
+        """A chunk whose message indexes are still to come."""
+        index = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            message_end_time=chunk.message_end_time,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=chunk.message_start_time,
+            uncompressed_size=chunk.uncompressed_size,
+        )
+        return cls(index, Counter())
 
     def add(self, index: MessageIndex, offset: int, length: int) -> None:
         """Add the next message index."""
-        self.indexes[index.channel_id] = offset
-        self.index_length += length
+        self.index.message_index_offsets[index.channel_id] = offset
+        self.index.message_index_length += length
         self.counts[index.channel_id] = len(index.records)
 
 
@@ -144,8 +146,8 @@ class McapContent:
 
     def records_of(self, placed: _PlacedChunk) -> list[McapRecord]:
         """The schemas, channels and messages of a chunk."""
-        self.file.seek(placed.offset + _HEAD.size)
-        return breakup_chunk(Chunk.read(self._record(placed.length)), validate_crc=True)
+        self.file.seek(placed.index.chunk_start_offset + _HEAD.size)
+        return breakup_chunk(Chunk.read(self._record(placed.index.chunk_length)), validate_crc=True)
 
     def whole_rows(self) -> tuple[int, int]:
         """The number of whole rows, and the index of the first chunk that has messages of another one."""
@@ -189,7 +191,7 @@ class McapContent:
 
     def _look(self, offset: int, opcode: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
-            self.chunks.append(_PlacedChunk(offset, length, Chunk.read(self._record(length))))
+            self.chunks.append(_PlacedChunk.at(offset, length, Chunk.read(self._record(length))))
         elif opcode == Opcode.MESSAGE_INDEX:
             self.chunks[-1].add(MessageIndex.read(self._record(length)), offset, length)
         elif opcode == Opcode.METADATA:
@@ -206,7 +208,7 @@ def _write_end(file: BinaryIO, content: McapContent, rows: int, changed: int) ->
     first = min(changed, len(content.chunks) - 1)
     records = [r for r in content.records_of(content.chunks[first]) if not isinstance(r, Message) or r.sequence < rows]
     registered = [record for record in content.records_of(content.chunks[0]) if not isinstance(record, Message)]
-    kept, start = content.chunks[:first], content.chunks[first].offset
+    kept, start = content.chunks[:first], content.chunks[first].index.chunk_start_offset
     notes = [(offset, length, note) for offset, length, note in content.notes if offset < start]
     later = [note for offset, _, note in content.notes if offset > start and note.name != ROWS]
     file.seek(start)
@@ -238,7 +240,7 @@ def _write_chunk(file: BinaryIO, records: Sequence[McapRecord]) -> _PlacedChunk:
     chunk = Chunk("", data, max(stamps), min(stamps), zlib.crc32(data), len(data))
     offset = file.tell()
     chunk.write(out)
-    placed = _PlacedChunk(offset, out.count, chunk)
+    placed = _PlacedChunk.at(offset, out.count, chunk)
     file.write(_taken(out))
     for index in indexes.values():
         offset = file.tell()
@@ -257,17 +259,15 @@ def _write_summary(
     """Write what `mcap.writer` writes at the end: the summary, its offsets and the footer."""
     schemas = [record for record in registered if isinstance(record, Schema)]
     channels = [record for record in registered if isinstance(record, Channel)]
-    counts: Counter[int] = Counter()
-    for placed in chunks:
-        counts.update(placed.counts)
+    counts = sum((placed.counts for placed in chunks), Counter[int]())
     statistics = Statistics(
         attachment_count=0,
         channel_count=len(channels),
         channel_message_counts=dict(counts),
         chunk_count=len(chunks),
         message_count=counts.total(),
-        message_end_time=max(placed.chunk.message_end_time for placed in chunks),
-        message_start_time=min(placed.chunk.message_start_time for placed in chunks),
+        message_end_time=max(placed.index.message_end_time for placed in chunks),
+        message_start_time=min(placed.index.message_start_time for placed in chunks),
         metadata_count=len(notes),
         schema_count=len(schemas),
     )
@@ -275,7 +275,7 @@ def _write_summary(
         (Opcode.SCHEMA, schemas),
         (Opcode.CHANNEL, channels),
         (Opcode.STATISTICS, [statistics]),
-        (Opcode.CHUNK_INDEX, [_chunk_index(placed) for placed in chunks]),
+        (Opcode.CHUNK_INDEX, [placed.index for placed in chunks]),
         (Opcode.METADATA_INDEX, [MetadataIndex(offset, length, note.name) for offset, length, note in notes]),
     ]
     start, out, offsets = file.tell(), RecordBuilder(), []
@@ -291,21 +291,6 @@ def _write_summary(
     crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offsets_start), zlib.crc32(summary))
     Footer(start, offsets_start, crc).write(out)
     file.write(summary + _taken(out) + _MAGIC)
-
-
-def _chunk_index(placed: _PlacedChunk) -> ChunkIndex:
-    chunk = placed.chunk
-    return ChunkIndex(
-        chunk_length=placed.length,
-        chunk_start_offset=placed.offset,
-        compression=chunk.compression,
-        compressed_size=placed.compressed_size,
-        message_end_time=chunk.message_end_time,
-        message_index_length=placed.index_length,
-        message_index_offsets=placed.indexes,
-        message_start_time=chunk.message_start_time,
-        uncompressed_size=chunk.uncompressed_size,
-    )
 
 
 def _taken(out: RecordBuilder) -> bytes:
