@@ -118,7 +118,7 @@ class McapFile:
     def pieces(path: Path, types: Mapping[str, VariableType]) -> Iterator[Columns]:  # noqa: ARG004 the file has them
         """All rows. What a field has rounded, such as a Float64 in a float32, comes back rounded."""
         _writer_class()
-        from .mcap_reading import read_mcap  # noqa: PLC0415 an optional dependency
+        from .mcap_records import read_mcap  # noqa: PLC0415 an optional dependency
 
         yield read_mcap(path)
 
