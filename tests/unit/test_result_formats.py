@@ -291,6 +291,26 @@ def test_a_recovered_bag_has_its_index_and_the_sums_are_right(tmp_path: Path) ->
     assert_rows(path, rows, types)
 
 
+def test_a_recovered_bag_of_every_third_point_has_its_last_rows(tmp_path: Path) -> None:
+    types: list[VariableType] = ["Float64", "Int32"]
+    path = tmp_path / "a.mcap"
+    file = McapFile.open(path, msgspec.structs.replace(recording(types), first=2, every=3))
+    points = np.arange(2, 2 + 3 * 20, 3)
+    file.write(points * 0.1, [values_of(type_, 20) for type_ in types])
+    file.flush()
+    whole = path.read_bytes()
+    file.close()
+    path.write_bytes(whole)
+
+    rows = fmu_mesh.recover(path)
+
+    result = fmu_mesh.Result.read(path)
+    assert rows == 20
+    assert np.allclose(result.times, points * 0.1)
+    for type_ in types:
+        assert same(result[f"it.{type_}"], values_of(type_, 20)), type_
+
+
 @FORMATS
 def test_a_complete_file_is_not_changed_by_recover(tmp_path: Path, format_: ResultFormat, name: str) -> None:
     file = format_.open(tmp_path / name, recording())

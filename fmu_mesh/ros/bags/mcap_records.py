@@ -322,7 +322,8 @@ def _write_end(file: BinaryIO, content: McapContent, rows: int, changed: int) ->
     """Write the end of a file after its whole rows; from the chunk ``changed`` on there are messages of another row."""
     # The last chunk is always written again: its message indexes may be missing.
     first = min(changed, len(content.chunks) - 1)
-    records = [r for r in content.records_of(content.chunks[first]) if not isinstance(r, Message) or r.sequence < rows]
+    end = content.recording.first + rows * content.recording.every  # the point of the first row that is left out
+    records = [r for r in content.records_of(content.chunks[first]) if not isinstance(r, Message) or r.sequence < end]
     registered = [record for record in content.records_of(content.chunks[0]) if not isinstance(record, Message)]
     kept, start = content.chunks[:first], content.chunks[first].index.chunk_start_offset
     notes = [(offset, length, note) for offset, length, note in content.notes if offset < start]
