@@ -12,7 +12,7 @@ import msgspec
 
 from .system_structure import ConnectorKind
 
-__all__ = ["GRAMMAR", "NAMESPACES", "PATTERNS", "TYPES", "Attribute", "Rule", "number_of"]
+__all__ = ["GRAMMAR", "NAMESPACES", "PATTERNS", "TYPES", "Attribute", "Rule"]
 
 NAMESPACES: Final = {
     "ssd": "http://ssp-standard.org/SSP1/SystemStructureDescription",
@@ -32,7 +32,7 @@ PATTERNS: Final = {
     "size": re.compile(r"\+?[0-9]{1,20}"),
     "boolean": re.compile(r"true|false|0|1"),
 }
-"""The values of attributes by type, after XML Schema."""
+"""The values of attributes by type, after XML Schema; `float` reads a number, `INF` and `NaN` included."""
 
 _IN_WORDS: Final = {
     "text": "a text",
@@ -218,13 +218,3 @@ GRAMMAR: Final[dict[str, Rule]] = {
     "ssb:DictionaryEntry": _rule(_NAMED, f"{_ONE_OF_THE_TYPES} ssc:Dimension* {_META} ssb:Annotations"),
 }
 """By tag with the usual prefix."""
-
-
-def number_of(text: str) -> float:
-    """The value of a text that is an xs:double, exactly as Python reads the same digits.
-
-    Example:
-        >>> number_of("1e-3"), number_of("-INF")
-        (0.001, -inf)
-    """
-    return float(text.replace("INF", "inf"))

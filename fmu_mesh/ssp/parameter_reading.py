@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from ..text import listed, shown
 from ..variables.value_types import FMI2_TYPES, INTEGERS, TYPES, VariableType
 from .file_definitions import enumeration_named, enumerations_of, transformation_of, unit_named, units_of
-from .grammar import PATTERNS, number_of
+from .grammar import PATTERNS
 from .problems import Problems
 from .system_structure import Enumeration, MappingEntry, ParameterMapping, ParameterSet, ParameterValue, Unit
 from .xml_reading import XmlElement
@@ -187,7 +187,7 @@ def _is_value(text: str, kind: str) -> bool:
         case "Real" | "Float64" | "Float32" if text in ("INF", "-INF", "NaN"):
             return True
         case "Real" | "Float64" | "Float32":  # digits must not become infinite
-            return bool(PATTERNS["number"].fullmatch(text)) and abs(number_of(text)) <= _LARGEST[kind]
+            return bool(PATTERNS["number"].fullmatch(text)) and abs(float(text)) <= _LARGEST[kind]
         case "Boolean":
             return bool(PATTERNS["boolean"].fullmatch(text))
         case "Binary":

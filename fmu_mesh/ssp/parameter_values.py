@@ -20,7 +20,6 @@ from ..variables.units import Linear, conversion
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import INTEGERS, PlainValue, VariableType, flattened, is_float, nested
 from .flattening import PathChange
-from .grammar import number_of
 from .parameter_reading import VARIABLE_TYPES
 from .problems import Problems
 from .system_structure import Connector, FilePlace, MappingEntry, ParameterValue, Transformation, Unit
@@ -148,7 +147,7 @@ def changed(
         target = target_of_variable(variable, path)
     elements = flattened(value.value, len(value.shape))
     if is_float(value.type):
-        elements = [number_of(one) if isinstance(one, str) else one for one in elements]
+        elements = [float(one) if isinstance(one, str) else one for one in elements]
     try:
         value, elements, steps = _connected(value, elements, change)
         return _as_target(value, elements, target, ", ".join(steps))
@@ -363,8 +362,8 @@ def _formula(linear: Linear) -> str:
 
 
 _PARSERS: Final[dict[VariableType, Callable[[str], Any]]] = {
-    "Float64": number_of,
-    "Float32": number_of,
+    "Float64": float,
+    "Float32": float,
     "Boolean": lambda text: text in ("true", "1"),
     "String": str,
     "Enumeration": str,

@@ -26,7 +26,7 @@ from ..system.graph import feedback_edges, fewest_feedback_edges
 from ..text import listed, meant, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable
 from .flattening import FlatConnection, flatten
-from .grammar import PATTERNS, number_of
+from .grammar import PATTERNS
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
 from .package import DEFAULT, RESULT_BESIDE_PACKAGE, Package
@@ -413,7 +413,7 @@ def _step_size(
         wanted, attribute = places.get(annotation.type, ("", ""))
         for text in (attributes.get(attribute) for name, attributes in annotation.elements if name == wanted):
             number = (text or "").strip()
-            value = number_of(number) if PATTERNS["number"].fullmatch(number) else math.nan
+            value = float(number) if PATTERNS["number"].fullmatch(number) else math.nan
             if math.isfinite(value) and value > 0.0:
                 return value, annotation
             problems.add(annotation.place, words.format(wanted, attribute, text), "a step size > 0 in s")

@@ -17,7 +17,7 @@ from lxml import etree
 from ..archives.safe_xml import safe_xml, syntax_error
 from ..errors import LoadFailed
 from ..text import listed, nearest, printable, shown
-from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule, number_of
+from .grammar import GRAMMAR, NAMESPACES, PATTERNS, Attribute, Rule
 from .problems import Problems
 from .system_structure import Annotation, FilePlace
 
@@ -87,7 +87,7 @@ class XmlElement:
     def optional_number(self, name: str) -> float | None:
         """A number; None where it is not given, or is no number."""
         text = (self.get(name) or "").strip()
-        return number_of(text) if PATTERNS["number"].fullmatch(text) else None
+        return float(text) if PATTERNS["number"].fullmatch(text) else None
 
     def integer(self, name: str, default: int = 0) -> int:
         """A whole number; ``default`` where it is not given, or is none."""

@@ -8,7 +8,6 @@ import pytest
 
 from fmu_mesh.errors import Finding
 from fmu_mesh.ssp.file_definitions import enumeration_named, enumerations_of, unit_named, units_of
-from fmu_mesh.ssp.grammar import number_of
 from fmu_mesh.ssp.parameter_reading import parameter_mapping, parameter_set
 from fmu_mesh.ssp.problems import Problems
 from fmu_mesh.ssp.system_structure import Enumeration, ParameterMapping, ParameterSet, Transformation, Unit
@@ -44,6 +43,13 @@ def _mapping(entries: str, version: str = "2.0") -> tuple[ParameterMapping, Prob
     root = read_xml(text.encode(), "x.ssm", "ssm:ParameterMapping", problems)
     assert root is not None
     return parameter_mapping(root, problems), problems
+
+
+def _factor(text: str) -> float:
+    """What an attribute of a number is read as; 0.0 if it is none."""
+    unit = f'<ssv:Units><ssc:Unit name="m"><ssc:BaseUnit factor="{text}"/></ssc:Unit></ssv:Units>'
+    [element] = [one for one in _values(unit, Problems()).own_elements() if one.tag == "ssc:BaseUnit"]
+    return element.number("factor", 0.0)
 
 
 def _one(found: list[Finding]) -> str:
@@ -461,6 +467,8 @@ def test_an_entry_without_a_source_or_a_target_is_a_finding(attribute: str) -> N
 
 
 def test_a_number_is_read_as_python_reads_its_digits() -> None:
-    assert [number_of(text) for text in ("0.1", "-1e-308", "+.5", "5.")] == [0.1, -1e-308, 0.5, 5.0]
-    assert number_of("INF") == math.inf
-    assert math.isnan(number_of("NaN"))
+    factors = [_factor(text) for text in ("0.1", "-1e-308", "+.5", "5.", "INF", "-INF")]
+
+    assert factors == [0.1, -1e-308, 0.5, 5.0, math.inf, -math.inf]
+    assert math.isnan(_factor("NaN"))
+    assert _factor("inf") == _factor("nan") == _factor("1_0") == 0.0
