@@ -47,19 +47,13 @@ def units_of(
         if used and used not in units:
             undefined.setdefault(used, element.place)
     if undefined:
-        _warn_undefined(undefined, [unit.name for unit in units.values() if unit.base is not None], problems)
+        [first, *others] = undefined
+        what, values = ("the units", "them") if others else ("the unit", "it")
+        found = f"{what} {listed([*map(shown, undefined)])}, which the file does not define: values in {values}"
+        defined = [unit.name for unit in units.values() if unit.base is not None]
+        expected = _defined("" if others else first, defined, "Unit")
+        problems.warn(undefined[first], f"{found} are not converted", expected)
     return {**units, **{name: Unit(name) for name in undefined}}
-
-
-def _warn_undefined(undefined: Mapping[str, FilePlace], defined: Collection[str], problems: Problems) -> None:
-    """One warning about all units that a file uses and does not define."""
-    names, place = [*undefined], next(iter(undefined.values()))
-    if len(names) == 1:
-        found = f"the unit {shown(names[0])}, which the file does not define: values in it are not converted"
-        problems.warn(place, found, _defined(names[0], defined, "Unit"))
-        return
-    found = f"the units {listed([shown(name) for name in names])}, which the file does not define: values in them"
-    problems.warn(place, f"{found} are not converted", _defined("", defined, "Unit"))
 
 
 def _defined(name: str, defined: Collection[str], kind: Literal["Unit", "Enumeration"]) -> str:
@@ -118,9 +112,14 @@ def transformation_of(element: XmlElement, problems: Problems) -> Transformation
         if second.tag != found[0].tag:  # of the same element, there is a finding
             problems.add(second.place, "a second transformation", "one at most")
     kind = _KINDS[found[0].tag]
-    if kind == "linear":
-        return _linear(found[0], problems)
-    return Transformation(kind, found[0].place, entries=_entries(found[0], kind, problems))
+    place = found[0].place
+    if kind != "linear":
+        return Transformation(kind, place, entries=_entries(found[0], kind, problems))
+    factor, offset = found[0].number("factor", 1.0), found[0].number("offset", 0.0)
+    if not (math.isfinite(factor) and math.isfinite(offset)):
+        problems.add(place, f"factor {factor:g} and offset {offset:g}", "finite numbers")
+        return Transformation(kind, place)
+    return Transformation(kind, place, factor, offset)
 
 
 def _unique(root: XmlElement, tag: str, child: str, problems: Problems) -> Iterator[XmlElement]:
@@ -150,14 +149,6 @@ def _base_unit(element: XmlElement, problems: Problems) -> BaseUnit | None:
     found = f"factor {unit.factor:g} and offset {unit.offset:g}"
     problems.add(element.place, found, "a finite factor that is not 0, and a finite offset")
     return None
-
-
-def _linear(element: XmlElement, problems: Problems) -> Transformation:
-    factor, offset = element.number("factor", 1.0), element.number("offset", 0.0)
-    if not (math.isfinite(factor) and math.isfinite(offset)):
-        problems.add(element.place, f"factor {factor:g} and offset {offset:g}", "finite numbers")
-        factor, offset = 1.0, 0.0
-    return Transformation("linear", element.place, factor, offset)
 
 
 def _entries(element: XmlElement, kind: str, problems: Problems) -> dict[str, str]:

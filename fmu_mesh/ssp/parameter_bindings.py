@@ -7,6 +7,7 @@ lower level, and at one level the later one. What a value becomes is `parameter_
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import islice
 from typing import Final
 
@@ -231,7 +232,8 @@ class _Resolution:
                     continue
                 values[name] = value
                 if variable.causality == "structuralParameter":
-                    sizes |= _size(value, variable)
+                    with suppress(ValueRefused):  # out of its range: the plan has a finding for it
+                        sizes[name] = to_value(value.value, variable)
             description = description.sized(sizes)
         return {name: values[name] for name in candidates if name in values}
 
@@ -242,11 +244,3 @@ def _systems_of(system: StructureSystem, path: Path) -> Iterator[tuple[Path, Str
     for element in system.elements:
         if isinstance(element, StructureSystem):
             yield from _systems_of(element, (*path, element.name))
-
-
-def _size(value: AppliedValue, variable: Variable) -> dict[str, Value]:
-    """The value of a structural parameter; none if it is out of its range, which the plan has a finding for."""
-    try:
-        return {variable.name: to_value(value.value, variable)}
-    except ValueRefused:
-        return {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import posixpath
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeVar, cast, get_args
+from typing import Final, NamedTuple, TypeVar, cast, get_args
 
 from msgspec.structs import replace
 
@@ -46,10 +46,6 @@ _PACKAGE: Final = "application/x-ssp-package"
 _SET: Final = "application/x-ssp-parameter-set"
 _MAPPING: Final = "application/x-ssp-parameter-mapping"
 _MODELICA: Final = "text/x-modelica"
-_IMPLEMENTATIONS: Final[dict[str, Literal["any", "CoSimulation", "ModelExchange"]]] = {
-    "CoSimulation": "CoSimulation",
-    "ModelExchange": "ModelExchange",
-}
 _MAXIMUM_DEPTH: Final = 32
 """Most systems inside one another."""
 
@@ -63,11 +59,12 @@ def read_structure(package: Package, name: str, problems: Problems) -> Structure
 
 
 class _File(NamedTuple):
-    """What elements of one file refer to."""
+    """What elements of one file refer to; ``around`` are the files and systems that are read while this one is."""
 
     name: str
     units: dict[str, Unit]
     enumerations: dict[str, Enumeration]
+    around: tuple[str, ...]
 
     @property
     def folder(self) -> str:
@@ -97,16 +94,8 @@ class _Reader:
         self._problems = problems
         self._connections = 0
         self._nested_systems = 0
-        self._being_read: list[str] = []
 
-    def structure(self, name: str, depth: int) -> Structure | None:
-        self._being_read.append(name)
-        try:
-            return self._structure(name, depth)
-        finally:
-            self._being_read.pop()
-
-    def _structure(self, name: str, depth: int) -> Structure | None:
+    def structure(self, name: str, depth: int, around: tuple[str, ...] = ()) -> Structure | None:
         root = self._root(name, "ssd:SystemStructureDescription")
         if root is None:
             return None
@@ -114,6 +103,7 @@ class _Reader:
             name,
             units_of(root, "ssd:Units", self._problems),
             enumerations_of(root, "ssd:Enumerations", self._problems),
+            (*around, name),
         )
         self._not_verified(root)
         top = root.child("ssd:System")
@@ -197,7 +187,7 @@ class _Reader:
             name=element.text("name"),
             source=name,
             place=element.place,
-            implementation=_IMPLEMENTATIONS.get(implementation or "", "any"),
+            implementation=implementation if implementation in ("CoSimulation", "ModelExchange") else "any",
             connectors=self._connectors(element, file),
             bindings=self._bindings(element, file, name),
             annotations=element.annotations(),
@@ -223,10 +213,10 @@ class _Reader:
             name = self._package.named_by(uri, file.folder, element.place, self._problems)
             if name is not None and not name.lower().endswith(".ssd"):
                 name = posixpath.join(name, fragment or DEFAULT)
-            if name in self._being_read:
+            if name in file.around:
                 self._problems.add(element.place, f"the system '{name}' inside itself", "another system")
             elif name is not None:
-                structure = self.structure(name, depth + 1)
+                structure = self.structure(name, depth + 1, file.around)
                 system = structure.system if structure is not None else None
         if system is None:
             return self._unknown(element, file)
@@ -240,13 +230,10 @@ class _Reader:
             self._problems.add(element.place, f"the source '#{identifier}'", f"the id of a System in {file.name}")
             return None
         own = f"{file.name}#{identifier}"
-        if own in self._being_read or element.is_inside(definition):
+        if own in file.around or element.is_inside(definition):
             self._problems.add(element.place, f"the system '#{identifier}' inside itself", "another system")
             return None
-        self._being_read.append(own)
-        system = self._system(definition, file, depth + 1)
-        self._being_read.pop()
-        return system
+        return self._system(definition, file._replace(around=(*file.around, own)), depth + 1)
 
     def _unknown(self, element: XmlElement, file: _File) -> StructureSystem:
         """What stands for a component that cannot be read, for which there is a finding."""

@@ -44,11 +44,6 @@ class _Document(NamedTuple):
     file: str
     lines: Mapping[Any, int]
 
-    def place(self, element: Any) -> FilePlace:  # noqa: ANN401  lxml ships no types
-        """Where an element is."""
-        line = self.lines.get(element) or element.sourceline or 0
-        return FilePlace(self.file, line, printable(_in_words(element)))
-
 
 class XmlElement:
     """An element of a file that was checked; its attributes have valid values, or there is a finding about them.
@@ -68,7 +63,8 @@ class XmlElement:
     @property
     def place(self) -> FilePlace:
         """Its file and line, and its name in words: `Connector 'u' of Component 'gain'`."""
-        return self._document.place(self._element)
+        line = self._document.lines.get(self._element) or self._element.sourceline or 0
+        return FilePlace(self._document.file, line, printable(_in_words(self._element)))
 
     def get(self, name: str) -> str | None:
         """An attribute as text; None if it is not given."""
@@ -139,17 +135,12 @@ class XmlElement:
 
     def with_id(self, identifier: str) -> XmlElement | None:
         """The element of the whole file with this `id`; None if there is none."""
-        for element in self._element.getroottree().iter():
-            if isinstance(element.tag, str) and element.get("id") == identifier:
-                return XmlElement(element, self._document, self.version)
-        return None
+        found = self._element.xpath("//*[@id = $identifier]", identifier=identifier)
+        return XmlElement(found[0], self._document, self.version) if found else None
 
     def is_inside(self, other: XmlElement) -> bool:
         """Whether this element is another one, or anywhere inside it."""
-        own: Any = self._element
-        while own is not None and own is not other._element:
-            own = own.getparent()
-        return own is not None
+        return self._element is other._element or other._element in self._element.iterancestors()
 
     def check(self, problems: Problems) -> None:
         """Check this element and all that is inside it against the grammar."""
