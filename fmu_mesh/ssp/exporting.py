@@ -21,7 +21,7 @@ from ..archives.archive_entries import checked_archive, entry_name
 from ..archives.safe_xml import safe_xml
 from ..config.findings import Findings
 from ..config.loading import PlainConfig, read_file
-from ..config.mesh import Config, LimitsConfig
+from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..files import archive_on_the_way, beside, is_file, is_folder
 from ..system.system import ResolvedSystem
@@ -82,14 +82,17 @@ def export(
     if path.suffix.lower() != ".ssp":
         raise ConfigurationError(f"'{path}' is no name of a package", hint="Let it end in '.ssp'.")
     kept = _kept_package(plain)
-    if kept is not None and (version is None or kept.is_of(version)):
-        place = (kept.root / kept.name,) if is_folder(kept.root) else (kept.root, kept.name)
-        original = read_system(*place, annotated=False)
-        Findings(kept.shown, first=original.findings).raise_any()  # the package may have changed since it was read
-        if json.dumps(_content(plain.data)) == json.dumps(_content(original.data)):
-            return _write_copy(plain, original, kept, path)
-    units = _write_new(plain, resolve, path, version or "1.0")
-    return kept.lost(units) if kept is not None else ()
+    try:
+        if kept is not None and (version is None or kept.is_of(version)):
+            place = (kept.root / kept.name,) if is_folder(kept.root) else (kept.root, kept.name)
+            original = read_system(*place, annotated=False)
+            Findings(kept.shown, first=original.findings).raise_any()  # the package may have changed since it was read
+            if json.dumps(_content(plain.data)) == json.dumps(_content(original.data)):
+                return _write_copy(plain, original, kept, path)
+        units = _write_new(plain, resolve, path, version or "1.0")
+        return kept.lost(units) if kept is not None else ()
+    except LoadFailed as error:  # of the package, or of an FMU
+        raise ConfigurationError(error.message, hint=error.hint) from error
 
 
 def _content(data: Any) -> list[Any]:  # noqa: ANN401  values of a file
@@ -113,12 +116,9 @@ def _write_copy(plain: PlainConfig, original: PlainConfig, kept: _KeptPackage, p
     names = names_in(before) if before is not None else {}
     annotation = written(data, described, names=names, moved=_to_package(plain.file))
     document = kept.document if annotation == before else with_own_annotation(kept.document, annotation)
-    try:
-        with kept.copied(document) as entries:
-            write_package(path, entries)
-            names_of_files = [entry.name for entry in entries]
-    except LoadFailed as error:
-        raise ConfigurationError(error.message, hint=error.hint) from error
+    with kept.copied(document) as entries:
+        write_package(path, entries)
+        names_of_files = [entry.name for entry in entries]
     if kept.name in names_of_files and kept.name != DEFAULT:
         found = f"'{kept.name}' is not the default description of the package"
         return (Finding(str(path), "", found, f"`ssd={kept.name!r}` to run it"),)
@@ -139,7 +139,11 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
         {name: sections[name]["kind"] for name in models if sections[name].get("kind", "auto") != "auto"},
     )
     data = {**data, "simulation": {"algorithm": system.config.simulation.algorithm, **data["simulation"]}}
-    annotation = written(data, _described(system.config), names=changed, moved=_to_package(plain.file))
+    # What a new description says in its own words about what the annotation could also say.
+    times = {key: getattr(system.config.simulation, key) for key in ("start_time", "stop_time")}
+    given = {key: value for key, value in times.items() if value is not None}
+    described = {"mesh": mesh_name(system.config.mesh), "simulation": given}
+    annotation = written(data, described, names=changed, moved=_to_package(plain.file))
     findings = Findings(str(plain.file), plain.lines, plain.overrides)
     document, units = ssd_of(system, names, version, annotation, findings)
     findings.raise_any()
@@ -147,14 +151,6 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
     entries = [PackageEntry(resource, models_of[resource]) for resource in dict.fromkeys(resources.values())]
     write_package(path, [PackageEntry(DEFAULT, document), *entries])
     return units
-
-
-def _described(config: Config) -> dict[str, Any]:
-    """What a new description says in its own words about what the annotation could also say."""
-    simulation = config.simulation
-    times = {"start_time": simulation.start_time, "stop_time": simulation.stop_time}
-    given = {key: value for key, value in times.items() if value is not None}
-    return {"mesh": mesh_name(config.mesh), "simulation": given}
 
 
 def _element_names(instances: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
@@ -183,11 +179,7 @@ def _element_names(instances: Sequence[str]) -> tuple[dict[str, str], dict[str, 
 
 
 def _packable(plain: PlainConfig, *, fmus_only: bool = False) -> dict[str, Any]:
-    """The values of the configuration with the scenario that it may name a file of.
-
-    Raises:
-        ConfigurationError: a file cannot go into a package, or with ``fmus_only`` there is an instance that is no FMU.
-    """
+    """The values of the configuration with the scenario that it may name a file of; all that cannot go is an error."""
     findings = Findings(str(plain.file), plain.lines, plain.overrides)
     data = plain.data
     instances = data.get("instances") if isinstance(data, dict) else None
@@ -253,12 +245,7 @@ class _KeptPackage(NamedTuple):
 
     @contextmanager
     def copied(self, document: bytes) -> Iterator[list[PackageEntry]]:
-        """The files of a copy of the package, with another content of the description.
-
-        Raises:
-            LoadFailed, OSError: the package cannot be read.
-            ConfigurationError: a link, or a file that the description names, leads out of the folder.
-        """
+        """The files of a copy of the package, with another content of the description."""
         if is_file(self.root):
             with self.root.open("rb") as file, checked_archive(self.root, file, LimitsConfig(), "package") as archive:
                 entries = [entry for entry in archive.infolist() if not entry.is_dir()]
@@ -312,11 +299,7 @@ class _KeptPackage(NamedTuple):
 
 
 def _kept_package(plain: PlainConfig) -> _KeptPackage | None:
-    """The package that a configuration was read from; None if it was not.
-
-    Raises:
-        ConfigurationError: it cannot be read any more.
-    """
+    """The package that a configuration was read from; None if it was not."""
     file = plain.file
     if file.suffix.lower() != ".ssd":
         return None

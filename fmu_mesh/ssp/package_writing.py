@@ -23,7 +23,7 @@ from typing import IO, Final, NamedTuple
 from .. import files
 from ..archives.inner_files import inner_file
 from ..config.mesh import LimitsConfig
-from ..errors import ConfigurationError, LoadFailed
+from ..errors import ConfigurationError
 from ..instances.fmi.archive.archive import content_of
 
 __all__ = ["ArchiveEntry", "PackageEntry", "resource_names", "write_package"]
@@ -65,14 +65,13 @@ def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
     """Write a package; one that is there stays as it is until the new one is complete.
 
     Raises:
-        ConfigurationError: it cannot be written, or an FMU cannot be read.
+        ConfigurationError: it cannot be written.
+        LoadFailed: an FMU cannot be read.
     """
     try:
         with files.replaced(path) as draft, zipfile.ZipFile(draft, "w") as package:
             for entry in entries:
                 _add(package, entry)
-    except LoadFailed as error:
-        raise ConfigurationError(error.message, hint=error.hint) from error
     except _DAMAGED as error:
         raise ConfigurationError(f"'{path}' cannot be written, because a file for it is damaged: {error}") from error
     except OSError as error:
@@ -87,7 +86,7 @@ def resource_names(models: Iterable[Path]) -> dict[Path, str]:
     Names that differ in upper and lower case only would be one file on some systems.
 
     Raises:
-        ConfigurationError: an FMU cannot be read.
+        ConfigurationError, LoadFailed: an FMU cannot be read.
     """
     names: dict[Path, str] = {}
     by_content: dict[str, str] = {}
@@ -95,8 +94,6 @@ def resource_names(models: Iterable[Path]) -> dict[Path, str]:
     for path in models:
         try:
             content = content_of(path)
-        except LoadFailed as error:
-            raise ConfigurationError(error.message, hint=error.hint) from error
         except OSError as error:
             raise ConfigurationError(f"'{path}' cannot be read: {error.strerror}") from error
         if content not in by_content:
@@ -157,12 +154,9 @@ def _packed(path: Path) -> Iterator[IO[bytes]]:
         with zipfile.ZipFile(packed, "w") as archive:
             for own in sorted(path.rglob("*"), key=lambda file: file.relative_to(path).as_posix()):
                 if own.is_file():
-                    _pack(archive, own, own.relative_to(path).as_posix())
+                    name, status = own.relative_to(path).as_posix(), own.stat()
+                    runs = bool(status.st_mode & stat.S_IXUSR)
+                    info = _info(name, status.st_size, zipfile.ZIP_DEFLATED, executable=runs)
+                    with own.open("rb") as source, archive.open(info, "w") as target:
+                        shutil.copyfileobj(source, target, _CHUNK)
         yield packed
-
-
-def _pack(archive: zipfile.ZipFile, file: Path, name: str) -> None:
-    status = file.stat()
-    info = _info(name, status.st_size, zipfile.ZIP_DEFLATED, executable=bool(status.st_mode & stat.S_IXUSR))
-    with file.open("rb") as source, archive.open(info, "w") as target:
-        shutil.copyfileobj(source, target, _CHUNK)

@@ -70,7 +70,7 @@ class ValueTarget(msgspec.Struct, frozen=True):
 
 
 class _Misfit(Exception):
-    """A value that the target cannot have."""
+    """A value that the target cannot have; every step below raises it."""
 
     def __init__(self, expected: str, suggestion: str | None = None) -> None:
         super().__init__(expected)
@@ -149,7 +149,14 @@ def changed(
     if is_float(value.type):
         elements = [float(one) if isinstance(one, str) else one for one in elements]
     try:
-        value, elements, steps = _connected(value, elements, change)
+        steps = [value.how] if value.how else []
+        if not change.linear.identity:
+            why = "the connections on the way have a factor or an offset"
+            value, elements, step = _linear(value, elements, change.linear, why)
+            steps.append(step)
+        if change.mapping:
+            elements = [_mapped(one, value.items, change.mapping) for one in elements]
+            steps.append("mapped by its connection")
         return _as_target(value, elements, target, ", ".join(steps))
     except _Misfit as misfit:
         found = f"the {value.type} value {shown(value.value)} for {target.words}"
@@ -202,21 +209,14 @@ def _unit_conversion(unit: Unit, parameter: ParameterValue, target: ValueTarget,
 def _transformed(
     value: AppliedValue, elements: list[Any], transformation: Transformation, target: ValueTarget
 ) -> tuple[AppliedValue, list[Any], str]:
-    """A value after the transformation of its mapping (SSP 2.0, 4.5.2), and what was done in words.
-
-    Raises:
-        _Misfit: the transformation is not one for such values.
-    """
+    """A value after the transformation of its mapping (SSP 2.0, 4.5.2), and what was done in words."""
     entries = transformation.entries
     match transformation.kind:
         case "linear":
             if target.type is not None and not is_float(target.type):
                 raise _Misfit("a Real variable: its mapping has a LinearTransformation")
-            if not is_float(value.type) and value.type not in INTEGERS:
-                raise _Misfit("a number: its mapping has a LinearTransformation")
             linear = Linear(transformation.factor, transformation.offset)
-            value = replace(value, type="Float64")
-            return value, _calculated(elements, linear), _formula(linear)
+            return _linear(value, elements, linear, "its mapping has a LinearTransformation")
         case "boolean":
             if value.type != "Boolean":
                 raise _Misfit("a Boolean: its mapping has a BooleanMappingTransformation")
@@ -235,33 +235,8 @@ def _transformed(
     return value, elements, "mapped by value"
 
 
-def _connected(
-    value: AppliedValue, elements: list[Any], change: PathChange
-) -> tuple[AppliedValue, list[Any], list[str]]:
-    """A value after the connections on its way, and what was done in words.
-
-    Raises:
-        _Misfit: it is none that can be changed in this way.
-    """
-    steps = [value.how] if value.how else []
-    if not change.linear.identity:
-        if value.type not in INTEGERS and not is_float(value.type):
-            raise _Misfit("a number: the connections on the way have a factor or an offset")
-        elements = _calculated(elements, change.linear)
-        value = replace(value, type="Float64")
-        steps.append(_formula(change.linear))
-    if change.mapping:
-        elements = [_mapped(one, value.items, change.mapping) for one in elements]
-        steps.append("mapped by its connection")
-    return value, elements, steps
-
-
 def _as_target(value: AppliedValue, elements: list[Any], target: ValueTarget, how: str) -> AppliedValue:
-    """A value with the type and the shape of a target.
-
-    Raises:
-        _Misfit: it has another shape, or is none of this type.
-    """
+    """A value with the type and the shape of a target."""
     if target.shape is not None and target.shape != value.shape:
         raise _Misfit(_number_of_values(target.shape))
     plain = to_plain(nested([_element(one, value, target) for one in elements], value.shape))
@@ -269,11 +244,7 @@ def _as_target(value: AppliedValue, elements: list[Any], target: ValueTarget, ho
 
 
 def _element(element: Any, value: AppliedValue, target: ValueTarget) -> Any:  # noqa: ANN401  the type says which
-    """One element as a value of the type of the target, without loss.
-
-    Raises:
-        _Misfit: it is none.
-    """
+    """One element as a value of the type of the target, without loss."""
     kind = target.type
     if kind is None:
         return element
@@ -296,11 +267,7 @@ def _element(element: Any, value: AppliedValue, target: ValueTarget) -> Any:  # 
 
 
 def _item(element: Any, value: AppliedValue, target: ValueTarget) -> str | int:  # noqa: ANN401  the type says which
-    """An item of an Enumeration by its name, or by its number.
-
-    Raises:
-        _Misfit: there is no such item.
-    """
+    """An item of an Enumeration by its name, or by its number."""
     known = [f"{name} ({number})" for name, number in target.items.items()]
     expected = f"one of {listed(known)}" if known else "the number of an item"
     if value.type == "Enumeration" and isinstance(element, str):
@@ -315,11 +282,7 @@ def _item(element: Any, value: AppliedValue, target: ValueTarget) -> str | int: 
 
 
 def _whole(element: Any, items: Mapping[str, int]) -> int:  # noqa: ANN401  the type says which
-    """A whole number without loss: of a number, of true and false, of the name of an item.
-
-    Raises:
-        _Misfit: it is none.
-    """
+    """A whole number without loss: of a number, of true and false, of the name of an item."""
     if isinstance(element, bool | int):
         return int(element)
     if isinstance(element, float) and math.isfinite(element) and element == int(element):
@@ -353,12 +316,14 @@ def _calculated(elements: list[Any], linear: Linear) -> list[Any]:
     return elements if linear.identity else [linear.factor * one + linear.offset for one in elements]
 
 
-def _formula(linear: Linear) -> str:
-    """A transformation in words: `2 * value + 10`."""
+def _linear(value: AppliedValue, elements: list[Any], linear: Linear, why: str) -> tuple[AppliedValue, list[Any], str]:
+    """A number with a factor and an offset, and what was done in words: `2 * value + 10`."""
+    if not is_float(value.type) and value.type not in INTEGERS:
+        raise _Misfit(f"a number: {why}")
     text = "value" if linear.factor == 1.0 else f"{linear.factor:.12g} * value"
-    if linear.offset == 0.0:
-        return text
-    return f"{text} {'+' if linear.offset > 0 else '-'} {abs(linear.offset):.12g}"
+    if linear.offset != 0.0:
+        text += f" {'+' if linear.offset > 0 else '-'} {abs(linear.offset):.12g}"
+    return replace(value, type="Float64"), _calculated(elements, linear), text
 
 
 _PARSERS: Final[dict[VariableType, Callable[[str], Any]]] = {
