@@ -23,9 +23,8 @@ from typing import Any
 from ...errors import ConfigurationError, FmuError, FmuMeshError, Interrupted
 from ...wire.client.reaching import Meshes
 from ..bags.playing import running_configuration
-from .fmu_node import FmuNode
+from .fmu_node import PARAMETERS, FmuNode
 from .gateway_node import GatewayNode
-from .node_settings import PARAMETERS
 from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["create_node", "main"]

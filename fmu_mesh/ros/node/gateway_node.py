@@ -29,8 +29,7 @@ from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.profile import DEPTH, Profile, Put, Take
 from ..messages.topics import RosPlan, Topic
-from .clock_watch import ClockWatch
-from .rclpy_modules import RosNode, message_class, ros_module, steady_timer
+from .rclpy_modules import ClockWatch, RosNode, message_class, ros_module, steady_timer
 
 __all__ = ["GatewayNode", "RclpyProfile"]
 

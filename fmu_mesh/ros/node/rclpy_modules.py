@@ -1,4 +1,4 @@
-"""Access to ROS itself: its modules, the classes of its messages, and timers on its steady clock.
+"""Access to ROS itself: its modules, the classes of its messages, timers on its steady clock, and who has `/clock`.
 
 The user installs and sources ROS; it is not a dependency of this package. So its modules are imported when they are
 needed.
@@ -7,12 +7,18 @@ needed.
 from __future__ import annotations
 
 import importlib
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from ...errors import ConfigurationError
+from ..gateway.link import two_clocks
+from ..messages.topics import CLOCK_TOPIC
 
-__all__ = ["RosNode", "message_class", "ros_module", "steady_timer", "time_message"]
+__all__ = ["ClockWatch", "RosNode", "message_class", "ros_module", "steady_timer", "time_message"]
+
+_INTERVAL_S = 1.0
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 RosNode = Any
 """`rclpy.node.Node`, which has no types where ROS is not installed."""
@@ -61,3 +67,32 @@ def steady_timer(node: RosNode, period_s: float, callback: Callable[[], None]) -
     """Create a timer of a node that also runs while simulated time stands still."""
     clock = ros_module("rclpy.clock")
     return node.create_timer(period_s, callback, clock=clock.Clock(clock_type=clock.ClockType.STEADY_TIME))
+
+
+class ClockWatch:
+    """Warns once of every other node that publishes `/clock`, and says which setting stops this node from it.
+
+    A node with `use_sim_time` takes every message on `/clock`, so with two sources its time jumps back and forth.
+    """
+
+    def __init__(self, node: RosNode, setting: str) -> None:
+        self._node = node
+        self._setting = setting
+        self._reported: set[str] = set()
+        self._timer = steady_timer(node, _INTERVAL_S, self._look)
+
+    def close(self) -> None:
+        """Stop looking."""
+        self._node.destroy_timer(self._timer)
+
+    def _look(self) -> None:
+        names = Counter(
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in self._node.get_publishers_info_by_topic(CLOCK_TOPIC)
+        )
+        names[self._node.get_fully_qualified_name()] -= 1
+        for name in sorted(+names):
+            if name not in self._reported:
+                self._reported.add(name)
+                other = "a program that gives no name" if _UNKNOWN in name else f"the node '{name}'"
+                self._node.get_logger().warning(two_clocks(other, self._setting))
