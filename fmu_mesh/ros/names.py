@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 from . import node
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401 any name of the new module
+def moved(module: str, name: str) -> Any:  # noqa: ANN401 any name of the new module
+    """A name of an old module, with a warning."""
     if name not in node.__all__:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    text = f"{__name__} is deprecated: write `from fmu_mesh.ros.node import {name}`"
+        raise AttributeError(f"module '{module}' has no attribute '{name}'")
+    text = f"{module} is deprecated: write `from fmu_mesh.ros.node import {name}`"
     warnings.warn(text, DeprecationWarning, stacklevel=2)
     return getattr(node, name)
+
+
+__getattr__ = partial(moved, __name__)

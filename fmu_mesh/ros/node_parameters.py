@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
-from typing import Any
+from functools import partial
 
-from . import node
+from .names import moved
 
-
-def __getattr__(name: str) -> Any:  # noqa: ANN401 any name of the new module
-    if name not in node.__all__:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    text = f"{__name__} is deprecated: write `from fmu_mesh.ros.node import {name}`"
-    warnings.warn(text, DeprecationWarning, stacklevel=2)
-    return getattr(node, name)
+__getattr__ = partial(moved, __name__)

@@ -133,7 +133,7 @@ def test_every_variable_is_a_parameter_and_those_that_are_set_initialize_fmu(ros
     assert [node.has_parameter(name) for name in names] == [True] * 6
     assert node.get_parameter("g").value is None
     driver = node.managed._driver
-    assert [driver.get_value(name) for name in ("l", "d", "a", "g")] == [2.0, 0.001, 1.3, 9.81]
+    assert [driver.adapter.get_value(name) for name in ("l", "d", "a", "g")] == [2.0, 0.001, 1.3, 9.81]
 
 
 def test_a_parameter_that_fmi_forbids_to_set_is_set_with_a_warning(
@@ -152,7 +152,7 @@ def test_a_parameter_that_fmi_forbids_to_set_is_set_with_a_warning(
     node.trigger_configure()
 
     assert state_of(node) == "inactive"
-    assert node.managed._driver.get_value("a") == 1.3
+    assert node.managed._driver.adapter.get_value("a") == 1.3
     assert "'a', an output with initial 'calculated': FMI 2.0 (2.2.7) does not allow setting it" in caplog.text
 
 
@@ -345,11 +345,11 @@ def test_an_input_holds_from_its_messages_stamp_and_the_second_equal_counts(ros:
 
     time.set(1100)
     ros.until(lambda: driver._steps == 1, "the first step")
-    first = driver.get_value("y")
+    first = driver.adapter.get_value("y")
     time.set(1200)
     ros.until(lambda: driver._steps == 2, "the second step")
 
-    assert (first, driver.get_value("y")) == (0.0, 7.0)
+    assert (first, driver.adapter.get_value("y")) == (0.0, 7.0)
 
 
 def test_catching_up_is_bounded_per_update_and_told(ros: Ros, said: Said) -> None:
@@ -404,7 +404,7 @@ def test_every_type_has_its_topic_and_its_parameter(ros: Ros, tmp_path: Path) ->
     ros.until(lambda: got == {name: value for name, (_, value) in values.items()}, f"all values, but {got}")
     driver = node.managed._driver
     names = ("integer_parameter", "string_parameter", "enumeration_parameter")
-    assert [driver.get_value(name) for name in names] == [5, "x", 3]
+    assert [driver.adapter.get_value(name) for name in names] == [5, "x", 3]
 
 
 def test_a_tunable_parameter_changes_at_run_time_and_a_fixed_is_refused(ros: Ros) -> None:

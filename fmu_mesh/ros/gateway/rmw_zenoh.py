@@ -28,6 +28,7 @@ from ...errors import FmuMeshError
 from ...installing import importing
 from ...system.start_values import why_not_settable
 from ...variables.model_description import Value, Variable
+from ...variables.value_types import is_float
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.session import Question, ask
@@ -275,12 +276,4 @@ class ParameterServices:
 
 def _kind(variable: Variable) -> int:
     """The number of the parameter type in ROS (`rcl_interfaces/msg/ParameterType`)."""
-    match variable.type:
-        case "Boolean":
-            return _BOOL
-        case "String":
-            return _STRING
-        case "Float64" | "Float32":
-            return _DOUBLE
-        case _:
-            return _INTEGER
+    return _DOUBLE if is_float(variable.type) else {"Boolean": _BOOL, "String": _STRING}.get(variable.type, _INTEGER)

@@ -25,7 +25,7 @@ from ...adapter import FMIAdapter, Nanoseconds
 from ...adapter.argument_checks import Arguments
 from ...errors import DeadlineExceeded, FmuError, FmuMeshError
 from ...simtime import steps_between
-from ...variables.model_description import ModelDescription, Value
+from ...variables.model_description import Value
 
 __all__ = ["DriveSettings", "FmuDriver", "FmuThread", "Update"]
 
@@ -82,6 +82,10 @@ class FmuDriver:
     The time of the FMU is 0.0 at the first update, and stands still between the last update before a pause and
     `resume`.
 
+    Attributes:
+        adapter: the FMU; another one after a restart. Only its `remove_files` is for other threads.
+        started: whether the FMU has left Initialization Mode, so that only tunable parameters can change.
+
     Raises:
         CallRefused: a setting is out of range.
         LoadFailed: the FMU cannot be read, extracted or instantiated.
@@ -90,27 +94,12 @@ class FmuDriver:
     def __init__(self, settings: DriveSettings) -> None:
         self._settings = settings
         self._kept: dict[str, Value] = {}
-        self._adapter = self._load()
-        self._arguments = Arguments(settings.fmu_path.stem, self._adapter.description)
-        self._started = False
+        self.adapter = self._load()
+        self._arguments = Arguments(settings.fmu_path.stem, self.adapter.description)
+        self.started = False
         self._shift = 0
         self._start = 0
         self._steps = 0
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._adapter.description
-
-    @property
-    def step_size(self) -> float:
-        """The communication step size in s."""
-        return self._adapter.step_size
-
-    @property
-    def started(self) -> bool:
-        """Whether the FMU has left Initialization Mode, so that only tunable parameters can change."""
-        return self._started
 
     def check_value(self, name: str, value: Value) -> Value:
         """Convert a value to the type of its variable, as `set_value` would do now. Any thread may call this.
@@ -118,7 +107,7 @@ class FmuDriver:
         Raises:
             CallRefused: the variable cannot be set now, or the value has a wrong type or range.
         """
-        variable = self._arguments.tunable(name) if self._started else self._arguments.settable(name)
+        variable = self._arguments.tunable(name) if self.started else self._arguments.settable(name)
         return self._arguments.value(variable, value)
 
     def set_value(self, name: str, value: Value) -> None:
@@ -128,16 +117,11 @@ class FmuDriver:
             CallRefused: the variable cannot be set now, or the value has a wrong type or range.
             FmuError: the FMU refuses it.
         """
-        if self._started:
-            self._adapter.set_parameter_value(name, value)
+        if self.started:
+            self.adapter.set_parameter_value(name, value)
         else:
-            self._adapter.set_initial_value(name, value)
+            self.adapter.set_initial_value(name, value)
         self._kept[name] = value
-
-    def get_value(self, name: str) -> Value:
-        """The current value of a variable."""
-        value: Value = self._adapter.get_value(name)
-        return value
 
     def set_input(self, name: str, time: int, value: Value) -> None:
         """Give an input a value that holds from ``time`` in ns on.
@@ -145,14 +129,14 @@ class FmuDriver:
         Raises:
             CallRefused: there is no such input, or the value has a wrong type or range.
         """
-        self._adapter.set_input_value(name, Nanoseconds(time - self._shift), value)
+        self.adapter.set_input_value(name, Nanoseconds(time - self._shift), value)
 
     def resume(self, time: int) -> None:
         """Continue at ``time`` in ns from the state of the FMU; restart the FMU if it has reached the stop time."""
-        if self._started and self._ended:
+        if self.started and self._ended:
             self._restart()
-        elif self._started:
-            self._shift = time - self._adapter.simulation_time_ns
+        elif self.started:
+            self._shift = time - self.adapter.simulation_time_ns
 
     def update(self, time: int, outputs: Sequence[str], *, restart: bool) -> Update:
         """Step until ``time``, at most to the stop time and at most `max_steps` steps, and read outputs.
@@ -167,22 +151,22 @@ class FmuDriver:
             FmuError: the FMU failed; only `close` is allowed now.
         """
         jumped_back = 0.0
-        if self._started:
-            back = (self._adapter.simulation_time_ns + self._shift - time) / 1e9
-            jumped_back = back if back > self.step_size / 2 else 0.0
+        if self.started:
+            back = (self.adapter.simulation_time_ns + self._shift - time) / 1e9
+            jumped_back = back if back > self.adapter.step_size / 2 else 0.0
             if jumped_back and restart:
                 self._restart()
             elif jumped_back:
-                self._shift = time - self._adapter.simulation_time_ns
-        if not self._started:
+                self._shift = time - self.adapter.simulation_time_ns
+        if not self.started:
             self._start = time
             self._steps = 0
-            self._adapter.exit_initialization_mode(Nanoseconds(time))
-            self._started = True
+            self.adapter.exit_initialization_mode(Nanoseconds(time))
+            self.started = True
         steps, behind = self._advance(time - self._shift)
         return Update(
-            time=self._adapter.simulation_time_ns + self._shift,
-            values={name: self._adapter.get_value(name) for name in outputs},
+            time=self.adapter.simulation_time_ns + self._shift,
+            values={name: self.adapter.get_value(name) for name in outputs},
             steps=steps,
             behind=behind,
             jumped_back=jumped_back,
@@ -191,11 +175,7 @@ class FmuDriver:
 
     def close(self) -> None:
         """Free the FMU and remove its files. Never raises; may be called more than once."""
-        self._adapter.close()
-
-    def remove_files(self) -> None:
-        """From any thread: remove the files of an FMU that does not return, before the process is ended."""
-        self._adapter.remove_files()
+        self.adapter.close()
 
     @property
     def _ended(self) -> bool:
@@ -212,23 +192,23 @@ class FmuDriver:
 
     def _restart(self) -> None:
         """Replace the FMU by a new instance, and set again every variable that was set."""
-        self._adapter.close()
-        self._started = False
+        self.adapter.close()
+        self.started = False
         self._shift = 0
-        self._adapter = self._load()
+        self.adapter = self._load()
         for name, value in self._kept.items():
-            self._adapter.set_initial_value(name, value)
+            self.adapter.set_initial_value(name, value)
 
     def _advance(self, time: int) -> tuple[int, float]:
         """Step until ``time`` on the clock of the adapter; returns the number of steps, and the rest in s."""
         before = self._steps
         allowed = min(self._settings.max_steps, self._last_step - before)
         if allowed >= 1:
-            self._adapter.do_steps_until(Nanoseconds(time), max_steps=int(allowed))
-        reached = self._adapter.simulation_time_ns
-        self._steps = round((reached - self._start) / 1e9 / self.step_size)
+            self.adapter.do_steps_until(Nanoseconds(time), max_steps=int(allowed))
+        reached = self.adapter.simulation_time_ns
+        self._steps = round((reached - self._start) / 1e9 / self.adapter.step_size)
         missing = (time - reached) / 1e9
-        behind = missing if missing > self.step_size / 2 and not self._ended else 0.0
+        behind = missing if missing > self.adapter.step_size / 2 and not self._ended else 0.0
         return self._steps - before, behind
 
 

@@ -130,7 +130,7 @@ class FmuNode:
                 self._thread.submit(driver.close).result(_FMU_END_S)
             except FutureTimeout:
                 self._log.error(f"the FMU did not return within {_FMU_END_S:g} s; it is left behind")
-                driver.remove_files()
+                driver.adapter.remove_files()
         if topics is not None:
             topics.close_outputs()
         self._configured.close()
@@ -147,7 +147,7 @@ class FmuNode:
         settings = _read_settings(self._node)
         self._paced = _PacedTime(settings.real_time_factor)
         driver = self._driver = self._thread.call(FmuDriver, settings)
-        description = driver.description
+        description = driver.adapter.description
         names = names_of(description.variables, settings.names)
         taken = sorted(_RESERVED.intersection(names.values()))
         if taken:
@@ -178,9 +178,9 @@ class FmuNode:
         for name, near in undeclared(self._node).items():
             hint = f"did you mean '{near}'?" if near is not None else "it is ignored"
             self._log.warning(f"the parameter '{name}' is set, but is no variable of the FMU; {hint}")
-        description = driver.description
+        description = driver.adapter.description
         if settings.step_size is None:
-            self._log.info(f"no step_size is given; the FMU's own is used: {driver.step_size!r} s")
+            self._log.info(f"no step_size is given; the FMU's own is used: {driver.adapter.step_size!r} s")
         proposed = description.default_experiment.stop_time
         if settings.stop_time is None and proposed is not None:
             self._log.info(f"the FMU proposes to stop at {proposed!r} s; set stop_time to end there")
@@ -309,16 +309,7 @@ class FmuNode:
 
 
 class _NodeSettings(DriveSettings, frozen=True, kw_only=True):
-    """The checked parameters of a node that runs an FMU.
-
-    Attributes:
-        update_period: period of the timer in s.
-        stamped: whether numeric variables have a second topic with a header.
-        names: ROS names by variable, for variables whose usual name cannot be used.
-        messages: entries of the parameter `messages`.
-        publish_clock: whether the node is the source of simulated time.
-        real_time_factor: simulated over wall-clock time.
-    """
+    """The checked parameters of a node that runs an FMU; `PARAMETERS` describes them."""
 
     update_period: float
     stamped: bool
