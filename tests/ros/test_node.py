@@ -341,7 +341,7 @@ def test_an_input_holds_from_its_messages_stamp_and_the_second_equal_counts(ros:
         message.header.stamp.sec, message.header.stamp.nanosec = 1, 100 * MS
         message.point.x = value
         publisher.publish(message)
-    ros.until(lambda: len(driver._adapter._trajectories.get("u", ())) == 2, "both messages")
+    ros.until(lambda: len(driver.adapter._trajectories.get("u", ())) == 2, "both messages")
 
     time.set(1100)
     ros.until(lambda: driver._steps == 1, "the first step")
