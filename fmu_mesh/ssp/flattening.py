@@ -30,7 +30,7 @@ from .system_structure import (
     Unit,
 )
 
-__all__ = ["Describe", "FlatConnection", "PathChange", "flatten"]
+__all__ = ["Describe", "FlatConnection", "Path", "PathChange", "flatten"]
 
 Path = tuple[str, ...]
 Describe = Callable[[Path], ModelDescription | None]

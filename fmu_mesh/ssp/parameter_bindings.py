@@ -6,7 +6,7 @@ lower level, and at one level the later one. What a value becomes is `parameter_
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
 from typing import Final
@@ -16,6 +16,7 @@ import msgspec
 from ..text import listed, nearest, shown
 from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
+from .flattening import Describe, Path
 from .parameter_reading import refuse_ambiguous
 from .parameter_values import AppliedValue, changed, converted, target_of_connector, target_of_variable
 from .problems import Problems
@@ -30,8 +31,6 @@ from .system_structure import (
 )
 
 __all__ = ["AppliedValue", "ResolvedParameters", "changed", "resolve_parameters"]
-
-Path = tuple[str, ...]
 
 _SHOWN_NAMES: Final = 8
 """Most names of one binding with a warning of their own, if they match nothing."""
@@ -52,9 +51,7 @@ class ResolvedParameters(msgspec.Struct, frozen=True):
     of_systems: dict[tuple[Path, str], AppliedValue] = {}
 
 
-def resolve_parameters(
-    system: StructureSystem, describe: Callable[[Path], ModelDescription | None], problems: Problems
-) -> ResolvedParameters:
+def resolve_parameters(system: StructureSystem, describe: Describe, problems: Problems) -> ResolvedParameters:
     """The value of every variable and of every connector of a system that bindings give one.
 
     Names that match nothing have no effect and are warnings. Only the value that counts is converted. ``describe``
@@ -73,7 +70,7 @@ class _Candidate(msgspec.Struct, frozen=True):
 
 
 class _Resolution:
-    def __init__(self, describe: Callable[[Path], ModelDescription | None], problems: Problems) -> None:
+    def __init__(self, describe: Describe, problems: Problems) -> None:
         self._describe = describe
         self._problems = problems
         self._of_components: dict[Path, dict[str, _Candidate]] = {}

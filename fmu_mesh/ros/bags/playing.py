@@ -7,7 +7,7 @@ the result depends on the bag alone, and not on the speed of any process.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -169,7 +169,9 @@ def play(
     hold = go_on(client, hold, -(-hold // together) * together)
     targets: dict[tuple[str, str], Target] = {}
     first, count = hold, 0
-    for moment in _from(hold, moments):
+    past = {key: value for moment in moments if moment.point <= hold for key, value in moment.values.items()}
+    later = [moment for moment in moments if moment.point > hold]
+    for moment in [Moment(hold, past), *later] if past else later:
         hold = go_on(client, hold, moment.point)
         for instance in {instance for instance, _ in moment.values}:
             wait_until_at(client, instance, hold, timeout_s)
@@ -183,18 +185,3 @@ def play(
             count += 1
     client.command(Command("resume"))
     return count, first
-
-
-def _from(point: int, moments: Sequence[Moment]) -> Iterator[Moment]:
-    """The moments from ``point`` on; the earlier ones become a single moment at ``point``."""
-    past: dict[tuple[str, str], Value] = {}
-    for moment in moments:
-        if moment.point <= point:
-            past |= moment.values
-            continue
-        if past:
-            yield Moment(point, past)
-            past = {}
-        yield moment
-    if past:
-        yield Moment(point, past)

@@ -106,7 +106,9 @@ class Gateway:
         self._mesh_ended = False
         self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._progress = _Progress()
+        # The variables by their keys, the last point at which the newest samples of all of them hold, and the newest.
+        self._watched: dict[str, _WatchedVariable] = {}
+        self._complete = self._newest = -1
         self._clock: _ClockPublisher | None = None
 
     def open(self, patience_s: float = 60.0) -> None:
@@ -120,14 +122,13 @@ class Gateway:
                 self._open_output(topic)
             else:
                 self._open_input(topic)
-        watched = self._progress.watched
-        if not watched and self._plan.time_source is not None and self._plan.clock_points:
+        if not self._watched and self._plan.time_source is not None and self._plan.clock_points:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
             first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
             put = next(iter(self._profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
             self._clock = _ClockPublisher(put, self._plan, self._grid)
-        for key, variable in watched.items():
+        for key, variable in self._watched.items():
             self._take_values(key, variable)
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
@@ -191,7 +192,7 @@ class Gateway:
     def _watch(self, port: Port) -> _WatchedVariable:
         key = self._keys.variable(port.instance, port.kind, port.variable.name)
         variable = _WatchedVariable(f"{port.instance}.{port.variable.name}", port.step_points)
-        return self._progress.watched.setdefault(key, variable)  # several topics share it
+        return self._watched.setdefault(key, variable)  # several topics share it
 
     def _take_values(self, key: str, variable: _WatchedVariable) -> None:
         def arrived(sample: zenoh.Sample) -> None:
@@ -219,9 +220,13 @@ class Gateway:
                 variable.warn(f"{value!r} cannot be sent on '{assembler.topic.name}': {error}")
         if self._clock is not None and variable.holds_until < 0:
             self._clock.begin(stamp.point)
-        now = self._progress.published(variable, stamp.point)
+        was_last = variable.holds_until <= self._complete
+        variable.holds_until = stamp.point + variable.step_points - 1
+        self._newest = max(self._newest, stamp.point)
+        if was_last:
+            self._complete = min(other.holds_until for other in self._watched.values())
         if self._clock is not None:
-            self._clock.advance(now)
+            self._clock.advance(min(self._newest, self._complete))
 
     # --- from ROS to the mesh
 
@@ -275,7 +280,7 @@ class Gateway:
 
     def _is_over(self) -> bool:
         """Whether every sample has been carried."""
-        return self._ended or not self._progress.watched or self._progress.complete >= self._grid.last_point
+        return self._ended or not self._watched or self._complete >= self._grid.last_point
 
     def _end(self) -> None:
         self._ended = True
@@ -320,21 +325,14 @@ class _WatchedVariable(_WarnOnce):
 
     Attributes:
         outputs: (assembler of a topic, index of the variable's port there, publishes its messages).
+        holds_until: the last point at which the newest sample holds; -1 before the first sample.
     """
 
     def __init__(self, name: str, step_points: int) -> None:
         super().__init__(name)
         self.outputs: list[tuple[Assembler, int, Put]] = []
-        self._step_points = step_points
-        self._point = -1
-
-    @property
-    def holds_until(self) -> int:
-        """The last point at which the newest sample holds; -1 before the first sample."""
-        return self._point + self._step_points - 1 if self._point >= 0 else -1
-
-    def advance(self, point: int) -> None:
-        self._point = point
+        self.step_points = step_points
+        self.holds_until = -1
 
 
 class _ClockPublisher:
@@ -372,26 +370,3 @@ class _ClockPublisher:
     def _publish(self, point: int) -> None:
         time_s = self._grid.time(point)
         self._put(self._codec.encode({"clock": to_stamp(time_s)}), time_s)
-
-
-class _Progress:
-    """The watched variables of one gateway, and the point up to which all of their samples have been published.
-
-    Attributes:
-        watched: the variables by their keys.
-        complete: the last point at which the newest samples of all variables hold; -1 at first.
-    """
-
-    def __init__(self) -> None:
-        self.watched: dict[str, _WatchedVariable] = {}
-        self.complete = -1
-        self._newest = -1
-
-    def published(self, variable: _WatchedVariable, point: int) -> int:
-        """Note that the sample of ``variable`` at ``point`` has been published; returns how far everything has been."""
-        was_last = variable.holds_until <= self.complete
-        variable.advance(point)
-        self._newest = max(self._newest, point)
-        if was_last:
-            self.complete = min(other.holds_until for other in self.watched.values())
-        return min(self._newest, self.complete)
