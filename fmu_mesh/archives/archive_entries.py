@@ -49,13 +49,9 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def checked_archive(path: Path, file: IO[bytes], limits: LimitsConfig, otherwise: str = "FMU") -> zipfile.ZipFile:
-    """The archive in ``file``, after a check that all its entries may be unpacked. Closing it does not close the file.
+    """The archive in an open file, after a check that all its entries may be unpacked. Closing it leaves the file open.
 
-    Args:
-        path: how errors name the file.
-        file: a file that is open.
-        limits: how large the archive may be.
-        otherwise: what it is not if it is no archive.
+    Errors name the file ``path``, and say that it is no ``otherwise`` if it is no archive.
 
     Raises:
         LoadFailed: it is no archive, an entry exceeds a limit, or an entry would be written outside the folder.

@@ -18,14 +18,11 @@ _RESERVED: Final = "mesh"
 
 
 def instance_name(path: Sequence[str]) -> str:
-    """The name of an instance.
+    """The name of an instance, from the names of the systems around its element, without the root system, and its own.
 
     Example:
         >>> instance_name(["DP Controller"]), instance_name(["SuT", "2nd.motor"]), instance_name(["mesh"])
         ('DP-32-Controller', 'SuT--50-nd-46-motor', '_-109-esh')
-
-    Args:
-        path: the names of the systems around the element, without the root system, and that of the element.
     """
     name = "-".join(map(_element, path))
     if name == _RESERVED:

@@ -165,11 +165,9 @@ def chosen_names(defaults: Sequence[str], text: str) -> dict[str, str]:
 def merged(data: Mapping[str, Any], text: str, *, moved: Callable[[str], str] = lambda path: path) -> Merged:
     """A configuration of a description with what its annotation says.
 
-    Args:
-        data: what the description itself says: a mapping as in a configuration file, with long connections, and with
-            the names that `chosen_names` gives. It is not changed.
-        text: the text of the annotation.
-        moved: from the path of a result file for the folder of the package to one for the folder of the configuration.
+    The ``data`` are not changed: what the description itself says, a mapping as in a configuration file, with long
+    connections, and with the names that `chosen_names` gives. A result file is ``moved`` from its path for the folder
+    of the package to one for the folder of the configuration.
 
     Raises:
         AnnotationRefused: the text is no annotation of ours.

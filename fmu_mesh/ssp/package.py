@@ -46,9 +46,6 @@ class Package:
         root: the archive, or the folder.
         given: the .ssd that the user named instead of the package; empty if there is none.
 
-    Args:
-        path: what the user named.
-
     Raises:
         ConfigurationError: it cannot be read.
     """
@@ -133,13 +130,10 @@ class Package:
             raise ConfigurationError(f"'{path}' cannot be read: {error.strerror}") from error
 
     def named_by(self, uri: str, base: str, place: FilePlace, problems: Problems) -> str | None:
-        """The name of the file that a URI means; None after a finding.
+        """The name of the file that a URI without a fragment means.
 
-        Args:
-            uri: as the file has it, without a fragment.
-            base: the folder that it is relative to, such as `resources`; empty: the root of the package.
-            place: where it is written.
-            problems: gets URIs with a scheme, absolute ones, those out of an archive, and files that do not exist.
+        None after a finding: it has a scheme, is absolute, leads out of an archive, or there is no such file. It is
+        relative to the folder ``base``, such as `resources`; empty: the root of the package.
         """
         expected = "a path inside the package, such as resources/model.fmu"
         scheme = _SCHEME.match(uri)

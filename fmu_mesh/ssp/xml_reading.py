@@ -50,7 +50,6 @@ class XmlElement:
 
     Attributes:
         tag: with the usual prefix, such as `ssd:System`; a foreign element has its namespace in braces.
-        place: where it is.
         version: of the file, `1.0` or `2.0`.
     """
 

@@ -46,14 +46,7 @@ StampSource = Literal["header", "log"]
 
 
 class BagSample(msgspec.Struct, frozen=True):
-    """One recorded value.
-
-    Attributes:
-        stamp: the time from which on the value holds, in ns.
-        instance: name of the instance.
-        variable: name of its input.
-        value: an array has the shape of the variable.
-    """
+    """One recorded value of an input, which holds from ``stamp`` on, in ns; an array has the shape of the variable."""
 
     stamp: int
     instance: str
@@ -109,11 +102,9 @@ class Bag:
             types.store.fielddefs.setdefault(name, definition)
 
     def samples(self, topics: Sequence[Topic], stamps: StampSource) -> Iterator[BagSample]:
-        """The values of ``topics`` in the order in which they were recorded.
+        """The values of subscribed ``topics`` in the order in which they were recorded.
 
-        Args:
-            topics: subscribed topics.
-            stamps: `header` takes the stamp in the header if there is one; `log` takes the time of the recording.
+        With ``stamps`` = `header` the stamp in the header counts, if there is one; `log` takes the time of recording.
 
         Raises:
             ConfigurationError: a message has no such array element, or an array of another size.
@@ -158,12 +149,8 @@ def topics_for(
 ) -> list[Topic]:
     """The topics of a bag that are played into inputs of a mesh.
 
-    Args:
-        loaded: the configuration of the mesh.
-        descriptions: the model descriptions by instance name.
-        bag: the bag.
-        choices: each is `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE`. Without choices, the topics are
-            those that the mesh subscribes to: by its `ros` section, or by the default names of its inputs.
+    Each of the ``choices`` is `TOPIC=INSTANCE.VARIABLE` or `TOPIC:FIELD=INSTANCE.VARIABLE`. Without choices, the topics
+    are those that the mesh subscribes to: by its `ros` section, or by the default names of its inputs.
 
     Raises:
         ConfigurationError: a choice is wrong, or the mesh subscribes to no topic of the bag.
@@ -202,9 +189,7 @@ def topics_for(
 def timed(samples: Iterable[BagSample], start: float | None) -> list[tuple[float, BagSample]]:
     """Samples in the order of their stamps, each with its simulation time in s.
 
-    Args:
-        samples: in any order.
-        start: simulation time in s of the earliest stamp; None: stamps are simulation times.
+    The earliest stamp is at ``start``, in s; None: stamps are simulation times.
     """
     ordered = sorted(samples, key=lambda sample: sample.stamp)
     shift = 0 if start is None or not ordered else nanoseconds(start) - ordered[0].stamp

@@ -32,7 +32,6 @@ class TopicColumns(msgspec.Struct, frozen=True):
     """The columns of one topic.
 
     Attributes:
-        name: of the topic.
         steps: it has a message in every row with the first point after a multiple of one of these.
         fields: the columns that each field has, by its path; of an array those of all elements.
     """
@@ -51,9 +50,7 @@ class RecordedMcap(msgspec.Struct, frozen=True):
 
     Attributes:
         start_time: time of point 0 in s.
-        step_size: from one point to the next, in s.
         distribution: of ROS; it defines the message types.
-        columns: all of them, in order.
         topics: all of them; also those without columns, such as `/clock`.
         first: point of the first row.
         every: number of points from row to row.

@@ -56,9 +56,7 @@ _HEAD: Final = struct.Struct("<BQ")
 def finish_mcap(path: Path, kept: Kept) -> int:
     """Cut a file off after its last whole row, and write its end; return the number of its rows.
 
-    Args:
-        path: the file; nobody is writing it any more. If it has its end, it stays as it is.
-        kept: rows that are known to be there.
+    Nobody is writing the file any more. If it has its end, it stays as it is. Rows in ``kept`` are known to be there.
 
     Raises:
         ConfigurationError: it is not the MCAP of a run.
@@ -134,16 +132,9 @@ class _PlacedChunk(NamedTuple):
 class McapContent:
     """The complete records of an MCAP that a run has written, or is writing.
 
-    Args:
-        file: open for reading.
-        path: for errors.
-
     Attributes:
-        file: the file.
-        chunks: the complete ones.
         notes: (offset, length, metadata record) of each.
         rows: the number of rows; None if the file has no end.
-        recording: which column is where.
         metadata: of the run, with what was noted.
 
     Raises:

@@ -55,11 +55,7 @@ class Played(msgspec.Struct, frozen=True):
 def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options: PlayOptions) -> Played:
     """Play a bag to a mesh.
 
-    Args:
-        client: the mesh.
-        bag: the bag.
-        loaded: the configuration of the mesh; None: it is read from the file that the mesh names.
-        options: its ``config`` comes first.
+    The configuration of the mesh is that of ``options``, else ``loaded``, else in the file that the mesh names.
 
     Raises:
         ConfigurationError: the bag has no message of these topics before the end of the simulation.
@@ -117,13 +113,7 @@ def schedule(
     """Find the point of every sample.
 
     A value is set at the first point of its instance that is not before its stamp. If an input has several values for
-    one point, the last one is set.
-
-    Args:
-        samples: in any order.
-        grid: the communication points.
-        step_points: points per step of every instance.
-        start: simulation time in s of the earliest stamp; None: stamps are simulation times.
+    one point, the last one is set. An instance has ``step_points`` points per step; ``start`` is that of `timed`.
 
     Returns:
         The moments in order of their points, the number of samples that a later one replaced, and the number of samples
@@ -148,13 +138,8 @@ def play(
 ) -> tuple[int, int]:
     """Set all values on a mesh: let it run to each moment, pause it there, set the values; at the end let it run on.
 
-    If the mesh is past a moment already, its values are set at once; for each input the last one counts.
-
-    Args:
-        client: the mesh; this pauses it if it is running.
-        moments: in the order of their points.
-        step_points: points per step of every instance.
-        timeout_s: how long in s the mesh may stay at one point before it has reached the next moment.
+    If the mesh is past a moment already, its values are set at once; for each input the last one counts. The moments
+    are in the order of their points. It may stay at one point for ``timeout_s`` before it reaches the next moment.
 
     Returns:
         The number of values that were set, and the point of the first one.

@@ -221,7 +221,7 @@ class Gateway:
         if self._clock is not None and variable.holds_until < 0:
             self._clock.begin(stamp.point)
         was_last = variable.holds_until <= self._complete
-        variable.holds_until = stamp.point + variable.step_points - 1
+        variable.advance(stamp.point)
         self._newest = max(self._newest, stamp.point)
         if was_last:
             self._complete = min(other.holds_until for other in self._watched.values())
@@ -331,8 +331,12 @@ class _WatchedVariable(_WarnOnce):
     def __init__(self, name: str, step_points: int) -> None:
         super().__init__(name)
         self.outputs: list[tuple[Assembler, int, Put]] = []
-        self.step_points = step_points
+        self._step_points = step_points
         self.holds_until = -1
+
+    def advance(self, point: int) -> None:
+        """Note that the newest sample is that of ``point``."""
+        self.holds_until = point + self._step_points - 1
 
 
 class _ClockPublisher:

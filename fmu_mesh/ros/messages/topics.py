@@ -62,7 +62,6 @@ class Topic(msgspec.Struct, frozen=True):
 
     Attributes:
         name: absolute name; in a node that runs a single FMU it may be relative to the namespace of the node.
-        message: full name of the message type.
         direction: the mesh publishes `out` and subscribes to `in`.
         profile: how the topic looks on Zenoh.
         frame_id: of every header in the message.
@@ -91,9 +90,6 @@ class RosPlan(msgspec.Struct, frozen=True):
     """Everything that the gateway needs to know.
 
     Attributes:
-        types: the message types of the topics.
-        node: name of the ROS node.
-        namespace: of the node.
         clock_points: points between two /clock messages; None: no /clock.
         time_source: the variable whose samples show the time if no topic is published; None if there is none.
     """

@@ -41,7 +41,6 @@ class DriveSettings(msgspec.Struct, frozen=True, kw_only=True):
     """How an FMU is driven.
 
     Attributes:
-        fmu_path: the .fmu file.
         step_size: communication step size in s; None takes the default experiment's.
         stop_time: end of the last step at the latest, in s of the FMU's time; None: no end.
         max_steps: largest number of steps in one update.
@@ -58,8 +57,6 @@ class Update(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         time: the time of the outputs, in ns.
-        values: the requested outputs, by name.
-        steps: number of steps that were taken.
         behind: how far the FMU is behind after the largest number of steps, in s; else 0.
         jumped_back: how far time had jumped back before this update, in s; else 0.
         ended: whether the stop time is reached.
@@ -141,11 +138,8 @@ class FmuDriver:
     def update(self, time: int, outputs: Sequence[str], *, restart: bool) -> Update:
         """Step until ``time``, at most to the stop time and at most `max_steps` steps, and read outputs.
 
-        Args:
-            time: the present time in ns.
-            outputs: names of variables to read.
-            restart: what to do if time has jumped back by more than half a step. True, for simulated time: restart the
-                FMU. False, for a wall clock that was set back: continue from the state of the FMU.
+        If time has jumped back by more than half a step, ``restart`` says what to do. True, for simulated time: restart
+        the FMU. False, for a wall clock that was set back: continue from the state of the FMU.
 
         Raises:
             FmuError: the FMU failed; only `close` is allowed now.

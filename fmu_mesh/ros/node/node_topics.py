@@ -79,14 +79,10 @@ def topics_of(
 ) -> list[Topic]:
     """The topics of an FMU: one per input and output, as in `fmi_adapter`, and those of ``messages``.
 
-    A variable that no message of `std_msgs` carries (Binary, an array of Boolean or String) has no topic of its own.
-
-    Args:
-        description: the model description.
-        names: ROS names by variable, for variables whose usual name cannot be used.
-        messages: entries `TOPIC: {type: PACKAGE/msg/TYPE, fields: {PATH: VARIABLE}}`; a variable in one of them has no
-            topic of its own.
-        stamped: whether every numeric input and output has a second topic `NAME_stamped` whose messages have a header.
+    A variable that no message of `std_msgs` carries (Binary, an array of Boolean or String) has no topic of its own,
+    nor has one in an entry `TOPIC: {type: PACKAGE/msg/TYPE, fields: {PATH: VARIABLE}}` of ``messages``. The ``names``
+    are ROS names by variable, for those whose usual name cannot be used. If they are ``stamped``, all numeric inputs
+    and outputs have a second topic `NAME_stamped` whose messages have a header.
 
     Raises:
         ConfigurationError: names everything that is wrong.
