@@ -9,7 +9,7 @@ from __future__ import annotations
 import posixpath
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar, cast, get_args
+from typing import Final, Literal, NamedTuple, TypeVar, cast, get_args
 
 from msgspec.structs import replace
 
@@ -46,6 +46,10 @@ _PACKAGE: Final = "application/x-ssp-package"
 _SET: Final = "application/x-ssp-parameter-set"
 _MAPPING: Final = "application/x-ssp-parameter-mapping"
 _MODELICA: Final = "text/x-modelica"
+_IMPLEMENTATIONS: Final[dict[str, Literal["any", "CoSimulation", "ModelExchange"]]] = {
+    "CoSimulation": "CoSimulation",
+    "ModelExchange": "ModelExchange",
+}
 _MAXIMUM_DEPTH: Final = 32
 """Most systems inside one another."""
 
@@ -187,7 +191,7 @@ class _Reader:
             name=element.text("name"),
             source=name,
             place=element.place,
-            implementation=implementation if implementation in ("CoSimulation", "ModelExchange") else "any",
+            implementation=_IMPLEMENTATIONS.get(implementation or "", "any"),
             connectors=self._connectors(element, file),
             bindings=self._bindings(element, file, name),
             annotations=element.annotations(),

@@ -15,7 +15,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple, Self
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -100,16 +100,11 @@ def read_mcap(path: Path) -> Columns:
     return Columns(times, {name: found[name] for name in types}, units, content.metadata)
 
 
-class _PlacedChunk(NamedTuple):
-    """Where a chunk is, and the number of messages of each channel in it."""
+class _PlacedChunk(ChunkIndex):
+    """The index of a chunk, and the number of messages of each channel in it."""
 
-    index: ChunkIndex
-    counts: Counter[int]
-
-    @classmethod
-    def at(cls, offset: int, length: int, chunk: Chunk) -> Self:
-        """A chunk whose message indexes are still to come."""
-        index = ChunkIndex(
+    def __init__(self, offset: int, length: int, chunk: Chunk) -> None:
+        super().__init__(
             chunk_length=length,
             chunk_start_offset=offset,
             compression=chunk.compression,
@@ -120,12 +115,12 @@ class _PlacedChunk(NamedTuple):
             message_start_time=chunk.message_start_time,
             uncompressed_size=chunk.uncompressed_size,
         )
-        return cls(index, Counter())
+        self.counts: Counter[int] = Counter()
 
     def add(self, index: MessageIndex, offset: int, length: int) -> None:
         """Add the next message index."""
-        self.index.message_index_offsets[index.channel_id] = offset
-        self.index.message_index_length += length
+        self.message_index_offsets[index.channel_id] = offset
+        self.message_index_length += length
         self.counts[index.channel_id] = len(index.records)
 
 
@@ -166,8 +161,8 @@ class McapContent:
 
     def records_of(self, placed: _PlacedChunk) -> list[McapRecord]:
         """The schemas, channels and messages of a chunk."""
-        self.file.seek(placed.index.chunk_start_offset + _HEAD.size)
-        return breakup_chunk(Chunk.read(self._record(placed.index.chunk_length)), validate_crc=True)
+        self.file.seek(placed.chunk_start_offset + _HEAD.size)
+        return breakup_chunk(Chunk.read(self._record(placed.chunk_length)), validate_crc=True)
 
     def whole_rows(self) -> tuple[int, int]:
         """The number of whole rows, and the index of the first chunk that has messages of another one."""
@@ -211,7 +206,7 @@ class McapContent:
 
     def _look(self, offset: int, opcode: int, length: int) -> None:
         if opcode == Opcode.CHUNK:
-            self.chunks.append(_PlacedChunk.at(offset, length, Chunk.read(self._record(length))))
+            self.chunks.append(_PlacedChunk(offset, length, Chunk.read(self._record(length))))
         elif opcode == Opcode.MESSAGE_INDEX:
             self.chunks[-1].add(MessageIndex.read(self._record(length)), offset, length)
         elif opcode == Opcode.METADATA:
@@ -316,7 +311,7 @@ def _write_end(file: BinaryIO, content: McapContent, rows: int, changed: int) ->
     end = content.recording.first + rows * content.recording.every  # the point of the first row that is left out
     records = [r for r in content.records_of(content.chunks[first]) if not isinstance(r, Message) or r.sequence < end]
     registered = [record for record in content.records_of(content.chunks[0]) if not isinstance(record, Message)]
-    kept, start = content.chunks[:first], content.chunks[first].index.chunk_start_offset
+    kept, start = content.chunks[:first], content.chunks[first].chunk_start_offset
     notes = [(offset, length, note) for offset, length, note in content.notes if offset < start]
     later = [note for offset, _, note in content.notes if offset > start and note.name != ROWS]
     file.seek(start)
@@ -348,7 +343,7 @@ def _write_chunk(file: BinaryIO, records: Sequence[McapRecord]) -> _PlacedChunk:
     chunk = Chunk("", data, max(stamps), min(stamps), zlib.crc32(data), len(data))
     offset = file.tell()
     chunk.write(out)
-    placed = _PlacedChunk.at(offset, out.count, chunk)
+    placed = _PlacedChunk(offset, out.count, chunk)
     file.write(_taken(out))
     for index in indexes.values():
         offset = file.tell()
@@ -374,8 +369,8 @@ def _write_summary(
         channel_message_counts=dict(counts),
         chunk_count=len(chunks),
         message_count=counts.total(),
-        message_end_time=max(placed.index.message_end_time for placed in chunks),
-        message_start_time=min(placed.index.message_start_time for placed in chunks),
+        message_end_time=max(placed.message_end_time for placed in chunks),
+        message_start_time=min(placed.message_start_time for placed in chunks),
         metadata_count=len(notes),
         schema_count=len(schemas),
     )
@@ -383,7 +378,7 @@ def _write_summary(
         (Opcode.SCHEMA, schemas),
         (Opcode.CHANNEL, channels),
         (Opcode.STATISTICS, [statistics]),
-        (Opcode.CHUNK_INDEX, [placed.index for placed in chunks]),
+        (Opcode.CHUNK_INDEX, chunks),
         (Opcode.METADATA_INDEX, [MetadataIndex(offset, length, note.name) for offset, length, note in notes]),
     ]
     start, out, offsets = file.tell(), RecordBuilder(), []
