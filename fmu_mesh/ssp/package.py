@@ -20,7 +20,7 @@ from ..archives.archive_entries import LIMITS_HINT
 from ..config.mesh import LimitsConfig, RecordConfig
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.fmi.archive.archive import OpenFmu, opened
-from ..text import listed, meant, nearest, nearest_file
+from ..text import did_you_mean, listed, meant, nearest, nearest_file
 from .problems import Problems
 from .system_structure import FilePlace
 
@@ -102,7 +102,7 @@ class Package:
         """
         owner = self._owner(name)
         if owner is None:
-            hint = meant(nearest(name, self.names()), f"It has {listed(self.names())}.")
+            hint = did_you_mean(name, self.names(), f"It has {listed(self.names())}.")
             raise ConfigurationError(f"'{self.root}' has no file '{name}'", hint=hint)
         try:
             if owner[1].startswith("../"):

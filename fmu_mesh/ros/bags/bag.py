@@ -25,7 +25,7 @@ from ...errors import ConfigurationError
 from ...installing import importing
 from ...results.formats import near_hint, reading
 from ...system.scenario import BagValues, is_bag
-from ...text import listed, nearest
+from ...text import did_you_mean, listed, nearest
 from ...variables.model_description import ModelDescription, Value
 from ..gateway.mapping import Resolver, message_types
 from ..messages.assembling import Disassembler
@@ -203,8 +203,7 @@ def _entry(choice: str, there: Mapping[str, str]) -> RosTopicConfig:
         raise ConfigurationError(f"`topics=[{choice!r}]`: expected TOPIC=INSTANCE.VARIABLE or TOPIC:FIELD=….")
     topic = "/" + found["topic"].lstrip("/")
     if topic not in there:
-        near = nearest(topic, there)
-        hint = f"Did you mean '{near}'?" if near else f"It has {listed(sorted(there))}."
+        hint = did_you_mean(topic, there, f"It has {listed(sorted(there))}.")
         raise ConfigurationError(f"`topics=[{choice!r}]`: the bag has no topic '{topic}'.", hint=hint)
     return RosTopicConfig(topic=topic, type=there[topic], fields={found["field"] or "data": found["variable"]})
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 import logging
 import queue
+import re
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -171,13 +172,9 @@ class ParameterServices:
         """Offer the services of ``node`` within the context."""
         thread = threading.Thread(target=self._run, name="parameters", daemon=True)
         thread.start()
-        for name, kind, answer in (
-            ("get_parameters", "GetParameters", self._get),
-            ("get_parameter_types", "GetParameterTypes", self._get_types),
-            ("set_parameters", "SetParameters", self._set),
-            ("list_parameters", "ListParameters", self._list),
-            ("describe_parameters", "DescribeParameters", self._describe),
-        ):
+        answers = self._get, self._get_types, self._set, self._list, self._describe
+        for kind, answer in zip(SERVICES, answers, strict=True):
+            name = re.sub(r"\B([A-Z])", r"_\1", kind).lower()  # `get_parameters` is of the type GetParameters
             full_name = absolute(f"{self._plan.node}/{name}", self._plan.namespace)
             node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._queued(answer))
         try:

@@ -16,7 +16,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         node, executor = create_node(), executors.SingleThreadedExecutor()
     except Exception as error:  # noqa: BLE001 rclpy raises many types for wrong arguments, and each says which
         print(f"fmu_mesh.ros.node: {_wrong_arguments(error)}", file=sys.stderr)  # noqa: T201 as above
-        with _Deadline(f"ROS was not shut down within {_END_S:g} s", ConfigurationError.exit_code):
+        with _deadline(f"ROS was not shut down within {_END_S:g} s", ConfigurationError.exit_code):
             rclpy.try_shutdown()
         return ConfigurationError.exit_code
     try:
@@ -169,11 +170,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A second Ctrl-C ends the process at once, without a traceback.
         signal.signal(signal.SIGINT, lambda *_: os._exit(Interrupted.exit_code))
         managed: FmuNode | GatewayNode = node.managed
-        with _Deadline(f"the node was not closed within {_END_S:g} s", FmuError.exit_code):
+        with _deadline(f"the node was not closed within {_END_S:g} s", FmuError.exit_code):
             returned = managed.close()
         exit_code = managed.failure.exit_code if managed.failure is not None else 0 if returned else FmuError.exit_code
         # All that is the node's own is closed: nothing is lost if the middleware does not end.
-        with _Deadline(f"ROS was not shut down within {_END_S:g} s", exit_code):
+        with _deadline(f"ROS was not shut down within {_END_S:g} s", exit_code):
             executor.shutdown(0.0)  # otherwise the garbage collector destroys its parts in any order, with a message
             node.destroy_node()
             rclpy.try_shutdown()
@@ -183,25 +184,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return exit_code
 
 
-class _Deadline:
+@contextmanager
+def _deadline(what: str, exit_code: int) -> Iterator[None]:
     """Ends the process if what is inside takes longer than `_END_S`; says so, and what every thread does."""
 
-    def __init__(self, what: str, exit_code: int) -> None:
-        self._what = what
-        self._exit_code = exit_code
-        self._timer = threading.Timer(_END_S, self._end)
-        self._timer.daemon = True
-
-    def __enter__(self) -> None:
-        self._timer.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._timer.cancel()
-
-    def _end(self) -> None:
-        print(f"fmu_mesh.ros.node: {self._what}; the process ends without it", file=sys.stderr)  # noqa: T201 as above
+    def end() -> None:
+        print(f"fmu_mesh.ros.node: {what}; the process ends without it", file=sys.stderr)  # noqa: T201 as above
         faulthandler.dump_traceback()
-        os._exit(self._exit_code)
+        os._exit(exit_code)
+
+    timer = threading.Timer(_END_S, end)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class _Autostart:
