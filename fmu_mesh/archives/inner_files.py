@@ -7,6 +7,7 @@ file without a name if it is large, so nothing of it is left when it is closed. 
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 import zipfile
 from collections.abc import Iterable
@@ -32,11 +33,7 @@ _CHUNK: Final = 2**20
 
 
 class InnerFile(NamedTuple):
-    """A file of an archive, copied out of it; who has it closes ``file``.
-
-    Attributes:
-        sha256: in hexadecimal digits, of the bytes that were copied.
-    """
+    """A file of an archive, copied out of it, and its SHA-256 in hexadecimal digits; who has it closes ``file``."""
 
     file: IO[bytes]
     sha256: str
@@ -77,9 +74,8 @@ def inner_size(path: Path, outer: Path, limits: LimitsConfig = LimitsConfig()) -
     Raises:
         LoadFailed: as `inner_file`.
     """
-    copy = inner_file(path, outer, limits)
-    with copy.file:
-        return copy.file.seek(0, 2)
+    with inner_file(path, outer, limits).file as file:
+        return file.seek(0, os.SEEK_END)
 
 
 def _followed(path: Path, outer: Path, file: IO[bytes], limits: LimitsConfig, stack: ExitStack) -> InnerFile:
@@ -99,11 +95,7 @@ def _followed(path: Path, outer: Path, file: IO[bytes], limits: LimitsConfig, st
 
 
 def _entry_towards(path: Path, here: Path, archive: zipfile.ZipFile) -> tuple[str, zipfile.ZipInfo]:
-    """The file of an archive that ``path`` names, or that it leads into.
-
-    Raises:
-        LoadFailed: there is none; suggests the nearest one.
-    """
+    """The file of an archive that ``path`` names, or that it leads into."""
     wanted = _inside(path, here)
     entries = {entry_name(entry): entry for entry in archive.infolist() if not entry.is_dir()}
     parts = PurePosixPath(wanted)

@@ -21,7 +21,6 @@ from ..variables.units import Linear, conversion
 from ..variables.value_types import FMI2_TYPES, element_name
 from .problems import Problems
 from .system_structure import (
-    Connector,
     FilePlace,
     StructureComponent,
     StructureConnection,
@@ -248,17 +247,12 @@ class _Flattening:
             if type_ not in (None, variable.type):
                 found = f"the type {connector.type}, while the FMU has {variable.type_name}, which counts"
                 self._problems.warn(connector.place, found)
-            self._check_unit(connector, variable)
-
-    def _check_unit(self, connector: Connector, variable: Variable) -> None:
-        """Warn where a connector and its variable have units that are not the same."""
-        unit = connector.unit
-        if unit is None or not unit.name or not variable.unit or unit.name == variable.unit:
-            return
-        if unit.base is None or variable.base_unit is None or unit.base == variable.base_unit:
-            return
-        found = f"the unit '{unit.name}', while the FMU has '{variable.unit}'; that of the connector counts"
-        self._problems.warn(connector.place, found)
+            unit = connector.unit
+            if unit is None or not unit.name or not variable.unit or unit.name == variable.unit:
+                continue
+            if unit.base is not None and variable.base_unit is not None and unit.base != variable.base_unit:
+                found = f"the unit '{unit.name}', while the FMU has '{variable.unit}'; that of the connector counts"
+                self._problems.warn(connector.place, found)
 
     def _segment(self, system: StructureSystem, path: Path, connection: StructureConnection) -> _Segment | None:
         """A connection of a system with its direction; None after a finding."""
@@ -370,11 +364,9 @@ def _by_variables(source: _ConnectionEnd, target: _ConnectionEnd, own: Linear, *
 
 
 class _ConnectionEnd(msgspec.Struct, frozen=True):
-    """One end of a connection.
+    """One end of a connection; ``owner`` is whose connector it is, as seen from the system with the connection.
 
-    Attributes:
-        owner: whose connector it is, as seen from the system with the connection.
-        variable: that of an FMU; None for a connector of a system.
+    The variable is that of an FMU; None for a connector of a system.
     """
 
     path: Path

@@ -50,13 +50,9 @@ TYPES: Final = (*_TYPES_OF_1, "Float64", "Float32", *_INTEGERS_OF_2, "Clock")
 
 
 class Attribute(NamedTuple):
-    """One attribute.
+    """One attribute, with its first version of SSP.
 
-    Attributes:
-        type: a key of `PATTERNS`.
-        words: the only values, if there are such.
-        is_list: whether it has several values with blanks between them.
-        since: the first version of SSP that has it.
+    The type is a key of `PATTERNS`. The ``words`` are the only values, if there are such; a list has several values.
     """
 
     type: str

@@ -309,11 +309,7 @@ def _inside(path: str) -> str:
 
 
 def _own(path: str) -> str:
-    """The path of a result file in an annotation.
-
-    Raises:
-        AnnotationRefused: it leads out of the folder of the package: somebody else may have written it.
-    """
+    """The path of a result file in an annotation; somebody else may have written it."""
     if _inside(path) != posixpath.normpath(path):
         raise AnnotationRefused(f"the result file '{path}'", "a path into the folder of the package, without '..'")
     return path

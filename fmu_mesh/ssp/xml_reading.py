@@ -34,11 +34,9 @@ _KNOWN_LINES: Final = 65535
 
 
 class _Document(NamedTuple):
-    """What all elements of a file have in common.
+    """What all elements of a file have in common: its name in messages, and their lines where lxml may not know them.
 
-    Attributes:
-        file: as messages name it.
-        lines: those of all elements, where lxml may not know them; it also keeps the elements, which are its keys.
+    The ``lines`` also keep the elements, which are the keys.
     """
 
     file: str

@@ -179,11 +179,7 @@ def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -
 
 
 def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any message
-    """A field as a value of the mesh, an array in the shape of its variable.
-
-    Raises:
-        CdrError: the number of elements is wrong.
-    """
+    """A field as a value of the mesh, an array in the shape of its variable."""
     plain: Value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     if not port.variable.shape:
         return plain

@@ -153,12 +153,7 @@ class _Field(Protocol):
 
 
 def _field_of(types: MessageTypes, kind: FieldType, name: str) -> _Field:
-    """The field of this kind; ``name`` is its path, for errors.
-
-    Raises:
-        UnknownType: there is no such message type.
-        CdrError: the field cannot be encoded here.
-    """
+    """The field of this kind; ``name`` is its path, for errors."""
     match kind:
         case Basic("string", bound):
             return _StringField(bound, name)
