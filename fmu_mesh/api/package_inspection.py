@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +24,7 @@ from ..ssp.system_structure import (
     StructureComponent,
     StructureSystem,
     components_of,
+    elements_of,
 )
 from ..text import counted, printable, short_number
 
@@ -191,7 +191,7 @@ def inspect_package(path: str | Path, *, ssd: str | None = None) -> PackageInspe
         step_size, algorithm = times.get("step_size"), times.get("algorithm")
         components = [place for place, _ in components_of(structure.system)]
         names = dict(zip(components, instances if isinstance(instances, dict) else (), strict=False))
-        elements = list(_elements(structure.system))
+        elements = list(elements_of(structure.system))
         annotations = [*annotations_of(structure), *(own for _, one in elements[1:] for own in one.annotations)]
         return PackageInspection(
             file=str(path),
@@ -240,17 +240,6 @@ def _source(package: Package, path: tuple[str, ...], binding: Binding) -> Packag
     mapped_by = inside(mapping.place.file) if mapping is not None else None
     file, line = inside(values.place.file), values.place.line
     return PackageParameters(path, file, line, len(values.parameters), binding.prefix, mapped_by)
-
-
-def _elements(system: StructureSystem, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Element]]:
-    """The system and all elements inside it, in the order of the documents."""
-    yield path, system
-    for element in system.elements:
-        own = (*path, element.name)
-        if isinstance(element, StructureSystem):
-            yield from _elements(element, own)
-        else:
-            yield own, element
 
 
 # --- the page

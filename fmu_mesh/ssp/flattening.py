@@ -22,6 +22,7 @@ from ..variables.value_types import FMI2_TYPES, element_name
 from .problems import Problems
 from .system_structure import (
     FilePlace,
+    Path,
     StructureComponent,
     StructureConnection,
     StructureSystem,
@@ -29,9 +30,8 @@ from .system_structure import (
     Unit,
 )
 
-__all__ = ["Describe", "FlatConnection", "Path", "PathChange", "flatten"]
+__all__ = ["Describe", "FlatConnection", "PathChange", "flatten"]
 
-Path = tuple[str, ...]
 Describe = Callable[[Path], ModelDescription | None]
 """The model description of the component at a path; None if it cannot be read."""
 

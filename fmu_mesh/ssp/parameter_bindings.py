@@ -16,7 +16,7 @@ import msgspec
 from ..text import listed, nearest, shown
 from ..variables.model_description import ModelDescription, Value, Variable
 from ..variables.value_conversion import ValueRefused, to_value
-from .flattening import Describe, Path
+from .flattening import Describe
 from .parameter_reading import refuse_ambiguous
 from .parameter_values import AppliedValue, changed, converted, target_of_connector, target_of_variable
 from .problems import Problems
@@ -25,9 +25,11 @@ from .system_structure import (
     FilePlace,
     MappingEntry,
     ParameterValue,
+    Path,
     StructureComponent,
     StructureSystem,
     components_of,
+    elements_of,
 )
 
 __all__ = ["AppliedValue", "ResolvedParameters", "changed", "resolve_parameters"]
@@ -95,8 +97,8 @@ class _Resolution:
             candidates = self._of_components.get(path)
             if candidates and description is not None:
                 resolved.of_components[path] = self._of_component(component, path, description, candidates)
-        for path, owner in _systems_of(system, ()):
-            for connector in owner.connectors:
+        for path, owner in elements_of(system):
+            for connector in owner.connectors if isinstance(owner, StructureSystem) else ():
                 candidate = self._of_systems.get((path, connector.name))
                 if candidate is None or not candidate.parameter.values:
                     continue  # without values, there is a finding
@@ -233,11 +235,3 @@ class _Resolution:
                         sizes[name] = to_value(value.value, variable)
             description = description.sized(sizes)
         return {name: values[name] for name in candidates if name in values}
-
-
-def _systems_of(system: StructureSystem, path: Path) -> Iterator[tuple[Path, StructureSystem]]:
-    """A system and all systems in it, with their paths."""
-    yield path, system
-    for element in system.elements:
-        if isinstance(element, StructureSystem):
-            yield from _systems_of(element, (*path, element.name))

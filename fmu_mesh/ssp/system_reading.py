@@ -33,7 +33,15 @@ from .package import DEFAULT, RESULT_BESIDE_PACKAGE, Package
 from .parameter_bindings import AppliedValue, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure, read_values
-from .system_structure import Annotation, FilePlace, Structure, StructureComponent, StructureSystem, components_of
+from .system_structure import (
+    Annotation,
+    FilePlace,
+    Structure,
+    StructureComponent,
+    StructureSystem,
+    components_of,
+    elements_of,
+)
 
 __all__ = ["NEEDED", "chosen_description", "read_system"]
 
@@ -145,7 +153,8 @@ class _Configuration:
         if self._annotation is None:
             connections = self._delayed_last(connections)
         self._settle(connections, values, parameters.of_components, parameters.of_systems)
-        if not self._components and _is_known(system):
+        known = all(not isinstance(one, StructureSystem) or one.is_known for _, one in elements_of(system))
+        if not self._components and known:  # otherwise there is a finding
             found = "no component in it, nor in a system inside it: there is nothing to run"
             self._problems.add(system.place, found, "a Component with an FMU")
         if not self._components:
@@ -381,12 +390,6 @@ class _Configuration:
 def _nanoseconds(seconds: float) -> int:
     """A duration as libcosim has it, in 64 bits."""
     return round(min(seconds * 1e9, 2.0**62))
-
-
-def _is_known(system: StructureSystem) -> bool:
-    """Whether everything in a system could be read; otherwise there is a finding."""
-    inside = (element for element in system.elements if isinstance(element, StructureSystem))
-    return system.is_known and all(_is_known(element) for element in inside)
 
 
 def _map_value(text: str, target: Variable | None) -> bool | int | str:

@@ -26,6 +26,7 @@ __all__ = [
     "ParameterMapping",
     "ParameterSet",
     "ParameterValue",
+    "Path",
     "Structure",
     "StructureComponent",
     "StructureConnection",
@@ -33,6 +34,7 @@ __all__ = [
     "Transformation",
     "Unit",
     "components_of",
+    "elements_of",
 ]
 
 ConnectorKind = Literal[
@@ -47,6 +49,9 @@ ConnectorKind = Literal[
     "unspecified",
 ]
 
+
+Path = tuple[str, ...]
+"""The names of the elements on the way from the root system to one; empty for the root system."""
 
 Enumeration = dict[str, int]
 """An enumeration that a file defines (SSP 2.0, 4.4.1): the values by the names of the items."""
@@ -268,13 +273,17 @@ class Structure(msgspec.Struct, frozen=True):
     annotations: tuple[Annotation, ...] = ()
 
 
-def components_of(
-    system: StructureSystem, path: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], StructureComponent]]:
-    """All components with the names of the elements on the way to them, in the order of the documents."""
+def elements_of(system: StructureSystem, path: Path = ()) -> Iterator[tuple[Path, Element]]:
+    """A system and all elements inside it with their paths, in the order of the documents."""
+    yield path, system
     for element in system.elements:
         own = (*path, element.name)
-        if isinstance(element, StructureComponent):
-            yield own, element
+        if isinstance(element, StructureSystem):
+            yield from elements_of(element, own)
         else:
-            yield from components_of(element, own)
+            yield own, element
+
+
+def components_of(system: StructureSystem) -> Iterator[tuple[Path, StructureComponent]]:
+    """All components of a system and of those in it, with their paths."""
+    return ((path, element) for path, element in elements_of(system) if isinstance(element, StructureComponent))
