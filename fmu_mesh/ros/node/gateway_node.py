@@ -201,5 +201,4 @@ class GatewayNode:
 
 def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
     qos = ros_module("rclpy.qos")
-    reliability = {"reliable": qos.ReliabilityPolicy.RELIABLE, "best_effort": qos.ReliabilityPolicy.BEST_EFFORT}
-    return qos.QoSProfile(depth=DEPTH, reliability=reliability[topic.reliability])
+    return qos.QoSProfile(depth=DEPTH, reliability=qos.ReliabilityPolicy[topic.reliability.upper()])
