@@ -72,13 +72,11 @@ def open_profiles(
     profiles: dict[str, Profile] = {}
     with ExitStack() as stack:
         for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
-            if name == "rmw_zenoh":
-                node = profiles[name] = RmwZenoh(ros, plan, section.domain)
-                stack.callback(node.close)
-                stack.enter_context(ParameterServices(plan, mesh, keys).served_by(node))
-            else:
-                profile = profiles[name] = Ros2Dds(ros, plan.types)
-                stack.callback(profile.close)
+            profile = RmwZenoh(ros, plan, section.domain) if name == "rmw_zenoh" else Ros2Dds(ros, plan.types)
+            profiles[name] = profile
+            stack.callback(profile.close)
+            if isinstance(profile, RmwZenoh):
+                stack.enter_context(ParameterServices(plan, mesh, keys).served_by(profile))
         yield profiles
 
 

@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rclpy.try_shutdown()
         return ConfigurationError.exit_code
     try:
-        with _Autostart(node, executor):
+        with _autostart(node, executor):
             rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
@@ -202,78 +202,75 @@ def _deadline(what: str, exit_code: int) -> Iterator[None]:
         timer.cancel()
 
 
-class _Autostart:
-    """Configures and activates a node if its parameter `autostart` is true.
+@contextmanager
+def _autostart(node: RosNode, executor: Any) -> Iterator[None]:  # noqa: ANN401 a class of rclpy
+    """Configures and activates a node if its parameter `autostart` is true; goes around the spinning of the node.
 
     The gateway of a mesh waits for the mesh on another thread, so services answer meanwhile and Ctrl-C ends the wait.
-    Use it as a context manager around the spinning of the node.
     """
 
-    def __init__(self, node: RosNode, executor: Any) -> None:  # noqa: ANN401 a class of rclpy
-        self._node = node
-        self._executor = executor
-        self._log = node.get_logger()
-        self._over = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def __enter__(self) -> None:
-        """Start the node, or begin to wait for the mesh."""
-        if not self._node.get_parameter("autostart").value:
-            return
-        if self._node.get_parameter("config").value and not self._node.get_parameter("fmu_path").value:
-            self._thread = threading.Thread(target=self._wait_and_start, name="autostart", daemon=True)
-            self._thread.start()
-        else:
-            self._start()
-
-    def __exit__(self, *_: object) -> None:
-        """Stop waiting."""
-        self._over.set()
-        if self._thread is not None:
-            self._thread.join(_ATTEMPT_END_S)
-
-    def _start(self) -> None:
+    def start() -> None:
         done = ros_module("rclpy.lifecycle").TransitionCallbackReturn.SUCCESS
-        if self._node.trigger_configure() == done:
-            self._node.trigger_activate()
+        if node.trigger_configure() == done:
+            node.trigger_activate()
 
-    def _wait_and_start(self) -> None:
-        """Start the node when all instances of the mesh answer; after the timeout only say so."""
-        config = self._node.get_parameter("config").value
-        timeout_s = self._node.get_parameter("autostart_timeout").value
-        try:
-            mesh = running_configuration(Path(config)).config.mesh
-        except FmuMeshError:
-            self._executor.create_task(self._start)  # `configure` reports what is wrong with the file
-            return
-        deadline = time.monotonic() + timeout_s
-        reported = False
-        while not self._over.is_set():
-            reason = self._absence(mesh)
-            if reason is None:
-                self._executor.create_task(self._start)
-                return
-            if time.monotonic() >= deadline:
-                name = self._node.get_fully_qualified_name()
-                self._log.error(
-                    f"mesh '{mesh}' did not come within {timeout_s:g} s (autostart_timeout): {reason} "
-                    "Once it runs, configure and activate this node: "
-                    f"`ros2 lifecycle set {name} configure`, then `ros2 lifecycle set {name} activate`."
-                )
-                return
-            if not reported:
-                reported = True
-                self._log.info(f"waiting up to {timeout_s:g} s (autostart_timeout) for mesh '{mesh}': {reason}")
-            self._over.wait(_INTERVAL_S)
+    autostart, config, fmu_path = (node.get_parameter(name).value for name in ("autostart", "config", "fmu_path"))
+    if not autostart or not config or fmu_path:
+        if autostart:
+            start()
+        yield
+        return
+    over = threading.Event()
 
-    def _absence(self, mesh: str) -> str | None:
-        """Why the gateway cannot start yet; None if it can."""
-        endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
-        try:
-            with Meshes(endpoints, _ATTEMPT_S) as meshes:
-                client = meshes.named(mesh)
-                for name in client.info().instances:
-                    client.instance_info(name)
-        except FmuMeshError as error:
-            return str(error)
-        return None
+    def wait_and_start() -> None:
+        if _mesh_came(node, over):
+            executor.create_task(start)
+
+    thread = threading.Thread(target=wait_and_start, name="autostart", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(_ATTEMPT_END_S)
+
+
+def _mesh_came(node: RosNode, over: threading.Event) -> bool:
+    """Wait until all instances of the mesh answer; after the timeout only say so."""
+    timeout_s, ros_log = node.get_parameter("autostart_timeout").value, node.get_logger()
+    try:
+        mesh = running_configuration(Path(node.get_parameter("config").value)).config.mesh
+    except FmuMeshError:
+        return True  # `configure` reports what is wrong with the file
+    deadline = time.monotonic() + timeout_s
+    reported = False
+    while not over.is_set():
+        reason = _absence(node, mesh)
+        if reason is None:
+            return True
+        if time.monotonic() >= deadline:
+            name = node.get_fully_qualified_name()
+            ros_log.error(
+                f"mesh '{mesh}' did not come within {timeout_s:g} s (autostart_timeout): {reason} "
+                "Once it runs, configure and activate this node: "
+                f"`ros2 lifecycle set {name} configure`, then `ros2 lifecycle set {name} activate`."
+            )
+            return False
+        if not reported:
+            reported = True
+            ros_log.info(f"waiting up to {timeout_s:g} s (autostart_timeout) for mesh '{mesh}': {reason}")
+        over.wait(_INTERVAL_S)
+    return False
+
+
+def _absence(node: RosNode, mesh: str) -> str | None:
+    """Why the gateway cannot start yet; None if it can."""
+    endpoints = [endpoint for endpoint in node.get_parameter("connect").value if endpoint]
+    try:
+        with Meshes(endpoints, _ATTEMPT_S) as meshes:
+            client = meshes.named(mesh)
+            for name in client.info().instances:
+                client.instance_info(name)
+    except FmuMeshError as error:
+        return str(error)
+    return None
