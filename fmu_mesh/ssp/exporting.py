@@ -30,7 +30,7 @@ from .grammar import NAMESPACES
 from .naming import element_path, instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, names_in, written
 from .package import DEFAULT, Package
-from .package_writing import ArchiveEntry, PackageEntry, resource_names, write_package
+from .package_writing import ArchiveEntry, Content, resource_names, write_package
 from .ssd_writing import (
     ElementNames,
     SspVersion,
@@ -118,8 +118,7 @@ def _write_copy(plain: PlainConfig, original: PlainConfig, kept: _KeptPackage, p
     document = kept.document if annotation == before else with_own_annotation(kept.document, annotation)
     with kept.copied(document) as entries:
         write_package(path, entries)
-        names_of_files = [entry.name for entry in entries]
-    if kept.name in names_of_files and kept.name != DEFAULT:
+    if kept.name in entries and kept.name != DEFAULT:
         found = f"'{kept.name}' is not the default description of the package"
         return (Finding(str(path), "", found, f"`ssd={kept.name!r}` to run it"),)
     return ()
@@ -148,8 +147,7 @@ def _write_new(plain: PlainConfig, resolve: Callable[[], ResolvedSystem], path: 
     document, units = ssd_of(system, names, version, annotation, findings)
     findings.raise_any()
     models_of = {resource: model for model, resource in reversed(resources.items())}
-    entries = [PackageEntry(resource, models_of[resource]) for resource in dict.fromkeys(resources.values())]
-    write_package(path, [PackageEntry(DEFAULT, document), *entries])
+    write_package(path, {DEFAULT: document, **{name: models_of[name] for name in resources.values()}})
     return units
 
 
@@ -244,24 +242,20 @@ class _KeptPackage(NamedTuple):
         return said <= {version, None}
 
     @contextmanager
-    def copied(self, document: bytes) -> Iterator[list[PackageEntry]]:
+    def copied(self, document: bytes) -> Iterator[dict[str, Content]]:
         """The files of a copy of the package, with another content of the description."""
         if is_file(self.root):
             with self.root.open("rb") as file, checked_archive(self.root, file, LimitsConfig(), "package") as archive:
-                entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-                yield [
-                    PackageEntry(name, document if name == self.name else ArchiveEntry(archive, entry))
-                    for entry in entries
-                    for name in [entry_name(entry)]
-                ]
+                there = [entry for entry in archive.infolist() if not entry.is_dir()]
+                entries = {entry_name(entry): ArchiveEntry(archive, entry) for entry in there}
+                yield {**entries, self.name: document}
             return
         if beside := sorted(source for source in _sources(self._tree()) if source.startswith("../")):
             text = f"'{self.shown}' names '{beside[0]}', which is not in the folder of the package"
             raise ConfigurationError(text, hint="Copy it into the folder, and name the copy.")
         names = self._names_in_folder()
         main = DEFAULT if DEFAULT not in names else self.name
-        others = [PackageEntry(name, self._own_file(name)) for name in names if name != self.name]
-        yield [PackageEntry(main, document), *others]
+        yield {main: document, **{name: self._own_file(name) for name in names if name != self.name}}
 
     def _own_file(self, name: str) -> Path:
         """The path of a file of a folder; what is copied is given to others, and so must not be somewhere else."""

@@ -13,7 +13,7 @@ import shutil
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -26,7 +26,7 @@ from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError
 from ..instances.fmi.archive.archive import content_of
 
-__all__ = ["ArchiveEntry", "PackageEntry", "resource_names", "write_package"]
+__all__ = ["ArchiveEntry", "Content", "resource_names", "write_package"]
 
 _TIME: Final = (1980, 1, 1, 0, 0, 0)
 """The earliest time that an archive can have."""
@@ -49,20 +49,12 @@ class ArchiveEntry(NamedTuple):
     entry: zipfile.ZipInfo
 
 
-class PackageEntry(NamedTuple):
-    """One file of a package.
-
-    Attributes:
-        name: its path in the package.
-        content: its bytes, or where it is. The path of a folder is that of an unpacked FMU, which is packed.
-    """
-
-    name: str
-    content: bytes | Path | ArchiveEntry
+Content = bytes | Path | ArchiveEntry
+"""A file of a package, or where it is. The path of a folder is that of an unpacked FMU, which is packed."""
 
 
-def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
-    """Write a package; one that is there stays as it is until the new one is complete.
+def write_package(path: Path, entries: Mapping[str, Content]) -> None:
+    """Write a package of entries by their paths in it; one that is there stays as it is until the new one is complete.
 
     Raises:
         ConfigurationError: it cannot be written.
@@ -70,8 +62,8 @@ def write_package(path: Path, entries: Iterable[PackageEntry]) -> None:
     """
     try:
         with files.replaced(path) as draft, zipfile.ZipFile(draft, "w") as package:
-            for entry in entries:
-                _add(package, entry)
+            for name, content in entries.items():
+                _add(package, name, content)
     except _DAMAGED as error:
         raise ConfigurationError(f"'{path}' cannot be written, because a file for it is damaged: {error}") from error
     except OSError as error:
@@ -108,14 +100,14 @@ def resource_names(models: Iterable[Path]) -> dict[Path, str]:
     return names
 
 
-def _add(package: zipfile.ZipFile, entry: PackageEntry) -> None:
-    with _opened(entry.content) as source:
-        if isinstance(entry.content, ArchiveEntry):
-            size, stored = entry.content.entry.file_size, entry.content.entry.compress_type == zipfile.ZIP_STORED
+def _add(package: zipfile.ZipFile, name: str, content: Content) -> None:
+    with _opened(content) as source:
+        if isinstance(content, ArchiveEntry):
+            size, stored = content.entry.file_size, content.entry.compress_type == zipfile.ZIP_STORED
         else:
-            size, stored = source.seek(0, os.SEEK_END), entry.name.lower().endswith(_ARCHIVES)
+            size, stored = source.seek(0, os.SEEK_END), name.lower().endswith(_ARCHIVES)
             source.seek(0)
-        info = _info(entry.name, size, zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED)
+        info = _info(name, size, zipfile.ZIP_STORED if stored else zipfile.ZIP_DEFLATED)
         with package.open(info, "w") as target:
             shutil.copyfileobj(source, target, _CHUNK)
 
@@ -130,7 +122,7 @@ def _info(name: str, size: int, compression: int, *, executable: bool = False) -
 
 
 @contextmanager
-def _opened(content: bytes | Path | ArchiveEntry) -> Iterator[IO[bytes]]:
+def _opened(content: Content) -> Iterator[IO[bytes]]:
     """What a file of the package is to contain, open for reading."""
     match content:
         case bytes():

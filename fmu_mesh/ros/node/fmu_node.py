@@ -20,7 +20,7 @@ from ..messages.definitions import CLOCK
 from ..messages.topics import CLOCK_TOPIC, Topic
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
 from .node_topics import LOG_INTERVAL_S, FmuTopics, own_names, topics_of
-from .rclpy_modules import ClockWatch, RosNode, message_class, ros_module, steady_timer, time_message
+from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, time_message, watch_clock
 from .variable_parameters import (
     declare_parameters,
     names_of,
@@ -168,7 +168,7 @@ class FmuNode:
         if settings.publish_clock:
             publisher = self._clock_publisher = self._node.create_publisher(message_class(CLOCK), CLOCK_TOPIC, 10)
             self._configured.callback(self._node.destroy_publisher, publisher)
-            self._configured.callback(ClockWatch(self._node, "publish_clock: false").close)
+            self._configured.callback(watch_clock(self._node, "publish_clock: false"))
         self._node.add_on_set_parameters_callback(self._check_parameters)
         self._configured.callback(self._node.remove_on_set_parameters_callback, self._check_parameters)
         self._report(driver, settings, topics)

@@ -29,7 +29,7 @@ from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.profile import DEPTH, Profile, Put, Take
 from ..messages.topics import RosPlan, Topic
-from .rclpy_modules import ClockWatch, RosNode, message_class, ros_module, steady_timer
+from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, watch_clock
 
 __all__ = ["GatewayNode", "RclpyProfile"]
 
@@ -142,7 +142,7 @@ class GatewayNode:
             timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread))
             stack.callback(self._node.destroy_timer, timer)
             if plan.clock_points is not None:
-                stack.callback(ClockWatch(self._node, "`clock_rate: null` in the section `ros`").close)
+                stack.callback(watch_clock(self._node, "`clock_rate: null` in the section `ros`"))
             self._active = stack.pop_all()
 
     def deactivate(self) -> None:

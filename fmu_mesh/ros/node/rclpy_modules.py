@@ -9,13 +9,14 @@ from __future__ import annotations
 import importlib
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from ...errors import ConfigurationError
 from ..gateway.link import two_clocks
 from ..messages.topics import CLOCK_TOPIC
 
-__all__ = ["ClockWatch", "RosNode", "message_class", "ros_module", "steady_timer", "time_message"]
+__all__ = ["RosNode", "message_class", "ros_module", "steady_timer", "time_message", "watch_clock"]
 
 _INTERVAL_S = 1.0
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
@@ -69,30 +70,23 @@ def steady_timer(node: RosNode, period_s: float, callback: Callable[[], None]) -
     return node.create_timer(period_s, callback, clock=clock.Clock(clock_type=clock.ClockType.STEADY_TIME))
 
 
-class ClockWatch:
-    """Warns once of every other node that publishes `/clock`, and says which setting stops this node from it.
+def watch_clock(node: RosNode, setting: str) -> Callable[[], None]:
+    """Warn once of every other node that publishes `/clock`, until the function is called that this returns.
 
-    A node with `use_sim_time` takes every message on `/clock`, so with two sources its time jumps back and forth.
+    A node with `use_sim_time` takes every message on `/clock`, so with two sources its time jumps back and forth. The
+    warning says which ``setting`` keeps this node from publishing it.
     """
+    reported: set[str] = set()
 
-    def __init__(self, node: RosNode, setting: str) -> None:
-        self._node = node
-        self._setting = setting
-        self._reported: set[str] = set()
-        self._timer = steady_timer(node, _INTERVAL_S, self._look)
-
-    def close(self) -> None:
-        """Stop looking."""
-        self._node.destroy_timer(self._timer)
-
-    def _look(self) -> None:
+    def look() -> None:
         names = Counter(
             f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for info in self._node.get_publishers_info_by_topic(CLOCK_TOPIC)
+            for info in node.get_publishers_info_by_topic(CLOCK_TOPIC)
         )
-        names[self._node.get_fully_qualified_name()] -= 1
-        for name in sorted(+names):
-            if name not in self._reported:
-                self._reported.add(name)
-                other = "a program that gives no name" if _UNKNOWN in name else f"the node '{name}'"
-                self._node.get_logger().warning(two_clocks(other, self._setting))
+        names[node.get_fully_qualified_name()] -= 1
+        for name in sorted({*+names} - reported):
+            reported.add(name)
+            other = "a program that gives no name" if _UNKNOWN in name else f"the node '{name}'"
+            node.get_logger().warning(two_clocks(other, setting))
+
+    return partial(node.destroy_timer, steady_timer(node, _INTERVAL_S, look))
