@@ -30,7 +30,7 @@ from .grammar import PATTERNS
 from .naming import instance_name, mesh_name
 from .own_annotation import ANNOTATION_TYPE, AnnotationRefused, chosen_names, merged
 from .package import DEFAULT, RESULT_BESIDE_PACKAGE, Package
-from .parameter_bindings import AppliedValue, changed, resolve_parameters
+from .parameter_bindings import AppliedValue, ResolvedParameters, changed, resolve_parameters
 from .problems import Problems
 from .ssd_reading import annotations_of, read_structure, read_values
 from .system_structure import (
@@ -152,7 +152,7 @@ class _Configuration:
         connections, values = flatten(system, self._describe, self._problems, units)
         if self._annotation is None:
             connections = self._delayed_last(connections)
-        self._settle(connections, values, parameters.of_components, parameters.of_systems)
+        self._settle(connections, values, parameters)
         known = all(not isinstance(one, StructureSystem) or one.is_known for _, one in elements_of(system))
         if not self._components and known:  # otherwise there is a finding
             found = "no component in it, nor in a system inside it: there is nothing to run"
@@ -234,16 +234,13 @@ class _Configuration:
         return self._descriptions[key]
 
     def _settle(
-        self,
-        connections: Iterable[FlatConnection],
-        values: Iterable[FlatConnection],
-        of_components: dict[tuple[str, ...], dict[str, AppliedValue]],
-        of_systems: Mapping[tuple[tuple[str, ...], str], AppliedValue],
+        self, connections: Iterable[FlatConnection], values: Iterable[FlatConnection], parameters: ResolvedParameters
     ) -> None:
         """Give components the values of connectors of systems; a connected variable takes that of the connection."""
+        of_components = parameters.of_components
         for value in values:
             path, variable = value.target
-            if (applied := of_systems.get(value.source)) is not None:
+            if (applied := parameters.of_systems.get(value.source)) is not None:
                 given = changed(applied, value.change, self._variable(value.target), path, self._problems)
                 if given is not None:
                     of_components.setdefault(path, {})[variable] = given
