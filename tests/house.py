@@ -376,7 +376,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/onnx/onnx_model.py: options.log_severity_level": _ONNX,
         "instances/onnx/onnx_model.py: options.use_deterministic_compute": _ONNX,
         "ssp/xml_reading.py: parser.StartElementHandler": "expat takes its handlers in no other way",
-        "ros/node/entry.py: self._timer.daemon": "a Timer has no parameter for it",
+        "ros/node/entry.py: timer.daemon": "a Timer has no parameter for it",
         "ros/node/node_topics.py: message.header.stamp": _ROS,
         "ros/node/node_topics.py: setattr(owner)": _ROS,
     },
