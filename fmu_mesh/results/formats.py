@@ -111,7 +111,7 @@ def warn_of_endings(loaded: LoadedConfig, records: Sequence[RecordPlan], warning
             name = loaded.config.records[place].file
             found = f"'{name}', an ending of no installed format, so the file becomes a CSV"
             endings = " or ".join(result_endings())
-            warnings.add(f"{place}.file", found, f"a name ending in {endings}; from version 0.3 on this is an error")
+            warnings.add(f"{place}.file", found, f"a name ending in {endings}; from version 0.4 on this is an error")
 
 
 def require_readable(path: Path) -> ResultFormat:

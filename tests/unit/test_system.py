@@ -536,7 +536,7 @@ def test_other_names_of_result_files_are_taken(name: str) -> None:
 def test_an_ending_that_nobody_offers_is_still_a_csv_with_a_warning() -> None:
     (warning,) = built(text(rest="record: {file: result.dat}")).warnings
     assert "'result.dat', an ending of no installed format, so the file becomes a CSV" in str(warning)
-    assert "a name ending in .csv or .mcap or .parquet; from version 0.3 on this is an error" in str(warning)
+    assert "a name ending in .csv or .mcap or .parquet; from version 0.4 on this is an error" in str(warning)
 
 
 def test_a_client_needs_a_router() -> None:
