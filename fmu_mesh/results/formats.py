@@ -18,7 +18,7 @@ from ..errors import ConfigurationError, FmuMeshError
 from ..files import Kept, is_file, open_alone
 from ..plugins import plugin, plugin_names
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
-from ..text import nearest_file, printable
+from ..text import meant, nearest_file, printable
 from ..variables.model_description import ModelDescription
 from ..variables.value_types import VariableType
 from .recording import Columns, Recording, ResultFormat, Tail, joined
@@ -221,8 +221,7 @@ def reading(path: Path, what: str = "result file") -> Iterator[None]:
 
 def near_hint(path: Path) -> str | None:
     """The nearest file as a question, for an error about one that is not there."""
-    near = nearest_file(path)
-    return f"Did you mean '{near}'?" if near is not None else None
+    return meant(nearest_file(path))
 
 
 def _ending(path: str | Path) -> str:

@@ -21,7 +21,7 @@ from ..instances.registry import decode_section
 from ..simtime import ENDLESS
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
-from ..text import counted, listed, nearest
+from ..text import counted, did_you_mean, listed
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
 
@@ -246,6 +246,5 @@ def _no_node(plan: Plan, name: str) -> ConfigurationError:
         group = plan.node_of(name)
         return ConfigurationError(f"instance '{name}' runs in the group '{group}'", hint=f"Start node '{group}'.")
     names = [node for node in plan.nodes if node != RECORDER]
-    suggestion = nearest(name, names)
-    hint = f"Did you mean '{suggestion}'?" if suggestion else None
-    return ConfigurationError(f"there is no node '{name}'; there are: {listed(names)}.", hint=hint)
+    text = f"there is no node '{name}'; there are: {listed(names)}."
+    return ConfigurationError(text, hint=did_you_mean(name, names))
