@@ -118,19 +118,15 @@ class ProcessState:
 
 
 class _Seen(NamedTuple):
-    """What is compared.
-
-    Attributes:
-        signals: the handlers in C, of which Python does not know all, and the signals that this thread blocks.
-        environment: the addresses of the variables.
-    """
+    """What is compared."""
 
     folder: str | None
     locale: str
     thread_locale: int
+    # the handlers in C, of which Python does not know all, and the signals that this thread blocks
     signals: list[bytes]
     umask: int
-    environment: bytes
+    environment: bytes  # the addresses of the variables
 
     @classmethod
     def now(cls, signals: list[bytes]) -> _Seen:

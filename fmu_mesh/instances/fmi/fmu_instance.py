@@ -47,22 +47,14 @@ _OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
 class Bookkeeping(msgspec.Struct, frozen=True):
-    """What we know about an instance besides its FMU state.
+    """What we know about an instance besides its FMU state."""
 
-    Attributes:
-        step: own steps done; -1 in or before Initialization Mode.
-        time: the time of the FMU in s, where it does not follow from the step.
-        next_event: time of its next time event in s; None if there is none.
-        row: its held inputs.
-        ticks: the clocks; see `Clocks.place`.
-        last_event: time of its last event mode in s, where the steps depend on it; None if there was none.
-    """
-
-    step: int
-    time: float | None = None
-    next_event: float | None = None
-    row: tuple[bytes | list[Any], ...] = ()
-    ticks: tuple[float | None, ...] = ()
+    step: int  # own steps done; -1 in or before Initialization Mode
+    time: float | None = None  # the time of the FMU in s, where it does not follow from the step
+    next_event: float | None = None  # time of its next time event in s; None if there is none.
+    row: tuple[bytes | list[Any], ...] = ()  # its held inputs
+    ticks: tuple[float | None, ...] = ()  # the clocks; see `Clocks.place`
+    # time of its last event mode in s, where the steps depend on it; None if there was none.
     last_event: float | None = None
 
 

@@ -38,20 +38,13 @@ mode is checked after each step anyway, but for its traps."""
 
 
 class FmuFunctions(NamedTuple):
-    """The functions of one version of FMI and one kind of FMU.
+    """The functions of one version of FMI and one kind of FMU."""
 
-    Attributes:
-        library: FMPy's class for them.
-        values: those that get and set values.
-        free: FMPy's method that frees an instance.
-        needed: the functions, without their prefix, that every run needs.
-        names: FMI functions whose name does not follow from the name of FMPy's method, by that name.
-    """
-
-    library: type[Any]
-    values: ValueFunctions
-    free: str
-    needed: tuple[str, ...]
+    library: type[Any]  # FMPy's class for them
+    values: ValueFunctions  # those that get and set values
+    free: str  # FMPy's method that frees an instance
+    needed: tuple[str, ...]  # the functions, without their prefix, that every run needs
+    # FMI functions whose name does not follow from the name of FMPy's method, by that name
     names: Mapping[str, str] = {}
 
 

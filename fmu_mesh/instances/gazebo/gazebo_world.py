@@ -58,51 +58,31 @@ _GROUND = """
 
 
 class GazeboModel(msgspec.Struct, frozen=True):
-    """A model, also one in another model.
+    """A model, also one in another model."""
 
-    Attributes:
-        scoped: the name in Gazebo, such as `outer::inner`.
-        moving: whether it is not static; Gazebo lets a model in a static one move.
-    """
-
-    scoped: str
+    scoped: str  # the name in Gazebo, such as `outer::inner`
     element: ET.Element
-    moving: bool
+    moving: bool  # whether it is not static; Gazebo lets a model in a static one move.
 
 
 class SdfWorld(msgspec.Struct, frozen=True):
-    """The file of a world.
+    """The file of a world."""
 
-    Attributes:
-        text: the SDF that Gazebo gets; the unchanged file if nothing had to be changed.
-        source: the file.
-        element: the world as Gazebo gets it.
-        models: all models, outer ones first.
-        notes: parts that differ from the file or have no variables.
-    """
-
-    text: bytes
-    source: bytes
-    element: ET.Element
-    models: tuple[GazeboModel, ...]
-    notes: tuple[str, ...]
+    text: bytes  # the SDF that Gazebo gets; the unchanged file if nothing had to be changed
+    source: bytes  # the file
+    element: ET.Element  # the world as Gazebo gets it
+    models: tuple[GazeboModel, ...]  # all models, outer ones first
+    notes: tuple[str, ...]  # parts that differ from the file or have no variables
 
 
 class GazeboJoint(msgspec.Struct, frozen=True):
-    """A revolute or prismatic joint.
+    """A revolute or prismatic joint."""
 
-    Attributes:
-        scoped: the name in Gazebo, `model::joint`.
-        name: the name in variables.
-        effort_limit: largest absolute effort in N m or N; infinite without a limit.
-        free: whether it has no limits, whatever the file says.
-    """
-
-    scoped: str
-    name: str
+    scoped: str  # the name in Gazebo, `model::joint`
+    name: str  # the name in variables
     revolute: bool
-    effort_limit: float
-    free: bool
+    effort_limit: float  # largest absolute effort in N m or N; infinite without a limit
+    free: bool  # whether it has no limits, whatever the file says
 
 
 class GazeboLink(msgspec.Struct, frozen=True):
@@ -113,20 +93,14 @@ class GazeboLink(msgspec.Struct, frozen=True):
 
 
 class GazeboWorld(msgspec.Struct, frozen=True):
-    """A world.
+    """A world."""
 
-    Attributes:
-        text: the SDF that Gazebo gets.
-        step_size: of the engine in s.
-        places: the variables by name.
-    """
-
-    text: bytes
-    step_size: float
+    text: bytes  # the SDF that Gazebo gets
+    step_size: float  # of the engine in s
     joints: tuple[GazeboJoint, ...]
     links: tuple[GazeboLink, ...]
     description: ModelDescription
-    places: dict[str, WorldVariable]
+    places: dict[str, WorldVariable]  # the variables by name
 
 
 def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:

@@ -53,20 +53,14 @@ _OF_DOFS = ("velocity", "acceleration", "effort_applied", "effort_command", "eff
 
 
 class World(msgspec.Struct, frozen=True):
-    """A loaded model.
+    """A loaded model."""
 
-    Attributes:
-        model: the `mujoco.MjModel`.
-        entries: all variables.
-        limits: (index of the joint's velocity, smallest, largest effort) of joints whose effort is limited.
-        keyframe: number of the keyframe to start from, or None.
-    """
-
-    model: Any
+    model: Any  # the `mujoco.MjModel`
     description: ModelDescription
-    entries: tuple[WorldVariable, ...]
+    entries: tuple[WorldVariable, ...]  # all variables
+    # (index of the joint's velocity, smallest, largest effort) of joints whose effort is limited
     limits: tuple[tuple[int, float, float], ...]
-    keyframe: int | None
+    keyframe: int | None  # number of the keyframe to start from, or None
 
 
 def load_world(path: Path, config: MujocoConfig) -> World:

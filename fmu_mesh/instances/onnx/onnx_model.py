@@ -57,18 +57,13 @@ _NO_FOLDER = "/dev/null"
 
 
 class Tensor(msgspec.Struct, frozen=True):
-    """One input or output of a model.
+    """One input or output of a model."""
 
-    Attributes:
-        variable: what the mesh sees of it. An input of any floating-point type is a Float64, so that every
-            floating-point output can be connected to it; its value is rounded when the model is computed.
-        dtype: the type of the elements of the tensor.
-        sizes: the sizes of all its dimensions.
-    """
-
+    # what the mesh sees of it. An input of any floating-point type is a Float64, so that every floating-point output
+    # can be connected to it; its value is rounded when the model is computed.
     variable: Variable
-    dtype: Any
-    sizes: Sizes
+    dtype: Any  # the type of the elements of the tensor
+    sizes: Sizes  # the sizes of all its dimensions
 
 
 class OnnxModel:

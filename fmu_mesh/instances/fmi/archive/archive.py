@@ -38,28 +38,18 @@ _XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription
 
 
 class Terms(msgspec.Struct, frozen=True):
-    """The conditions that an FMU must meet before it is used.
-
-    Attributes:
-        sha256: the SHA-256 that the configuration asks for, in hexadecimal digits.
-        content: what `content_of` returned when the run was planned.
-    """
+    """The conditions that an FMU must meet before it is used."""
 
     limits: LimitsConfig = LimitsConfig()
-    sha256: str | None = None
-    content: str | None = None
+    sha256: str | None = None  # the SHA-256 that the configuration asks for, in hexadecimal digits
+    content: str | None = None  # what `content_of` returned when the run was planned
 
 
 class Contents(msgspec.Struct, frozen=True):
-    """What is in an FMU.
+    """What is in an FMU."""
 
-    Attributes:
-        names: the names of all files, with `/` between the parts.
-        xml: the contents of the XML files that describe the FMU, by name.
-    """
-
-    names: frozenset[str]
-    xml: dict[str, bytes]
+    names: frozenset[str]  # the names of all files, with `/` between the parts
+    xml: dict[str, bytes]  # the contents of the XML files that describe the FMU, by name
 
 
 class OpenFmu(ABC):

@@ -73,14 +73,10 @@ _linked: set[Path] = set()
 
 
 class _Build(msgspec.Struct, frozen=True):
-    """What to compile and how.
-
-    Attributes:
-        sources: paths relative to the folder `sources` of the FMU.
-    """
+    """What to compile and how."""
 
     identifier: str
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # paths relative to the folder `sources` of the FMU
     includes: tuple[str, ...]
     options: tuple[str, ...]
 

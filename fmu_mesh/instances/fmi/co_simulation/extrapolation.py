@@ -122,19 +122,12 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
 
 
 class _Line(msgspec.Struct, frozen=True):
-    """The line through the last two rows of a source.
+    """The line through the last two rows of a source."""
 
-    Attributes:
-        value: the last value.
-        point: the point of the last value.
-        change: the last value minus the one before; 0 as long as there is only one.
-        distance: points between the two.
-    """
-
-    value: float
-    point: int = 0
-    change: float = 0.0
-    distance: int = 1
+    value: float  # the last value
+    point: int = 0  # the point of the last value
+    change: float = 0.0  # the last value minus the one before; 0 as long as there is only one
+    distance: int = 1  # points between the two
 
     def through(self, value: float, point: int) -> _Line:
         """The line with the value of this point, which may be the last one again."""

@@ -29,17 +29,11 @@ _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, cty
 
 
 class EventInfo(NamedTuple):
-    """What one event iteration returns (FMI 2.0, 3.2.2: fmi2EventInfo).
+    """What one event iteration returns (FMI 2.0, 3.2.2: fmi2EventInfo)."""
 
-    Attributes:
-        again: the iteration has not converged yet.
-        terminate: the FMU asks to end the simulation.
-        next_event: time of the next time event in s; infinite if there is none.
-    """
-
-    again: bool
-    terminate: bool
-    next_event: float
+    again: bool  # the iteration has not converged yet
+    terminate: bool  # the FMU asks to end the simulation
+    next_event: float  # time of the next time event in s; infinite if there is none
 
 
 class ModelCalls:
