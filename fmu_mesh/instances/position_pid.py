@@ -127,14 +127,9 @@ class PidInstance(KeepsStateAsBytes):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._description = describe_pid()
-        self._values = {v.name: float(v.start) for v in self._description.variables if isinstance(v.start, float)}
+        self.description = describe_pid()
+        self._values = {v.name: float(v.start) for v in self.description.variables if isinstance(v.start, float)}
         self._integral = 0.0
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
@@ -179,13 +174,12 @@ class PidInstance(KeepsStateAsBytes):
 
     def get_state(self) -> bytes:
         """The inputs, the gains and the integral."""
-        return msgspec.json.encode(_State(self._values, self._integral))
+        return msgspec.json.encode((self._values, self._integral))
 
     def set_state(self, state: object) -> None:
         """Restore what `get_state` of this or another controller returned."""
         assert isinstance(state, bytes)
-        decoded = msgspec.json.decode(state, type=_State)
-        self._values, self._integral = dict(decoded.values), decoded.integral
+        self._values, self._integral = msgspec.json.decode(state, type=tuple[dict[str, float], float])
 
     def close(self) -> None:
         """Nothing to free."""
@@ -199,13 +193,6 @@ class PidInstance(KeepsStateAsBytes):
     def _write(self, step: int) -> None:
         for ring in self._outputs:
             ring.part("Float64")[step & ring.mask] = self.get_values(ring.layout.names)
-
-
-class _State(msgspec.Struct, frozen=True):
-    """The state of a controller between two steps."""
-
-    values: dict[str, float]
-    integral: float
 
 
 def _limited(value: float, most: float) -> float:

@@ -112,7 +112,7 @@ class Fmi3(FmuInstance):
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """Structural parameters in Configuration Mode, then all others (FMI 3.0, 2.3.3 and 2.3.2)."""
-        structural = {v.name for v in self._description.with_causality("structuralParameter")}
+        structural = {v.name for v in self.description.with_causality("structuralParameter")}
         sizes = {name: value for name, value in start_values.items() if name in structural}
         if sizes:
             self._checked(self._fmu.enterConfigurationMode)

@@ -28,14 +28,13 @@ from ..call_guard import call_named, doing
 from ..contract import LogMessage
 from ..instance_wrapper import of_kind, packed, unpacked
 from ..kept_models import KeptModels
-from .archive.archive import Terms
 from .archive.system_libraries import missing_libraries
 from .buffers import BinaryBuffer, Buffer
 from .callbacks import recall, register, register_component, tell_counted, unregister
 from .calls import RowPointers, cffi_function, declared, memory, pointer
 from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
-from .step_options import StepOptions
+from .step_options import StepOptions, Terms
 
 __all__ = ["Bookkeeping", "FmuInstance", "LogSink"]
 
@@ -83,7 +82,9 @@ class FmuInstance(ABC):
     _solver = ""
     """What the error of a solver begins with."""
 
-    _description: ModelDescription
+    description: ModelDescription
+    """The model description; arrays have the shapes that the structural parameters give them."""
+
     _variables: Mapping[str, Variable]
 
     def __init__(  # noqa: PLR0913, PLR0917 what an instance is made of; all of it is named where it is called
@@ -128,11 +129,6 @@ class FmuInstance(ABC):
             raise LoadFailed(f"'{path}' cannot be instantiated: {text}{self._message()}", instance=name) from error
 
     @property
-    def description(self) -> ModelDescription:
-        """The model description; arrays have the shapes that the structural parameters give them."""
-        return self._description
-
-    @property
     def changes_process(self) -> bool:
         """See `ChangesProcess`."""
         return self._model.changes_process
@@ -145,7 +141,7 @@ class FmuInstance(ABC):
         Binary values may be base64 as in a configuration.
         """
         self._check_live()
-        self._describe(self._description.sized(start_values))
+        self._describe(self.description.sized(start_values))
         values = {name: to_value(value, self._variables[name]) for name, value in start_values.items()}
         self._enter_initialization(start_time, stop_time, values)
         self._state = "initialization"
@@ -335,11 +331,11 @@ class FmuInstance(ABC):
 
     @property
     def _only_once(self) -> bool:
-        return self._description.only_once_per_process
+        return self.description.only_once_per_process
 
     def _tolerance(self) -> float | None:
         """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""
-        return self._options.tolerance or self._description.default_experiment.tolerance
+        return self._options.tolerance or self.description.default_experiment.tolerance
 
     def _bookkeeping(self) -> Bookkeeping:
         return Bookkeeping(self._said.step)
@@ -349,14 +345,14 @@ class FmuInstance(ABC):
         self._state = "stepping"
 
     def _describe(self, description: ModelDescription) -> None:
-        self._description = description
+        self.description = description
         self._variables = {variable.name: variable for variable in description.variables}
 
     def _check_functions(self) -> None:
         """Refuse a library without a function that every run needs; others may be missing until they are called."""
         names = {*self._functions.needed}
-        names |= {self._function_name("Get", variable.type) for variable in self._description.with_causality("output")}
-        names |= {self._function_name("Set", variable.type) for variable in self._description.with_causality("input")}
+        names |= {self._function_name("Get", variable.type) for variable in self.description.with_causality("output")}
+        names |= {self._function_name("Set", variable.type) for variable in self.description.with_causality("input")}
         missing = self._fmu.dll.missing  # in FMI 1.0 with the model identifier before the name
         if lacking := sorted(name for name in names if any(one.endswith(name) for one in missing)):
             raise RuntimeError(f"its library has no function {', '.join(lacking)}, which every run needs")

@@ -17,12 +17,12 @@ from fmpy.fmi1 import FMICallException
 from ...variables.model_description import ModelDescription
 from ..process_end import process_ends
 from ..process_state import FOLDER
-from .archive.archive import Terms
 from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
+from .step_options import Terms
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
 

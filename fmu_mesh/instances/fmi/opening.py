@@ -8,14 +8,13 @@ from typing import Final, cast
 from ...variables.model_description import Kind, ModelDescription
 from ..contract import Instance
 from ..kept_models import KeptModels
-from .archive.archive import Terms
 from .co_simulation.extrapolation import LinearInputs, TakesDerivatives
 from .co_simulation.fmi1 import Fmi1Instance
 from .co_simulation.fmi2 import Fmi2Instance
 from .co_simulation.fmi3 import Fmi3Instance
 from .fmu_instance import FmuInstance, LogSink
 from .model_exchange.continuous import Fmi1ModelInstance, Fmi2ModelInstance, Fmi3ModelInstance
-from .step_options import StepOptions
+from .step_options import StepOptions, Terms
 
 __all__ = ["open_instance", "stepped"]
 

@@ -6,9 +6,18 @@ from typing import Literal
 
 import msgspec
 
+from ...config.mesh import LimitsConfig
 from ...system.linear_inputs import LinearInput
 
-__all__ = ["SolverSettings", "StepOptions"]
+__all__ = ["SolverSettings", "StepOptions", "Terms"]
+
+
+class Terms(msgspec.Struct, frozen=True):
+    """The conditions that an FMU must meet before it is used."""
+
+    limits: LimitsConfig = LimitsConfig()
+    sha256: str | None = None  # the SHA-256 that the configuration asks for, in hexadecimal digits
+    content: str | None = None  # what `content_of` returned when the run was planned
 
 
 class SolverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 
-__all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
+__all__ = ["HOW_TO_GET_IT", "PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
 
 # Which processes meet here: the node and one Gazebo, over pipes (ADR 21). Gazebo ends when its standard input ends, so
 # it needs no signal when the node is killed. What it writes to standard error goes to a file: nobody reads it during a
@@ -27,6 +27,8 @@ __all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "
 
 PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
 """The environment variable with the command of the lock-step program, as a shell would split it."""
+
+HOW_TO_GET_IT = f"Build bridges/gazebo_classic and put it on the path, or its command into ${PROGRAM_VARIABLE}."
 
 PROGRAM = "gazebo_lockstep"
 

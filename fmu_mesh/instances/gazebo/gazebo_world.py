@@ -29,7 +29,7 @@ from ...variables.model_description import DefaultExperiment, ModelDescription
 from ..world_variables import WorldVariable, joint_variables, numbered, world_input, world_output
 from .gazebo_section import GazeboClassicConfig
 
-__all__ = ["GazeboJoint", "GazeboLink", "GazeboWorld", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboWorld", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
@@ -65,16 +65,6 @@ class GazeboModel(msgspec.Struct, frozen=True):
     moving: bool  # whether it is not static; Gazebo lets a model in a static one move.
 
 
-class SdfWorld(msgspec.Struct, frozen=True):
-    """The file of a world."""
-
-    text: bytes  # the SDF that Gazebo gets; the unchanged file if nothing had to be changed
-    source: bytes  # the file
-    element: ET.Element  # the world as Gazebo gets it
-    models: tuple[GazeboModel, ...]  # all models, outer ones first
-    notes: tuple[str, ...]  # parts that differ from the file or have no variables
-
-
 class GazeboJoint(msgspec.Struct, frozen=True):
     """A revolute or prismatic joint."""
 
@@ -85,20 +75,13 @@ class GazeboJoint(msgspec.Struct, frozen=True):
     free: bool  # whether it has no limits, whatever the file says
 
 
-class GazeboLink(msgspec.Struct, frozen=True):
-    """A link; `scoped` and `name` as those of a `GazeboJoint`."""
-
-    scoped: str
-    name: str
-
-
 class GazeboWorld(msgspec.Struct, frozen=True):
     """A world."""
 
     text: bytes  # the SDF that Gazebo gets
     step_size: float  # of the engine in s
     joints: tuple[GazeboJoint, ...]
-    links: tuple[GazeboLink, ...]
+    links: tuple[tuple[str, str], ...]  # scoped and name, as those of a joint
     description: ModelDescription
     places: dict[str, WorldVariable]  # the variables by name
 
@@ -109,25 +92,25 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
     Raises:
         LoadFailed: it is no world that Gazebo could load without looking elsewhere.
     """
-    sdf = _read(path)
-    step_size = _number(sdf.element.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
+    text, source, world, models, notes = _read(path)
+    step_size = _number(world.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
-    moving = [model for model in sdf.models if model.moving]
+    moving = [model for model in models if model.moving]
     joints, links = _joints(moving, free, path), _links(moving)
     variables = numbered(_variables(joints, links))
     description = ModelDescription(
-        model_name=sdf.element.get("name") or path.stem,
+        model_name=world.get("name") or path.stem,
         model_identifier="gazebo_classic",
         fmi_version="",
         kind="physics_engine",
-        guid=hashlib.sha256(sdf.source).hexdigest()[:32],
+        guid=hashlib.sha256(source).hexdigest()[:32],
         variables=tuple(own.variable for own in variables),
         generation_tool="Gazebo classic",
         default_experiment=DefaultExperiment(step_size=step_size),
-        problems=sdf.notes,
+        problems=tuple(notes),
     )
     places = {own.variable.name: own for own in variables}
-    return GazeboWorld(sdf.text, step_size, joints, links, description, places)
+    return GazeboWorld(text, step_size, joints, links, description, places)
 
 
 def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[GazeboJoint, ...]:
@@ -146,9 +129,9 @@ def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[
     return tuple(joints)
 
 
-def _links(models: Sequence[GazeboModel]) -> tuple[GazeboLink, ...]:
+def _links(models: Sequence[GazeboModel]) -> tuple[tuple[str, str], ...]:
     scoped = [f"{model.scoped}::{link.get('name')}" for model in models for link in model.element.findall("link")]
-    return tuple(GazeboLink(*names) for names in zip(scoped, _names(scoped), strict=True))
+    return tuple(zip(scoped, _names(scoped), strict=True))
 
 
 def _names(scoped: list[str]) -> list[str]:
@@ -167,14 +150,14 @@ def _number(text: str | None, default: float, path: Path) -> float:
         raise LoadFailed(f"'{path}' has '{text.strip()}' where a number should be") from error
 
 
-def _variables(joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]) -> Iterator[WorldVariable]:
+def _variables(joints: tuple[GazeboJoint, ...], links: tuple[tuple[str, str], ...]) -> Iterator[WorldVariable]:
     for number, joint in enumerate(joints):
         places = {what: (what, number) for what in ("effort_applied", "effort_command", "effort")}
         in_state = enumerate(("position", "velocity", "acceleration"), JOINT_STATE * number)
         places |= {what: ("state", place) for place, what in in_state}
         yield from joint_variables(joint.name, places, revolute=joint.revolute)
-    for number, link in enumerate(links):
-        yield from _link_variables(link.name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
+    for number, (_, name) in enumerate(links):
+        yield from _link_variables(name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
     for axis, letter in enumerate("xyz"):
         yield world_input(f"wind_{letter}", ("wind", axis), "m/s", "velocity of the medium in world axes")
 
@@ -205,11 +188,11 @@ def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariabl
 # --- reading the file
 
 
-def _read(path: Path) -> SdfWorld:
-    """Read the world at ``path``.
+def _read(path: Path) -> tuple[bytes, bytes, ET.Element, Sequence[GazeboModel], list[str]]:
+    """The world at ``path``: the text that Gazebo gets, and that of the file.
 
-    Raises:
-        LoadFailed: it is no world that Gazebo could simulate without looking elsewhere.
+    Then the element of the world as Gazebo gets it; all models, outer ones first; and the parts that differ from the
+    file or have no variables.
     """
     try:
         with opened(path) as file:
@@ -225,7 +208,7 @@ def _read(path: Path) -> SdfWorld:
     (world,) = worlds
     notes = list(_without_known_includes(world))
     _refuse_includes(world, path)
-    models = tuple(_models(world, ""))
+    models = [*_models(world, "")]
     _refuse_what_gazebo_leaves_out(world, models, path)
     changed = bool(notes)
     for joint in world.iter("joint"):
@@ -233,7 +216,7 @@ def _read(path: Path) -> SdfWorld:
             _make_revolute(joint)
             changed = True
     notes += _notes(world, models)
-    return SdfWorld(ET.tostring(root) if changed else source, source, world, models, tuple(notes))
+    return ET.tostring(root) if changed else source, source, world, models, notes
 
 
 def _models(parent: ET.Element, scope: str) -> Iterator[GazeboModel]:
@@ -273,7 +256,7 @@ def _refuse_includes(world: ET.Element, path: Path) -> None:
         )
 
 
-def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[GazeboModel, ...], path: Path) -> None:
+def _refuse_what_gazebo_leaves_out(world: ET.Element, models: Sequence[GazeboModel], path: Path) -> None:
     """Parts that Gazebo ignores although they change the motion; and names with spaces.
 
     A space ends a name in the protocol of Gazebo's process.
@@ -299,7 +282,7 @@ def _make_revolute(joint: ET.Element) -> None:
             limit.remove(end)
 
 
-def _notes(world: ET.Element, models: tuple[GazeboModel, ...]) -> Iterator[str]:
+def _notes(world: ET.Element, models: Sequence[GazeboModel]) -> Iterator[str]:
     for model in models:
         for joint in model.element.findall("joint"):
             name, kind = f"{model.scoped}::{joint.get('name')}", joint.get("type")

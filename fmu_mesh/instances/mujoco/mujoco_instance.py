@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ...errors import InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
-from ...variables.model_description import ModelDescription, Value
+from ...variables.model_description import Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
 from ..contract import KeepsStateAsBytes
 from ..world_variables import WorldVariable
@@ -66,6 +66,7 @@ class MujocoInstance(KeepsStateAsBytes):
         self.name = name
         self._mujoco = engine()
         self._world = world = load_world(path, config)
+        self.description = world.description
         self._config = config
         self._log = log
         self._picture = picture
@@ -108,11 +109,6 @@ class MujocoInstance(KeepsStateAsBytes):
         self._driven: tuple[int, ...] = ()
         self._bound = False
         self._set_limits()
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._world.description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]

@@ -36,7 +36,7 @@ import msgspec
 from ...errors import LoadFailed
 from ...files import opened
 from ...installing import importing
-from ...text import listed, nearest
+from ...text import did_you_mean, listed
 from ...variables.model_description import DefaultExperiment, ModelDescription
 from ..world_variables import Place, WorldVariable, joint_variables, numbered, world_input, world_output
 from .mujoco_section import MujocoConfig
@@ -116,9 +116,7 @@ def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: 
     names = [model.key(number).name for number in range(model.nkey)]
     if name in names:
         return names.index(name)
-    close = nearest(name, names)
-    hint = f"Did you mean '{close}'?" if close is not None else None
-    raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=hint)
+    raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=did_you_mean(name, names))
 
 
 def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types

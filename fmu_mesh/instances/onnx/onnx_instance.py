@@ -23,7 +23,7 @@ from ...errors import FmuError, InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Layout
-from ...variables.model_description import ModelDescription, Value
+from ...variables.model_description import Value
 from ...variables.value_conversion import to_value
 from ...variables.value_types import is_float
 from ..contract import KeepsStateAsBytes
@@ -42,6 +42,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self.name = name
         self._takes_nan = not_finite == "record"
         self._model = model
+        self.description = model.description
         self._variables = {variable.name: variable for variable in model.description.variables}
         self._values = Ring(Layout.of(model.description.variables), 1)
         self._tensors: dict[str, Array] = {t.variable.name: np.empty(t.sizes, t.dtype) for t in model.inputs}
@@ -52,11 +53,6 @@ class OnnxInstance(KeepsStateAsBytes):
         self._numbers = [rows[0] for part, rows in parts if is_float(part.type)]
         self._is_initialized = False
         self._is_computed = False
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._model.description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]

@@ -9,7 +9,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from ...errors import CallRefused
-from ...text import listed, nearest
+from ...text import did_you_mean, listed
 from ...variables.model_description import ModelDescription, Variable
 from .component import Component, declared_variables
 
@@ -75,7 +75,6 @@ def _with_dependencies(variable: Variable, inputs: list[str], *, initializes: bo
         return replace(variable, dependencies=tuple(inputs) if initializes else ())
     unknown = next((name for name in variable.dependencies if name not in inputs), None)
     if unknown is not None:
-        suggestion = nearest(unknown, inputs)
-        hint = f"Did you mean '{suggestion}'?" if suggestion else f"The inputs are {listed(inputs)}."
+        hint = did_you_mean(unknown, inputs, f"The inputs are {listed(inputs)}.")
         raise CallRefused(f"'{variable.name}' depends on '{unknown}', which is no input", hint=hint)
     return variable

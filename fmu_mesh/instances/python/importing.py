@@ -25,7 +25,7 @@ from types import ModuleType
 from typing import Any, Literal, TypeGuard
 
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
-from ...text import listed, nearest, short_path
+from ...text import did_you_mean, listed, short_path
 from ...variables.model_description import ModelDescription
 from .component import Component
 from .component_description import description_of
@@ -83,10 +83,8 @@ class ImportedComponent:
         found = getattr(module, target.name, None)
         if found is None:
             classes = [name for name, value in vars(module).items() if _is_component(value) and value is not Component]
-            suggestion = nearest(target.name, classes)
-            hint = f"Did you mean '{suggestion}'?" if suggestion else None
-            has = listed(classes, nothing="no component")
-            raise CallRefused(f"there is no '{target.name}' in '{place}', which has {has}", hint=hint)
+            text = f"there is no '{target.name}' in '{place}', which has {listed(classes, nothing='no component')}"
+            raise CallRefused(text, hint=did_you_mean(target.name, classes))
         if not _is_component(found):
             what = "function" if callable(found) and not isinstance(found, type) else type(found).__name__
             hint = "Put the decorator `fmu_mesh.component` before it." if what == "function" else None

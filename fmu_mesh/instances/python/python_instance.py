@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...errors import FmuError, FmuMeshError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
-from ...variables.model_description import ModelDescription, Variable
+from ...variables.model_description import Variable
 from ...variables.value_conversion import ValueRefused, to_value
 from ...variables.value_types import DTYPES, INTEGERS, Value, is_float, is_text, nested
 from ..call_guard import lines_shown_of
@@ -54,7 +54,7 @@ class PythonInstance:
 
     def __init__(self, opening: Opening[PythonConfig]) -> None:
         self.name = opening.name
-        self._description = opening.description
+        self.description = opening.description
         # A value may be beyond `min` and `max`, which are for whoever sets it.
         bare = (replace(v, minimum=None, maximum=None) for v in opening.description.variables)
         self._variables: dict[str, Variable] = {variable.name: variable for variable in bare}
@@ -84,11 +84,6 @@ class PythonInstance:
     def changes_process(self) -> bool:
         """Whether its code may change the state of the process in a step, such as the working directory."""
         return self._imported.modules.mention(_CHANGING)
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
@@ -191,19 +186,11 @@ class PythonInstance:
         """Nothing to free: a state is Python objects."""
 
     def serialize_state(self, state: object) -> bytes:
-        """A state has Python objects of any kind, which only this process can use.
-
-        Raises:
-            FmuError: always.
-        """
+        """Refused with an `FmuError`: a state has Python objects of any kind, which only this process can use."""
         raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
 
     def deserialize_state(self, data: bytes) -> object:
-        """See `serialize_state`.
-
-        Raises:
-            FmuError: always.
-        """
+        """See `serialize_state`."""
         raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
 
     def close(self) -> None:

@@ -28,21 +28,14 @@ from ....archives.archive_entries import LIMITS_HINT, checked_archive, entry_nam
 from ....archives.inner_files import inner_file, inner_sha256, inner_size
 from ....config.mesh import LimitsConfig
 from ....errors import LoadFailed
+from ..step_options import Terms
 
-__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "in_new_folder", "opened", "sha256_of", "size_of"]
+__all__ = ["Contents", "OpenFmu", "content_of", "in_new_folder", "opened", "sha256_of", "size_of"]
 
 _MARGIN: Final = 2**20
 """The bytes that the folder of a run keeps for everything else."""
 _PLACE_HINT: Final = "Set FMU_MESH_RUNTIME_DIR, or TMPDIR, to a folder with room from which code may run."
 _XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription.xml")
-
-
-class Terms(msgspec.Struct, frozen=True):
-    """The conditions that an FMU must meet before it is used."""
-
-    limits: LimitsConfig = LimitsConfig()
-    sha256: str | None = None  # the SHA-256 that the configuration asks for, in hexadecimal digits
-    content: str | None = None  # what `content_of` returned when the run was planned
 
 
 class Contents(msgspec.Struct, frozen=True):
@@ -289,11 +282,11 @@ class _Folder(OpenFmu):
         """Nothing is open."""
 
     def read_binary(self, name: str) -> bytes:
-        with self._reading():
+        with reading(self.path):
             return self._file(name).read_bytes()
 
     def content_sha256(self) -> str:
-        with self._reading():
+        with reading(self.path):
             return content_of(self.path)
 
     def unpacked_size(self) -> int:
@@ -315,20 +308,13 @@ class _Folder(OpenFmu):
         return _names_in(self.path)
 
     def _size(self, name: str) -> int:
-        with self._reading():
+        with reading(self.path):
             return self._file(name).stat().st_size
 
     def _file(self, name: str) -> Path:
         if name not in _names_in(self.path):
             raise _no_file(self.path, name)
         return self.path / name
-
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
 
 
 def _names_in(path: Path) -> frozenset[str]:

@@ -20,7 +20,8 @@ from msgspec.structs import replace
 
 from ....errors import LoadFailed
 from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
-from .archive import Contents, OpenFmu, Terms, opened
+from ..step_options import Terms
+from .archive import Contents, OpenFmu, opened
 from .declared_variables import number, states_of, variables_of
 from .examining import examine, find_library, library_name
 

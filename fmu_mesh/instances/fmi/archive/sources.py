@@ -31,7 +31,8 @@ from .... import files
 from ....archives.archive_entries import reading
 from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
-from .archive import OpenFmu, Terms, in_new_folder, opened
+from ..step_options import Terms
+from .archive import OpenFmu, in_new_folder, opened
 from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed

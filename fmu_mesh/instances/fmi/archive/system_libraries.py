@@ -14,7 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from .archive import Terms, opened
+from ..step_options import Terms
+from .archive import opened
 from .shared_library import SharedLibrary, libraries_beside, read_shared_library
 
 __all__ = ["missing_libraries"]

@@ -69,7 +69,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
             status = self._do_step(self._self, time, step_size, _NEW)
         if status == PENDING:
             status = self._step_status.wait()
-        model = self._description
+        model = self.description
         repeats = status == DISCARD and model.can_handle_variable_step_size and model.can_reject_steps
         repeats = repeats and not self._options.linear_inputs  # sub-steps would need derivatives of their own
         if repeats:

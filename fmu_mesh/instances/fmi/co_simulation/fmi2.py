@@ -127,7 +127,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
             raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # a message about these questions is not the reason of the failure
-        model = self._description
+        model = self.description
         can_retry = (
             model.can_handle_variable_step_size and model.can_get_and_set_state and not self._options.linear_inputs
         )

@@ -79,14 +79,14 @@ class Fmi3Instance(NativeInstance, Fmi3):
         self._advance(end, lambda: self._steps.step(time, step_size, end))
 
     def _instantiate(self, **arguments: object) -> None:
-        has_event_mode = self._description.has_event_mode
+        has_event_mode = self.description.has_event_mode
         super()._instantiate(eventModeUsed=has_event_mode, earlyReturnAllowed=True, **arguments)
         self._do_step = cffi_function(self._fmu.dll.fmi3DoStep, _DO_STEP)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)
         self._said.note(time=start_time)
-        self._steps = Fmi3Steps(self._fmu, self._do_step, self._description, self._said)
+        self._steps = Fmi3Steps(self._fmu, self._do_step, self.description, self._said)
         self._checked(lambda: self._steps.start(start_time))
         self._by_calls = bool(self._steps.clocks)
 
@@ -105,7 +105,7 @@ class Fmi3Instance(NativeInstance, Fmi3):
     def _is_discrete(self, part: PartCall) -> bool:
         """Whether the variables of a part change in event mode only."""
         continuous = all(variable.variability == "continuous" for variable in part.variables)
-        return self._description.has_event_mode and not continuous
+        return self.description.has_event_mode and not continuous
 
     def _complete(self, step: int, status: int | None) -> None:
         steps, start, size, end = self._steps, self._time_of(step), self._step_size, self._time_of(step + 1)

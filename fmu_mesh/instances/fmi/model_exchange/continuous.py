@@ -155,9 +155,9 @@ class ContinuousInstance(FmuInstance):
 
     def _make_loop(self) -> EventLoop:
         self._loop = EventLoop(
-            self._calls(self._fmu, self._description, self._symbols),
+            self._calls(self._fmu, self.description, self._symbols),
             self._options.solver,
-            tell_completed_steps=self._description.tell_completed_steps,
+            tell_completed_steps=self.description.tell_completed_steps,
             stop_time=self._stop_time,
             clocks=self._clocks,
         )
@@ -240,7 +240,7 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1):
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(**arguments)
-        self._own_calls = Fmi1Calls(self._fmu, self._description, self._symbols)
+        self._own_calls = Fmi1Calls(self._fmu, self.description, self._symbols)
 
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitialize (FMI 1.0, 2.5)."""
@@ -265,5 +265,5 @@ class Fmi3ModelInstance(ContinuousInstance, Fmi3):
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)
-        self._clocks = Clocks(self._fmu, self._description.clocks)
+        self._clocks = Clocks(self._fmu, self.description.clocks)
         self._clocks.start(start_time)
