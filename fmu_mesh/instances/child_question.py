@@ -66,11 +66,7 @@ def described(describe: Callable[[], ModelDescription]) -> bytes:
 
 
 def run_child(command: Sequence[str]) -> tuple[bytes, str]:
-    """The output of a command, which ends with this process, and in words how it ended.
-
-    Raises:
-        LoadFailed: it cannot be started.
-    """
+    """The output of a command, which ends with this process, and in words how it ended."""
     reading, writing = os.pipe()
     try:
         child = subprocess.Popen(

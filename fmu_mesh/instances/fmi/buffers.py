@@ -58,11 +58,7 @@ class NumberBuffer:
         self.address: int = self._memory.ctypes.data
 
     def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
-        """Write numbers to the memory.
-
-        Raises:
-            OverflowError: the C type cannot hold one of them, or its opposite.
-        """
+        """Write numbers to the memory; `OverflowError` if the C type cannot hold one of them, or its opposite."""
         if self._is_boolean and self._signs is not None:
             self._memory[:] = np.asarray(elements, dtype=np.bool_) ^ (self._signs < 0)
             return

@@ -25,21 +25,14 @@ _APERIODIC: Final = ("changing", "countdown")
 class Clocks:
     """The clocks of one instance.
 
-    Attributes:
-        next_tick: time of the next tick of an input clock in s; infinite if there is none.
-        ticked: the output clocks that have ticked since this was last emptied.
-
     Call sequence: `start` in Initialization Mode; then in every event mode `set_due`, after each update of the discrete
-    states `read`, and at its end `update_intervals`.
-
-    Raises:
-        FMICallException: by every method: the FMU did not return OK.
+    states `read`, and at its end `update_intervals`. Each raises `FMICallException` if the FMU does not return OK.
     """
 
     def __init__(self, fmu: Any, clocks: Sequence[Clock]) -> None:  # noqa: ANN401 FMPy is untyped
         inputs = [clock for clock in clocks if clock.causality == "input"]
-        self.next_tick = math.inf
-        self.ticked: set[str] = set()
+        self.next_tick = math.inf  # of an input clock in s; infinite if there is none
+        self.ticked: set[str] = set()  # the output clocks that have ticked since this was last emptied
         self._fmu = fmu
         self._periodic = [_Periodic(clock) for clock in inputs if clock.interval_variability in _PERIODIC]
         self._aperiodic = {

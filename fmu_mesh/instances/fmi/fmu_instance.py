@@ -68,9 +68,6 @@ class FmuInstance(ABC):
     """One instance of an FMU; see `Instance` and `KeepsState` in `fmu_mesh.instances.contract`.
 
     Its arguments are those of `Opening`, and the ``terms`` of its archive and the ``options`` of its steps.
-
-    Raises:
-        LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
     _functions: FmuFunctions
@@ -243,11 +240,7 @@ class FmuInstance(ABC):
         return packed(own.kept, self._on_state(lambda: self._fmu.serializeFMUState(own.handle)))
 
     def deserialize_state(self, data: bytes) -> FmuState:
-        """See `KeepsState`.
-
-        Raises:
-            FmuMeshError: ``data`` is no state of an instance.
-        """
+        """See `KeepsState`."""
         self._check_state(self.description.can_serialize_state, "serialize its state")
         kept, rest = unpacked(data, Bookkeeping, self.name)
         return FmuState(self._on_state(lambda: self._fmu.deserializeFMUState(rest)), kept)

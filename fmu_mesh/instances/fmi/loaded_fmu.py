@@ -66,24 +66,13 @@ class FmuToLoad(NamedTuple):
 
 
 class LoadedFmu:
-    """One FMU with a folder and a library of its own.
-
-    It is extracted below ``folder``, an existing private folder.
-
-    Attributes:
-        key: what it was made from.
-        calls: FMPy's object, once it is loaded.
-        has_instance: whether the FMU is instantiated.
-        is_lost: whether it has returned fatal.
-
-    Raises:
-        LoadFailed: the FMU cannot be extracted.
-    """
+    """One FMU with a library and a folder of its own, below ``folder``; `LoadFailed` if it cannot be extracted."""
 
     def __init__(self, fmu: FmuToLoad, folder: Path) -> None:
         self.key = fmu.key
-        self.calls: Any = None
-        self.has_instance = self.is_lost = False
+        self.calls: Any = None  # FMPy's object, once it is loaded
+        self.has_instance = False
+        self.is_lost = False  # whether it has returned fatal
         self._fmu = fmu
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
         self._changes_process: bool | None = None
@@ -114,11 +103,7 @@ class LoadedFmu:
         return self._changes_process
 
     def instantiate(self, **arguments: object) -> None:
-        """Make an instance with these arguments for FMPy, if none is there that was reset.
-
-        Raises:
-            RuntimeError: there is no instance.
-        """
+        """Make an instance with these arguments for FMPy, if none is there that was reset."""
         if not self.has_instance:
             self.calls.instantiate(loggingOn=False, **arguments)
             self.has_instance = bool(self.calls.component)

@@ -41,9 +41,6 @@ def open_instance(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     """Extract the FMU at ``path`` below ``folder``, load it, and make the instance called ``name``.
 
     It has to keep to ``terms``. What an earlier instance of this name has ``kept`` is used again.
-
-    Raises:
-        LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
     kind = cast("Kind", description.kind)
     return _CLASSES[description.fmi_version[0], kind](path, name, description, folder, log, terms, options, kept)

@@ -87,11 +87,7 @@ class GazeboWorld(msgspec.Struct, frozen=True):
 
 
 def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
-    """Read the world at ``path``.
-
-    Raises:
-        LoadFailed: it is no world that Gazebo could load without looking elsewhere.
-    """
+    """Read the world at ``path``; `LoadFailed` if Gazebo could not load it without looking elsewhere."""
     text, source, world, models, notes = _read(path)
     step_size = _number(world.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}

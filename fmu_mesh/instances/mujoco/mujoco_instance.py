@@ -191,11 +191,7 @@ class MujocoInstance(KeepsStateAsBytes):
         return b"".join(part.tobytes() for part in (state, *self._remembered()))
 
     def set_state(self, state: object) -> None:
-        """See `KeepsState`; also for a state of an equal instance.
-
-        Raises:
-            StepFailed: it is no state of this model.
-        """
+        """See `KeepsState`; also for a state of an equal instance."""
         assert isinstance(state, bytes)
         mujoco = self._mujoco
         kept = self._remembered()
@@ -261,11 +257,7 @@ class MujocoInstance(KeepsStateAsBytes):
             data.xfrc_applied[body] = (*acting, *about)
 
     def _look_at_warnings(self) -> None:
-        """Raise an error if the world cannot be computed any more; log all other warnings.
-
-        Raises:
-            StepFailed: names the input or the joint that is not finite or huge.
-        """
+        """Fail if the world cannot be computed any more, naming an input or a joint; log all other warnings."""
         texts = [" ".join(text.split()) for text in warnings]
         warnings.clear()
         kinds = self._mujoco.mjtWarning

@@ -64,11 +64,7 @@ class World(msgspec.Struct, frozen=True):
 
 
 def load_world(path: Path, config: MujocoConfig) -> World:
-    """Load the model at ``path`` (MJCF or URDF).
-
-    Raises:
-        LoadFailed: MuJoCo is not installed, or cannot load the model; says why.
-    """
+    """Load the model at ``path`` (MJCF or URDF); `LoadFailed` if MuJoCo is not installed, or says why it cannot."""
     mujoco = engine()
     try:
         with opened(path) as file:
@@ -98,11 +94,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
 
 
 def engine() -> ModuleType:
-    """The module `mujoco`; it is imported on first use, because it is optional and slow to import.
-
-    Raises:
-        LibraryMissing: it is not installed.
-    """
+    """The module `mujoco`; it is imported on first use, because it is optional and slow to import."""
     with importing("mujoco", "worlds of MuJoCo"):
         import mujoco  # noqa: PLC0415  an extra, and slow to import
     mujoco.set_mju_user_warning(warnings.append)

@@ -43,11 +43,7 @@ class Picture(Protocol):
         ...
 
     def finish(self) -> None:
-        """Complete the film: `show` is not called again.
-
-        Raises:
-            LoadFailed: it cannot be written.
-        """
+        """Complete the film: `show` is not called again; `LoadFailed` if it cannot be written."""
         ...
 
     def close(self) -> None:
@@ -56,11 +52,7 @@ class Picture(Protocol):
 
 
 def check_film(path: Path) -> None:
-    """See whether a film can be made, before a run.
-
-    Raises:
-        ConfigurationError: it cannot be a film, or something is not installed; says what.
-    """
+    """See whether a film can be made, before a run; `ConfigurationError` says what is missing."""
     if path.suffix not in FILM_RATES:
         raise ConfigurationError(f"`video={str(path)!r}`: a film is one of {', '.join(FILM_RATES)}")
     if files.is_folder(path):
@@ -70,11 +62,7 @@ def check_film(path: Path) -> None:
 
 
 def check_window() -> None:
-    """See whether a window can be opened, before a run.
-
-    Raises:
-        ConfigurationError: there is no screen.
-    """
+    """See whether there is a screen for a window, before a run; `ConfigurationError` if not."""
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigurationError("`view=True` needs a screen, and there is none.", hint="`video=...` needs none.")
 

@@ -61,11 +61,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self.set_values({name: to_value(value, self._variables[name]) for name, value in start_values.items()})
 
     def exit_initialization(self) -> None:
-        """Compute the outputs of the first point.
-
-        Raises:
-            InitializationFailed: for the reasons of `do_step`.
-        """
+        """Compute the outputs of the first point."""
         self._follow()
         self._is_initialized = True
 
@@ -76,11 +72,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self._is_computed = False
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
-        """Current values by name.
-
-        Raises:
-            InitializationFailed: for the reasons of `do_step`.
-        """
+        """Current values by name; those of outputs may have to be computed."""
         if any(self._variables[name].causality == "output" for name in names):
             self._follow()
         return [self._values.value(0, name) for name in names]
@@ -109,11 +101,7 @@ class OnnxInstance(KeepsStateAsBytes):
         return msgspec.msgpack.encode([part.tolist() for part in self._values.parts])
 
     def set_state(self, state: object) -> None:
-        """See `KeepsState`; also for a state of an equal instance.
-
-        Raises:
-            StepFailed: it is no state of this model.
-        """
+        """See `KeepsState`; also for a state of an equal instance."""
         assert isinstance(state, bytes)
         own = self._values.parts
         try:

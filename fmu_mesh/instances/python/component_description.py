@@ -17,14 +17,9 @@ __all__ = ["check_arguments", "description_of"]
 
 
 def description_of(cls: type[Component], content: str) -> ModelDescription:
-    """The model description of a component class.
+    """The model description of a component class; `CallRefused` says why it cannot be one.
 
-    Args:
-        cls: the class.
-        content: the SHA-256 of the file that defines it; processes that disagree about it refuse one another.
-
-    Raises:
-        CallRefused: the class cannot be a component; says why.
+    ``content`` is the SHA-256 of the file that defines it; processes that disagree about it refuse one another.
     """
     declared = declared_variables(cls)
     if cls.step is Component.step:
@@ -51,11 +46,7 @@ def description_of(cls: type[Component], content: str) -> ModelDescription:
 
 
 def check_arguments(cls: type[Component], arguments: Mapping[str, Any]) -> None:
-    """Check that a component class can be called with these arguments.
-
-    Raises:
-        CallRefused: it cannot; says which argument is wrong.
-    """
+    """Check that a component class can be called with these arguments; `CallRefused` says which is wrong."""
     own = cls.__init__ is not object.__init__  # otherwise Python ignores all arguments
     if not own and arguments:
         text = f"'{cls.__name__}' has no `__init__`, which could take the argument '{next(iter(arguments))}'"

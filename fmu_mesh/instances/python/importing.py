@@ -41,24 +41,17 @@ _numbers = itertools.count(1)
 class ImportedComponent:
     """The class of a component, imported for one instance.
 
-    ``path`` is the absolute path of its file; `Path()` for a module.
-
-    Raises:
-        Exception: whatever the code of the user raises; `told` says it in words.
-        CallRefused: there is no such class, or it is no component.
-
-    Attributes:
-        cls: the class; call `load` first.
-        description: its model description.
-        modules: those of its folder; call `forget_names` after each call into the component.
+    ``path`` is the absolute path of its file; `Path()` for a module. `load` raises whatever the code of the user
+    raises, which `told` says in words; and `CallRefused` if there is no such class, or it is no component.
     """
 
     def __init__(self, path: Path, target: ClassPlace) -> None:
         self._path = path
         self._target = target
+        # Those of its folder; call `forget_names` after each call into the component.
         self.modules = OwnModules(path.parent)
         self._file = path if target.file else None
-        self.cls: type[Component] = Component
+        self.cls: type[Component] = Component  # known after `load`
         self.description: ModelDescription | None = None
 
     @property
@@ -203,17 +196,14 @@ def _cannot_import(cls: type, reason: str, hint: str) -> ConfigurationError:
 
 
 class OwnModules(MetaPathFinder):
-    """The modules of one instance. It finds them from the start until `close`.
-
-    Attributes:
-        lent: the names that were imported by name from elsewhere, in the call into the component that is under way.
-    """
+    """The modules of one instance. It finds them from the start until `close`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = str(folder)
         self._suffix = f"@{next(_numbers)}"
         self._builtins = {**vars(builtins), "__import__": self._import}
         self._kinds: dict[str, Literal["", "Python", "C"]] = {}
+        # The names that were imported by name from elsewhere, in the call into the component that is under way.
         self.lent: list[str] = []
         sys.meta_path.insert(0, self)
 

@@ -240,11 +240,7 @@ class PythonInstance:
         return self._component
 
     def _called(self, call: Callable[[], Any]) -> Any:  # noqa: ANN401 what the call returns
-        """Call code of the user.
-
-        Raises:
-            FmuError: it raised an exception.
-        """
+        """Call code of the user; what it raises becomes an `FmuError`."""
         try:
             return call()
         except (Exception, SystemExit) as error:
@@ -282,11 +278,7 @@ def _reader(ring: Ring, variable: Variable) -> Callable[[int], Any]:
 
 
 def _writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
-    """A function that writes the value of an output to a slot of a ring.
-
-    Raises:
-        ValueRefused: by the function: it is no value of the variable's type and shape.
-    """
+    """A function that writes the value of an output to a slot of a ring; it raises `ValueRefused`."""
     place = ring.layout.place(variable.name)
     part, first = ring.parts[place.part], place.first
 

@@ -90,11 +90,7 @@ def _hint(error: BaseException) -> str | None:
 
 
 def _check_version(python: str) -> None:
-    """Check that a Python has our version.
-
-    Raises:
-        LoadFailed: it has another one, or none.
-    """
+    """Check that a Python has our version."""
     output, _ = run_child([python, "-Pc", "import fmu_mesh; print(fmu_mesh.__version__)"])
     version = output.decode(errors="replace").strip()
     if version != __version__:

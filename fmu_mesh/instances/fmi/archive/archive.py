@@ -108,11 +108,7 @@ class OpenFmu(ABC):
 
 @contextmanager
 def opened(path: Path, terms: Terms = Terms()) -> Iterator[OpenFmu]:  # noqa: B008 a frozen Struct
-    """Open the FMU at ``path`` and check that it meets ``terms``.
-
-    Raises:
-        LoadFailed: there is no FMU, or it does not meet the terms.
-    """
+    """Open the FMU at ``path``; `LoadFailed` if there is none, or if it does not meet ``terms``."""
     kind = _Folder if files.is_folder(path) else _Archive
     with closing(kind(path, terms)) as fmu:
         if terms.content is not None and fmu.content_sha256() != terms.content:
@@ -126,11 +122,7 @@ def sha256_of(path: Path) -> str | None:
 
 
 def size_of(path: Path) -> int | None:
-    """The size of an archive in bytes; None for a folder.
-
-    Raises:
-        OSError, LoadFailed: it cannot be read.
-    """
+    """The size of an archive in bytes; None for a folder."""
     if files.is_folder(path):
         return None
     outer = files.archive_on_the_way(path)
@@ -138,12 +130,7 @@ def size_of(path: Path) -> int | None:
 
 
 def content_of(path: Path) -> str:
-    """A SHA-256 that identifies an FMU; see `OpenFmu.content_sha256`.
-
-    Raises:
-        OSError: it cannot be read.
-        LoadFailed: the archive in which it lies cannot be used.
-    """
+    """A SHA-256 that identifies an FMU; see `OpenFmu.content_sha256`. `OSError` or `LoadFailed`: it cannot be read."""
     if not files.is_folder(path):
         outer = files.archive_on_the_way(path)
         return files.sha256_of(path) if outer is None else inner_sha256(path, outer)
@@ -157,10 +144,7 @@ def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], No
     """Make a private folder for an FMU, with ``size`` bytes that ``fill`` writes; returns the folder.
 
     It is below ``parent``. If that has no room, or no code may run from there, it is in the folder for temporary files,
-    and `files.remove_tree` finds it by a link below ``parent``.
-
-    Raises:
-        LoadFailed: there is no place for it, or it is damaged; nothing is left behind.
+    and `files.remove_tree` finds it by a link below ``parent``. After `LoadFailed` nothing is left behind.
     """
     temporary = Path(tempfile.gettempdir())
     reasons: list[str] = []

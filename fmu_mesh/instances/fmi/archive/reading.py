@@ -122,11 +122,7 @@ def _readable(contents: Contents) -> BytesIO:
 
 
 def parsed(path: Path, contents: Contents) -> FmpyDescription:
-    """FMPy's model description of the FMU at ``path``, from what `examine` has returned.
-
-    Raises:
-        LoadFailed: it breaks a rule that `repair` does not know.
-    """
+    """FMPy's model description, from what `examine` has returned; `LoadFailed` if it breaks a rule beyond repair."""
     try:
         return read_model_description(_readable(contents), validate=False)
     except Exception as error:  # FMPy raises whatever the XML provokes in it

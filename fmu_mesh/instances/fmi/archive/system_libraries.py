@@ -35,9 +35,6 @@ def missing_libraries(path: Path, library: str, terms: Terms = Terms()) -> tuple
     """What the library of an FMU needs and this host does not have: whole libraries, or newer versions of them.
 
     ``library`` is the name of the file in it, as `ModelDescription.library` has it.
-
-    Raises:
-        LoadFailed: the FMU cannot be read.
     """
     with opened(path, terms) as fmu:
         beside = libraries_beside(fmu, library)

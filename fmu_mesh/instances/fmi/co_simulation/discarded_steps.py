@@ -55,9 +55,6 @@ class StepStatus:
 
         The FMU gets no function to call when it is done, so we have to ask (FMI 2.0, 2.1.5). `CallWatch` watches the
         deadline of the step.
-
-        Raises:
-            StepFailed: the FMU does not tell.
         """
         pause, longest = _PAUSES_S
         while True:
@@ -78,17 +75,13 @@ class StepStatus:
 
 
 def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_size: float) -> int:
-    """Take a step in halves, quarters and so on, as small as necessary.
+    """Take a step from ``time`` by ``step_size`` (s) in halves, quarters and so on, as small as necessary.
 
-    Args:
-        attempt: takes a step of some size from a time (both in s), and returns its status. After `DISCARD`, the FMU is
-            back at the start of this step.
-        time: start of the whole step in s.
-        step_size: its size in s.
+    ``attempt`` takes a step of some size from a time (both in s), and returns its status. After `DISCARD`, the FMU is
+    back at the start of this step.
 
-    Returns:
-        `DISCARD` if even the smallest sub-step was discarded; a higher status that ended the step; or the status of the
-        last sub-step.
+    Returns `DISCARD` if even the smallest sub-step was discarded; a higher status that ended the step; or the status of
+    the last sub-step.
     """
     done, size, status = 0, SMALLEST // 2, DISCARD
     while done < SMALLEST:

@@ -112,11 +112,7 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         return packed(own.lines, super().serialize_state(own.inner))
 
     def deserialize_state(self, data: bytes) -> object:
-        """See `KeepsState`.
-
-        Raises:
-            FmuMeshError: ``data`` is no state of an instance with linear inputs.
-        """
+        """See `KeepsState`."""
         lines, rest = unpacked(data, tuple[_Line, ...], None)
         return _LinearState(super().deserialize_state(rest), lines)
 

@@ -58,11 +58,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
         self._step(self._time_of(step), self._step_size, status)
 
     def _step(self, time: float, step_size: float, status: int | None) -> None:
-        """Take a step, or complete it after fmiDoStep has returned ``status``.
-
-        Raises:
-            StepFailed: the step cannot be completed.
-        """
+        """Take a step, or complete it after fmiDoStep has returned ``status``."""
         if status is None:
             if self._derivatives:
                 self._set_derivatives(self._derivatives)

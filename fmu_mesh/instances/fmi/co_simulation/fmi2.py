@@ -103,9 +103,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
     def _finish(self, status: int, end: float) -> None:
         """Complete a step to ``end`` (s) whose ``status`` is above warning (FMI 2.0, 4.2.1).
 
-        Raises:
-            StepFailed: the step cannot be completed.
-            TerminationRequested: the FMU asks to end the simulation before the end of the step.
+        `TerminationRequested`: the FMU asks to end the simulation before the end of the step.
         """
         if status == PENDING:
             status = self._step_status.wait()

@@ -170,11 +170,7 @@ class ContinuousInstance(FmuInstance):
         return self._loop
 
     def _advance(self, end: float) -> None:
-        """Advance the model to ``end`` (s).
-
-        Raises:
-            TerminationRequested: the model asks to end the simulation before.
-        """
+        """Advance the model to ``end`` (s); `TerminationRequested` if it asks to end the simulation before."""
         loop = self._event_loop()
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
             raise self._end_requested()

@@ -176,11 +176,7 @@ class EventLoop:
             self._solver.restart()
 
     def _iterate(self) -> tuple[bool, float]:
-        """Update the discrete states until they need no update; whether the FMU asks to end, and its next time event.
-
-        Raises:
-            SolverFailed: they need updates for ever.
-        """
+        """Update the discrete states until they are settled; whether the FMU asks to end, and its next time event."""
         for _ in range(EVENT_ITERATIONS):
             info = self._calls.update_discrete_states()
             self._clocks.read()
