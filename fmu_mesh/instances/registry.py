@@ -163,20 +163,16 @@ def check_engines(
         }
         for what, check in asked.items():
             if what not in reasons:
-                reasons[what] = _refusal(check)
+                reasons[what] = None
+                try:
+                    check()
+                except LoadFailed as error:
+                    reasons[what] = error
             if (reason := reasons[what]) is not None:
                 needed = "an engine that runs here" if what == key else "a system that has all libraries"
                 expected = f"{needed}, or the `host` of the instance. {reason.hint or ''}".rstrip()
                 findings.add(f"instances.{name}.{key}", reason.message, expected)
                 break
-
-
-def _refusal(check: Callable[[], None]) -> LoadFailed | None:
-    try:
-        check()
-    except LoadFailed as error:
-        return error
-    return None
 
 
 def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> None:

@@ -34,7 +34,9 @@ class Clocks:
         self.next_tick = math.inf  # of an input clock in s; infinite if there is none
         self.ticked: set[str] = set()  # the output clocks that have ticked since this was last emptied
         self._fmu = fmu
-        self._periodic = [_Periodic(clock) for clock in inputs if clock.interval_variability in _PERIODIC]
+        self._periodic = [clock for clock in inputs if clock.interval_variability in _PERIODIC]
+        self._ticks = [0] * len(self._periodic)  # of each, so far
+        self._first_and_interval = [(0.0, math.inf)] * len(self._periodic)  # of each: the time of tick 0, both in s
         self._aperiodic = {
             clock.value_reference: math.inf for clock in inputs if clock.interval_variability in _APERIODIC
         }
@@ -46,20 +48,25 @@ class Clocks:
 
     def start(self, time: float) -> None:
         """In Initialization Mode at ``time`` (s): ask for the intervals that depend on parameters."""
-        for clock in self._periodic:
-            clock.start(time, None if clock.is_known else self._interval_and_shift(clock.value_reference))
+        for number, clock in enumerate(self._periodic):
+            interval, shift = clock.interval or math.inf, clock.shift
+            if clock.interval is None:
+                shifts = (fmi3Float64 * 1)()
+                interval, _ = self._interval(clock.value_reference)
+                self._fmu.getShiftDecimal(_references(clock.value_reference), shifts)
+                shift = float(shifts[0])
+            self._first_and_interval[number] = time + shift, interval
         self._find_next()
 
     @property
     def place(self) -> tuple[float | None, ...]:
         """The ticks of each periodic clock, then the next tick of each aperiodic one in s; None if it has none."""
         aperiodic = (tick if math.isfinite(tick) else None for tick in self._aperiodic.values())
-        return (*(float(clock.ticks) for clock in self._periodic), *aperiodic)
+        return (*map(float, self._ticks), *aperiodic)
 
     def resume(self, place: Sequence[float | None]) -> None:
         """Continue where `place` was."""
-        for clock, ticks in zip(self._periodic, place, strict=False):
-            clock.resume(int(ticks or 0))
+        self._ticks = [int(ticks or 0) for ticks in place[: len(self._periodic)]]
         for reference, tick in zip(self._aperiodic, place[len(self._periodic) :], strict=True):
             self._aperiodic[reference] = math.inf if tick is None else tick
         self._find_next()
@@ -67,10 +74,10 @@ class Clocks:
     def set_due(self, time: float) -> None:
         """In event mode: activate every input clock whose tick is at ``time`` (s)."""
         due = []
-        for clock in self._periodic:
-            if not resolvable(time, clock.next_tick):
+        for number, clock in enumerate(self._periodic):
+            if not resolvable(time, self._next_ticks()[number]):
                 due.append(clock.value_reference)
-                clock.tick()
+                self._ticks[number] += 1
         for reference, tick in self._aperiodic.items():
             if not resolvable(time, tick):
                 due.append(reference)
@@ -93,56 +100,18 @@ class Clocks:
                 self._aperiodic[reference] = time + interval
         self._find_next()
 
-    def _interval_and_shift(self, reference: int) -> tuple[float, float]:
-        interval, _ = self._interval(reference)
-        shifts = (fmi3Float64 * 1)()
-        self._fmu.getShiftDecimal(_references(reference), shifts)
-        return interval, float(shifts[0])
-
     def _interval(self, reference: int) -> tuple[float, int]:
         intervals, qualifiers = (fmi3Float64 * 1)(), (fmi3IntervalQualifier * 1)()
         self._fmu.getIntervalDecimal(_references(reference), intervals, qualifiers)
         return float(intervals[0]), int(qualifiers[0])
 
+    def _next_ticks(self) -> list[float]:
+        """The times of the next ticks of the periodic clocks in s."""
+        pairs = zip(self._ticks, self._first_and_interval, strict=True)
+        return [first + ticks * interval for ticks, (first, interval) in pairs]
+
     def _find_next(self) -> None:
-        ticks = [*(clock.next_tick for clock in self._periodic), *self._aperiodic.values()]
-        self.next_tick = min(ticks, default=math.inf)
-
-
-class _Periodic:
-    """A periodic input clock.
-
-    Attributes:
-        is_known: whether the model description has its interval.
-        ticks: number of ticks so far.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self.value_reference = clock.value_reference
-        self.is_known = clock.interval is not None
-        self.ticks = 0
-        self._interval = clock.interval or math.inf
-        self._shift = clock.shift
-        self._start = 0.0
-
-    def start(self, time: float, interval_and_shift: tuple[float, float] | None) -> None:
-        """Start at ``time``; all in s; None keeps the interval and shift of the model description."""
-        self._start = time
-        if interval_and_shift is not None:
-            self._interval, self._shift = interval_and_shift
-
-    def tick(self) -> None:
-        """Count a tick."""
-        self.ticks += 1
-
-    def resume(self, ticks: int) -> None:
-        """Continue after so many ticks."""
-        self.ticks = ticks
-
-    @property
-    def next_tick(self) -> float:
-        """Time of the next tick in s."""
-        return self._start + self._shift + self.ticks * self._interval
+        self.next_tick = min((*self._next_ticks(), *self._aperiodic.values()), default=math.inf)
 
 
 NO_CLOCKS: Final = Clocks(None, ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Final
@@ -9,7 +10,9 @@ from typing import Final
 import numpy as np
 
 from ...variables.value_types import Value
+from ..call_guard import call_named
 from .callbacks import FMI1_CALLBACKS, FMI3_LOGGER, fmi2_callbacks
+from .calls import checked_function
 from .fmu_instance import FmuInstance
 from .fmu_values import ValueFunctions
 
@@ -43,6 +46,7 @@ FMI2_NEEDED: Final = (
     "fmi2EnterInitializationMode",
     "fmi2ExitInitializationMode",
 )
+_TERMINATE: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 FMI3_NEEDED: Final = ("fmi3EnterInitializationMode", "fmi3ExitInitializationMode")
 """The functions that co-simulation and model exchange need, and so above for FMI 2.0."""
 
@@ -56,6 +60,8 @@ class Fmi1(FmuInstance):
     """
 
     _initialized = False
+    _end: str
+    """The function that ends the simulation, after the prefix."""
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name; before the end of Initialization Mode this initializes the instance."""
@@ -82,6 +88,10 @@ class Fmi1(FmuInstance):
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """Call the function of FMI that initializes (times in s)."""
 
+    def _terminate(self) -> None:
+        function = checked_function(self._fmu.dll, self._symbols, self._end, _TERMINATE)
+        call_named(f"fmi{self._end}", function, self._component)
+
     def _end_run(self, *, resets: bool) -> bool:
         """As in the state machine of FMI 1.0 for co-simulation, fmiResetSlave takes the place of fmiTerminateSlave."""
         return (resets and self._model.reset()) or super()._end_run(resets=False)
@@ -99,9 +109,6 @@ class Fmi2(FmuInstance):
         self._checked(lambda: self._fmu.setupExperiment(tolerance=self._tolerance(), **times))
         self.set_values(start_values)
         self._checked(self._fmu.enterInitializationMode)
-
-    def _exit_initialization(self) -> None:
-        self._checked(self._fmu.exitInitializationMode)
 
 
 class Fmi3(FmuInstance):
@@ -121,6 +128,3 @@ class Fmi3(FmuInstance):
         self.set_values({name: value for name, value in start_values.items() if name not in structural})
         times = {"startTime": start_time, "stopTime": stop_time}
         self._checked(lambda: self._fmu.enterInitializationMode(tolerance=self._tolerance(), **times))
-
-    def _exit_initialization(self) -> None:
-        self._checked(self._fmu.exitInitializationMode)

@@ -274,9 +274,9 @@ class FmuInstance(ABC):
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """Set the start values and enter Initialization Mode."""
 
-    @abstractmethod
     def _exit_initialization(self) -> None:
         """Leave Initialization Mode."""
+        self._checked(self._fmu.exitInitializationMode)
 
     def _terminate(self) -> None:
         """End the simulation."""

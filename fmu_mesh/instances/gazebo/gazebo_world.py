@@ -26,7 +26,7 @@ from ...archives.safe_xml import safe_xml
 from ...errors import LoadFailed
 from ...files import opened
 from ...variables.model_description import DefaultExperiment, ModelDescription
-from ..world_variables import WorldVariable, joint_variables, numbered, world_input, world_output
+from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input
 from .gazebo_section import GazeboClassicConfig
 
 __all__ = ["GazeboJoint", "GazeboWorld", "load_gazebo_world"]
@@ -159,26 +159,14 @@ def _variables(joints: tuple[GazeboJoint, ...], links: tuple[tuple[str, str], ..
 
 
 def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariable]:
-    in_state = (
-        ("position", "xyz", "m", "of the link's origin in world axes"),
-        ("orientation", "wxyz", "1", "attitude as a unit quaternion, link axes to world axes"),
-        ("linear_velocity", "xyz", "m/s", "of the link's origin, in world axes"),
-        ("angular_velocity", "xyz", "rad/s", "in world axes"),
-    )
-    for what, letters, unit, text in in_state:
-        for letter in letters:
-            yield world_output(f"{name}.{what}_{letter}", ("state", state), unit, text)
-            state += 1
-    for axis, letter in enumerate("xyz"):
-        place = 3 * number + axis
-        text = "velocity of the medium in link axes"
-        yield world_output(f"{name}.wind_{letter}", ("body_wind", place), "m/s", text)
-        text = "velocity of the link's origin against the medium in link axes"
-        yield world_output(f"{name}.relative_velocity_{letter}", ("relative_velocity", place), "m/s", text)
-        text = "acts at the link's origin, in link axes"
-        yield world_input(f"{name}.force_{letter}", ("wrench", 6 * number + axis), "N", text)
-        text = "acts about the link's origin, in link axes"
-        yield world_input(f"{name}.moment_{letter}", ("wrench", 6 * number + 3 + axis), "N.m", text)
+    in_state = {"position": 0, "orientation": 3, "linear_velocity": 7, "angular_velocity": 10}
+    places = {what: ("state", state + offset) for what, offset in in_state.items()}
+    places |= {"wind": ("body_wind", 3 * number), "relative_velocity": ("relative_velocity", 3 * number)}
+    places |= {"force": ("wrench", 6 * number), "moment": ("wrench", 6 * number + 3)}
+    variables = [*body_variables(name, "link", places)]
+    yield from variables[:LINK_STATE]
+    for axis in range(3):  # in the order of value references, all that is along x comes before y and z
+        yield from variables[LINK_STATE + axis :: 3]
 
 
 # --- reading the file

@@ -38,7 +38,7 @@ from ...files import opened
 from ...installing import importing
 from ...text import did_you_mean, listed
 from ...variables.model_description import DefaultExperiment, ModelDescription
-from ..world_variables import Place, WorldVariable, joint_variables, numbered, world_input, world_output
+from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input, world_output
 from .mujoco_section import MujocoConfig
 
 __all__ = ["World", "engine", "load_world", "warnings"]
@@ -145,30 +145,12 @@ def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Wo
 
 def _bodies(model: Any) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     for number in range(_WORLD_BODY + 1, model.nbody):
-        name = model.body(number).name
-        if not name:
-            continue
-        in_world, place = "of the body's origin in world axes", 3 * number
-        yield from _vector(f"{name}.position", ("body_position", place), "m", in_world)
-        text = "attitude as a unit quaternion, body axes to world axes"
-        for part, letter in enumerate("wxyz"):
-            yield world_output(f"{name}.orientation_{letter}", ("body_orientation", 4 * number + part), "1", text)
-        yield from _vector(f"{name}.linear_velocity", ("linear_velocity", place), "m/s", in_world)
-        yield from _vector(f"{name}.angular_velocity", ("angular_velocity", place), "rad/s", "in world axes")
-        text = "velocity of the medium in body axes"
-        yield from _vector(f"{name}.wind", ("body_wind", place), "m/s", text, _WIND)
-        text = "velocity of the body's origin against the medium in body axes"
-        yield from _vector(f"{name}.relative_velocity", ("relative_velocity", place), "m/s", text, _WIND)
-        for offset, (what, unit, where) in enumerate((("force", "N", "at"), ("moment", "N.m", "about"))):
-            for axis, letter in enumerate("xyz"):
-                text = f"acts {where} the body's origin, in body axes"
-                yield world_input(f"{name}.{what}_{letter}", ("wrench", 6 * number + 3 * offset + axis), unit, text)
-
-
-def _vector(name: str, place: Place, unit: str, text: str, depends_on: tuple[str, ...] = ()) -> Iterator[WorldVariable]:
-    where, first = place
-    for axis, letter in enumerate("xyz"):
-        yield world_output(f"{name}_{letter}", (where, first + axis), unit, text, None, depends_on)
+        if name := model.body(number).name:
+            vectors = ("linear_velocity", "angular_velocity", "relative_velocity")
+            places = {what: (what, 3 * number) for what in vectors}
+            places |= {"position": ("body_position", 3 * number), "orientation": ("body_orientation", 4 * number)}
+            places |= {"force": ("wrench", 6 * number), "moment": ("wrench", 6 * number + 3)}
+            yield from body_variables(name, "body", {**places, "wind": ("body_wind", 3 * number)}, _WIND)
 
 
 def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types

@@ -23,7 +23,6 @@ __all__ = ["Fmi1Instance"]
 
 _DO_STEP = "int (*)(void *, double, double, char)"
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_char, ctypes.c_double)
-_TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _SET_DERIVATIVES = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p
 )
@@ -41,6 +40,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
     _kind = StepKind.FMI1
+    _end = "TerminateSlave"
     _functions = FmuFunctions(FMU1Slave, FMI1_VALUES, "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
 
     def advance(self, time: float, step_size: float) -> None:
@@ -108,7 +108,3 @@ class Fmi1Instance(NativeInstance, Fmi1):
         function = checked_function(self._fmu.dll, self._symbols, "InitializeSlave", _INITIALIZE)
         times = start_time, b"\x00" if stop_time is None else b"\x01", stop_time or 0.0
         self._checked(lambda: call_named("fmiInitializeSlave", function, self._component, *times))
-
-    def _terminate(self) -> None:
-        function = checked_function(self._fmu.dll, self._symbols, "TerminateSlave", _TERMINATE)
-        call_named("fmiTerminateSlave", function, self._component)

@@ -147,16 +147,8 @@ class Fmi3Instance(NativeInstance, Fmi3):
 class Fmi3Steps:
     """Steps of one instance: early return, event mode and clocks; it knows neither variables nor rings.
 
-    Args:
-        fmu: FMPy's object, instantiated with event mode if the description has it.
-        do_step: fmi3DoStep.
-        description: its model description.
-        said: what a step says besides its status. Up to `quiet_until`, a step is a single call of fmi3DoStep, unless
-            it says otherwise.
-
-    Attributes:
-        terminated: whether the FMU has asked to end the simulation; no step may be taken then.
-        clocks: its clocks.
+    ``fmu`` is FMPy's object, instantiated with event mode if the description has it; ``said`` what a step says besides
+    its status. Up to its `quiet_until`, a step is a single call of fmi3DoStep, unless it says otherwise.
 
     Call sequence: `start` in Initialization Mode, `exit_initialization` after it, then `step`, and `event` wherever
     values are set in event mode. A caller that calls fmi3DoStep itself continues with `finish` if needed.
@@ -166,14 +158,8 @@ class Fmi3Steps:
         SolverFailed: its events do not converge, or it makes no progress.
     """
 
-    def __init__(
-        self,
-        fmu: Any,  # noqa: ANN401 FMPy is untyped
-        do_step: Function,
-        description: ModelDescription,
-        said: Said,
-    ) -> None:
-        self.terminated = False
+    def __init__(self, fmu: Any, do_step: Function, description: ModelDescription, said: Said) -> None:  # noqa: ANN401 FMPy is untyped
+        self.terminated = False  # whether the FMU has asked to end the simulation; no step may be taken then
         self.clocks = Clocks(fmu, description.clocks)
         self._fmu = fmu
         self._self = pointer(fmu.component)

@@ -130,7 +130,7 @@ class ContinuousInstance(FmuInstance):
 
     def _exit_initialization(self) -> None:
         """After Initialization Mode: the first event, then continuous-time mode."""
-        super()._exit_initialization()  # type: ignore[safe-super]  # that of the version, which is the next base class
+        super()._exit_initialization()
         self._checked(lambda: self._make_loop().start(self._time_of_start))
 
     def _bookkeeping(self) -> Bookkeeping:
@@ -233,18 +233,13 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1):
 
     _functions = FmuFunctions(FMU1Model, FMI1_VALUES, "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
     _calls = Fmi1Calls
-
-    def _instantiate(self, **arguments: object) -> None:
-        super()._instantiate(**arguments)
-        self._own_calls = Fmi1Calls(self._fmu, self.description, self._symbols)
+    _end = "Terminate"
 
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitialize (FMI 1.0, 2.5)."""
         tolerance = self._options.solver.relative_tolerance
-        self._checked(lambda: self._own_calls.initialize(start_time, tolerance))
-
-    def _terminate(self) -> None:
-        self._own_calls.terminate()
+        calls = Fmi1Calls(self._fmu, self.description, self._symbols)
+        self._checked(lambda: calls.initialize(start_time, tolerance))
 
 
 class Fmi2ModelInstance(ContinuousInstance, Fmi2):

@@ -23,7 +23,6 @@ __all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
 _EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
-_TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
 
@@ -134,11 +133,6 @@ class Fmi1Calls(ModelCalls):
         self._event_update = self._function("EventUpdate", _EVENT_UPDATE)
         self._completed_step = self._function("CompletedIntegratorStep", _COMPLETED)
         self._initialize = self._function("Initialize", _INITIALIZE)
-        self._terminate = self._function("Terminate", _TERMINATE)
-
-    def terminate(self) -> None:
-        """End the simulation."""
-        self._terminate(self._component)
 
     def initialize(self, time: float, tolerance: float) -> None:
         """Compute what follows from the values that were set, at ``time`` in s (FMI 1.0, 2.5)."""

@@ -39,9 +39,6 @@ class EventLoop:
     The time of the FMU is never set to a later one than ``stop_time`` (s). It is told of completed integrator steps if
     it needs that.
 
-    Attributes:
-        terminated: whether the FMU has asked to end the simulation; nothing may be advanced then.
-
     Call sequence: `start` in event mode, then `advance`, and `event` wherever values are set in between; `close`.
 
     Raises:
@@ -58,7 +55,7 @@ class EventLoop:
         stop_time: float = math.inf,
         clocks: Clocks = NO_CLOCKS,
     ) -> None:
-        self.terminated = False
+        self.terminated = False  # whether the FMU has asked to end the simulation; nothing may be advanced then
         self._clocks = clocks
         self._calls = calls
         self._tell = tell_completed_steps
