@@ -203,7 +203,8 @@ class FmuInstance(ABC):
             return
         was_reset = False
         if self._live and self._state == "stepping":
-            was_reset = self._end_run(resets=self._kept is not None and (self._kept.resets or self._only_once))
+            resets = self._kept is not None and (self._kept.resets or self.description.only_once_per_process)
+            was_reset = self._end_run(resets=resets)
         elif self._live:
             self._quietly(self._release)
         self._leave_model(was_reset=was_reset)
@@ -314,17 +315,13 @@ class FmuInstance(ABC):
             or not self._live
             or self._state == "failed"
             or model.is_lost
-            or (self._only_once and not was_reset)
+            or (self.description.only_once_per_process and not was_reset)
         ):
             model.close()
             return
         if not was_reset:
             model.free()
         self._kept.keep(self.name, model)
-
-    @property
-    def _only_once(self) -> bool:
-        return self.description.only_once_per_process
 
     def _tolerance(self) -> float | None:
         """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""

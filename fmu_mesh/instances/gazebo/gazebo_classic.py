@@ -54,7 +54,7 @@ class GazeboClassicInstance:
             self._process = GazeboProcess(
                 world.text,
                 [(joint.scoped, joint.free) for joint in world.joints],
-                [scoped for scoped, _ in world.links],
+                [link.scoped for link in world.links],
             )
         except GazeboGone as error:
             text = f"Gazebo classic does not run '{path}': {error}"

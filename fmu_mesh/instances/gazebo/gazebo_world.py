@@ -29,7 +29,7 @@ from ...variables.model_description import DefaultExperiment, ModelDescription
 from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input
 from .gazebo_section import GazeboClassicConfig
 
-__all__ = ["GazeboJoint", "GazeboWorld", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboLink", "GazeboWorld", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
@@ -75,13 +75,20 @@ class GazeboJoint(msgspec.Struct, frozen=True):
     free: bool  # whether it has no limits, whatever the file says
 
 
+class GazeboLink(msgspec.Struct, frozen=True):
+    """A link; `scoped` and `name` as those of a `GazeboJoint`."""
+
+    scoped: str
+    name: str
+
+
 class GazeboWorld(msgspec.Struct, frozen=True):
     """A world."""
 
     text: bytes  # the SDF that Gazebo gets
     step_size: float  # of the engine in s
     joints: tuple[GazeboJoint, ...]
-    links: tuple[tuple[str, str], ...]  # scoped and name, as those of a joint
+    links: tuple[GazeboLink, ...]
     description: ModelDescription
     places: dict[str, WorldVariable]  # the variables by name
 
@@ -125,9 +132,9 @@ def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[
     return tuple(joints)
 
 
-def _links(models: Sequence[GazeboModel]) -> tuple[tuple[str, str], ...]:
+def _links(models: Sequence[GazeboModel]) -> tuple[GazeboLink, ...]:
     scoped = [f"{model.scoped}::{link.get('name')}" for model in models for link in model.element.findall("link")]
-    return tuple(zip(scoped, _names(scoped), strict=True))
+    return tuple(GazeboLink(*names) for names in zip(scoped, _names(scoped), strict=True))
 
 
 def _names(scoped: list[str]) -> list[str]:
@@ -146,14 +153,14 @@ def _number(text: str | None, default: float, path: Path) -> float:
         raise LoadFailed(f"'{path}' has '{text.strip()}' where a number should be") from error
 
 
-def _variables(joints: tuple[GazeboJoint, ...], links: tuple[tuple[str, str], ...]) -> Iterator[WorldVariable]:
+def _variables(joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]) -> Iterator[WorldVariable]:
     for number, joint in enumerate(joints):
         places = {what: (what, number) for what in ("effort_applied", "effort_command", "effort")}
         in_state = enumerate(("position", "velocity", "acceleration"), JOINT_STATE * number)
         places |= {what: ("state", place) for place, what in in_state}
         yield from joint_variables(joint.name, places, revolute=joint.revolute)
-    for number, (_, name) in enumerate(links):
-        yield from _link_variables(name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
+    for number, link in enumerate(links):
+        yield from _link_variables(link.name, number, JOINT_STATE * len(joints) + LINK_STATE * number)
     for axis, letter in enumerate("xyz"):
         yield world_input(f"wind_{letter}", ("wind", axis), "m/s", "velocity of the medium in world axes")
 

@@ -29,16 +29,13 @@ from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
-from ..contract import KeepsStateAsBytes
+from ..contract import KeepsStateAsBytes, LogMessage
 from ..world_variables import WorldVariable
 from .mujoco_section import MujocoConfig
 from .mujoco_world import engine, load_world, warnings
 from .rendering import Picture
 
 __all__ = ["MujocoInstance"]
-
-LogSink = Callable[[str, str, int], None]
-"""Takes status, text and own step of a message of the engine."""
 
 Floats = NDArray[np.float64]
 
@@ -60,7 +57,7 @@ class MujocoInstance(KeepsStateAsBytes):
         path: Path,
         name: str,
         config: MujocoConfig,
-        log: LogSink = lambda _status, _text, _step: None,
+        log: Callable[[LogMessage], None] = lambda _message: None,
         picture: Picture | None = None,
     ) -> None:
         self.name = name
@@ -135,7 +132,7 @@ class MujocoInstance(KeepsStateAsBytes):
             self._arrays[entry.where][entry.index] = value
             if entry.where == "effort_command" and not self._direct[entry.index] and self._bound:
                 text = f"'{name}' was set, but the joint has an actuator: set the actuator's own input"
-                self._log("warning", text, self._step)
+                self._warn(text)
         self._drive(self._entries[name] for name in values)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
@@ -266,7 +263,10 @@ class MujocoInstance(KeepsStateAsBytes):
             hint = "Are the inputs of this instance right? Otherwise a smaller step or more `physics_steps` may help."
             raise StepFailed(f"MuJoCo says: {' '.join(texts)}", instance=self.name, variable=self._culprit(), hint=hint)
         for text in texts:
-            self._log("warning", text, self._step)
+            self._warn(text)
+
+    def _warn(self, text: str) -> None:
+        self._log(LogMessage(self.name, "warning", "engine", text, self._step))
 
     def _culprit(self) -> str | None:
         """The first input that is not finite, or else the first joint with a huge acceleration."""

@@ -1,4 +1,4 @@
-"""Importing the class of a component: from a file, from an installed module, or as the program that is running has it.
+"""The class of a component: imported from a file, from a module, or as the running program has it; and described.
 
 A file is imported anew for each instance, under a name of its own, and so are the modules of its folder (`OwnModules`).
 So two instances share no global variables, whether they run in one process or in two.
@@ -15,8 +15,7 @@ import itertools
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from importlib.abc import FileLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import spec_from_file_location
@@ -24,14 +23,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, TypeGuard
 
+from msgspec.structs import replace
+
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
 from ...text import did_you_mean, listed, short_path
-from ...variables.model_description import ModelDescription
-from .component import Component
-from .component_description import description_of
+from ...variables.model_description import ModelDescription, Variable
+from .component import Component, declared_variables
 from .python_section import ClassPlace, importing
 
-__all__ = ["ImportedComponent", "component_section"]
+__all__ = ["ImportedComponent", "check_arguments", "component_section", "description_of"]
 
 _OWN = Path(__file__).resolve().parents[2]
 _TEXT_CHARACTERS = 500
@@ -66,13 +66,16 @@ class ImportedComponent:
         if not target.name.isidentifier():
             wanted = f"`{place}:Controller`, if the class is called Controller"
             raise CallRefused(f"'{place}' names no class at the top of the module, expected {wanted}")
-        with _marked(place):
+        token = importing.set(place)
+        try:
             if self._file is not None:
                 module, data = self._from_file(self._file)
             else:
                 module = importlib.import_module(target.module)
                 self._file = Path(module.__file__) if module.__file__ is not None else None
                 data = self._file.read_bytes() if self._file is not None else b""
+        finally:
+            importing.reset(token)
         found = getattr(module, target.name, None)
         if found is None:
             classes = [name for name, value in vars(module).items() if _is_component(value) and value is not Component]
@@ -132,15 +135,6 @@ class _SourceFile(FileLoader):
         return importlib.util.decode_source(self.data)
 
 
-@contextmanager
-def _marked(place: str) -> Iterator[None]:
-    token = importing.set(place)
-    try:
-        yield
-    finally:
-        importing.reset(token)
-
-
 def _is_component(value: object) -> TypeGuard[type[Component]]:
     return isinstance(value, type) and issubclass(value, Component)
 
@@ -177,6 +171,64 @@ def component_section(cls: object) -> tuple[dict[str, str], ModelDescription]:
 
 def _cannot_import(cls: type, reason: str, hint: str) -> ConfigurationError:
     return ConfigurationError(f"other processes cannot import the component '{cls.__qualname__}': {reason}", hint=hint)
+
+
+# --- the description of a class
+
+
+def description_of(cls: type[Component], content: str) -> ModelDescription:
+    """The model description of a component class; `CallRefused` says why it cannot be one.
+
+    ``content`` is the SHA-256 of the file that defines it; processes that disagree about it refuse one another.
+    """
+    declared = declared_variables(cls)
+    if cls.step is Component.step:
+        raise CallRefused(f"'{cls.__name__}' has no method `step(self, time, step_size)`")
+    hidden = [name for name in declared if hasattr(Component, name)]
+    if hidden:
+        text = f"the variable '{hidden[0]}' of '{cls.__name__}' has the name of something that every component has"
+        raise CallRefused(text, hint="Give it another name.")
+    variables = tuple(own.variable(reference) for reference, own in enumerate(declared.values()))
+    inputs = [variable.name for variable in variables if variable.causality == "input"]
+    initializes = cls.initialize is not Component.initialize
+    return ModelDescription(
+        model_name=cls.__name__,
+        model_identifier=cls.__name__,
+        fmi_version="",
+        kind="component",
+        guid=f"{{{content}:{cls.__name__}}}",
+        variables=tuple(_with_dependencies(variable, inputs, initializes=initializes) for variable in variables),
+        description=(cls.__doc__ or "").strip().partition("\n")[0] or None,
+        generation_tool="Python",
+        can_handle_variable_step_size=True,
+        can_get_and_set_state=True,
+    )
+
+
+def check_arguments(cls: type[Component], arguments: Mapping[str, Any]) -> None:
+    """Check that a component class can be called with these arguments; `CallRefused` says which is wrong."""
+    own = cls.__init__ is not object.__init__  # otherwise Python ignores all arguments
+    if not own and arguments:
+        text = f"'{cls.__name__}' has no `__init__`, which could take the argument '{next(iter(arguments))}'"
+        raise CallRefused(text, hint="The values of parameters are `start_values`.")
+    if own:
+        try:
+            inspect.signature(cls.__init__).bind(None, **arguments)
+        except TypeError as error:
+            raise CallRefused(f"`arguments` do not fit `{cls.__name__}.__init__`: {error}") from error
+
+
+def _with_dependencies(variable: Variable, inputs: list[str], *, initializes: bool) -> Variable:
+    """An output with the inputs that its initial value depends on: all, if it is computed and nothing else is said."""
+    if variable.causality != "output":
+        return replace(variable, dependencies=())
+    if variable.dependencies is None:
+        return replace(variable, dependencies=tuple(inputs) if initializes else ())
+    unknown = next((name for name in variable.dependencies if name not in inputs), None)
+    if unknown is not None:
+        hint = did_you_mean(unknown, inputs, f"The inputs are {listed(inputs)}.")
+        raise CallRefused(f"'{variable.name}' depends on '{unknown}', which is no input", hint=hint)
+    return variable
 
 
 # --- the modules of the folder of a component, imported for one instance alone

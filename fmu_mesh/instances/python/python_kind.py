@@ -66,8 +66,7 @@ class PythonKind(Kind[PythonConfig]):
 
 def answer_to(request: str) -> bytes:
     """In the child process: import what is asked for; returns the answer."""
-    from .component_description import check_arguments  # noqa: PLC0415  as above
-    from .importing import ImportedComponent  # noqa: PLC0415  as above
+    from .importing import ImportedComponent, check_arguments  # noqa: PLC0415  as above
 
     python, path, arguments = msgspec.json.decode(request, type=tuple[str, str, dict[str, Any]])
     component = ImportedComponent(Path(path), class_place_of(python))
