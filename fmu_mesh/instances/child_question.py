@@ -40,8 +40,7 @@ _Answer = ModelDescription | tuple[str, str | None]
 def ask_description_of(what: str, module: str, request: object, python: str = sys.executable) -> ModelDescription:
     """What ``answer_to`` of a module answers to a request in a child process; ``what`` happens there, as errors say it.
 
-    Raises:
-        LoadFailed: there is no description, or the process ended without an answer; says why.
+    `LoadFailed` says why there is no description, also if the process ended without an answer.
     """
     try:
         text = msgspec.json.encode(request).decode()

@@ -156,11 +156,7 @@ class PidInstance(KeepsStateAsBytes):
         self._write(step)
 
     def do_step(self, step: int) -> None:
-        """Read the inputs of row ``step``, integrate the error over the step, and write the effort to row ``step + 1``.
-
-        Raises:
-            StepFailed: an input is infinite or no number.
-        """
+        """Read the inputs of row ``step``, integrate the error over the step, write the effort to row ``step + 1``."""
         row = self._inputs.part("Float64")[step & self._inputs.mask].tolist()
         values = self._values
         values.update(zip(self._inputs.layout.names, row, strict=True))

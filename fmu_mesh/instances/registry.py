@@ -179,9 +179,6 @@ def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> 
     """Check that there is one world to show, and that this host can show it.
 
     Call it before any model is described: an engine may have to know of a film when it is imported.
-
-    Raises:
-        ConfigurationError: there is no world or there are several, or this host cannot show it.
     """
     if not showing:
         return

@@ -7,26 +7,44 @@ multiplication. The caller enters and leaves event mode.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
 from fmpy.fmi3 import fmi3Float64, fmi3IntervalQualifier, fmi3ValueReference
 
 from ...simtime import resolvable
 from ...variables.model_description import Clock
+from .fmu_values import SolverFailed
 
-__all__ = ["NO_CLOCKS", "Clocks"]
+__all__ = ["EVENT_ITERATIONS", "NO_CLOCKS", "Clocks", "EventInfo", "updated"]
+
+EVENT_ITERATIONS: Final = 1000
+"""After this many event iterations, or events at the same time, a model does not converge."""
 
 _INTERVAL_CHANGED: Final = 2
 _PERIODIC: Final = ("constant", "fixed", "tunable")
 _APERIODIC: Final = ("changing", "countdown")
 
 
+class EventInfo(NamedTuple):
+    """What one event iteration returns (FMI 2.0, 3.2.2: fmi2EventInfo)."""
+
+    again: bool  # the iteration has not converged yet
+    terminate: bool  # the FMU asks to end the simulation
+    next_event: float  # time of the next time event in s; infinite if there is none
+
+
+def updated(fmu: Any) -> EventInfo:  # noqa: ANN401 FMPy is untyped
+    """One event iteration of FMI 3.0 (fmi3UpdateDiscreteStates)."""
+    again, terminate, _nominals, _states, defined, time = fmu.updateDiscreteStates()
+    return EventInfo(bool(again), bool(terminate), float(time) if defined else math.inf)
+
+
 class Clocks:
     """The clocks of one instance.
 
-    Call sequence: `start` in Initialization Mode; then in every event mode `set_due`, after each update of the discrete
-    states `read`, and at its end `update_intervals`. Each raises `FMICallException` if the FMU does not return OK.
+    Call sequence: `start` in Initialization Mode; then `settle` in every event mode. Each raises `FMICallException` if
+    the FMU does not return OK.
     """
 
     def __init__(self, fmu: Any, clocks: Sequence[Clock]) -> None:  # noqa: ANN401 FMPy is untyped
@@ -71,8 +89,25 @@ class Clocks:
             self._aperiodic[reference] = math.inf if tick is None else tick
         self._find_next()
 
-    def set_due(self, time: float) -> None:
-        """In event mode: activate every input clock whose tick is at ``time`` (s)."""
+    def settle(self, time: float, update: Callable[[], EventInfo]) -> EventInfo:
+        """In event mode at ``time`` (s): let clocks tick, and ``update`` the discrete states until they are settled.
+
+        Raises:
+            SolverFailed: they need updates for ever.
+        """
+        self._set_due(time)
+        for _ in range(EVENT_ITERATIONS):
+            info = update()
+            self._read()
+            if info.terminate:
+                return info
+            if not info.again:
+                self._update_intervals(time)
+                return info
+        raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {EVENT_ITERATIONS} updates")
+
+    def _set_due(self, time: float) -> None:
+        """Activate every input clock whose tick is at ``time`` (s)."""
         due = []
         for number, clock in enumerate(self._periodic):
             if not resolvable(time, self._next_ticks()[number]):
@@ -86,13 +121,13 @@ class Clocks:
             self._fmu.setClock(due, [True] * len(due))
         self._find_next()
 
-    def read(self) -> None:
-        """In event mode: note which output clocks tick (FMI 3.0, 2.2.8.3)."""
+    def _read(self) -> None:
+        """Note which output clocks tick (FMI 3.0, 2.2.8.3)."""
         if self._outputs:
             active = self._fmu.getClock([clock.value_reference for clock in self._outputs])
             self.ticked.update(clock.name for clock, ticks in zip(self._outputs, active, strict=True) if ticks)
 
-    def update_intervals(self, time: float) -> None:
+    def _update_intervals(self, time: float) -> None:
         """At the end of event mode: ask when aperiodic clocks tick next (FMI 3.0, 2.2.8.4)."""
         for reference in self._aperiodic:
             interval, qualifier = self._interval(reference)

@@ -39,11 +39,7 @@ Floats = NDArray[np.float64]
 
 
 class GazeboClassicInstance:
-    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
-
-    Raises:
-        LoadFailed: the world cannot be read, or Gazebo does not start or does not load it.
-    """
+    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(self, path: Path, name: str, config: GazeboClassicConfig) -> None:
         self.name = name

@@ -46,11 +46,7 @@ _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
 
 
 class MujocoInstance(KeepsStateAsBytes):
-    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
-
-    Raises:
-        LoadFailed: MuJoCo is not installed, or cannot load the model.
-    """
+    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(
         self,

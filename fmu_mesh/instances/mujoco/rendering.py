@@ -72,9 +72,6 @@ class Film(Picture):
 
     A film is unreadable until it is complete. Until then, its file is `<name>.unfinished.mp4` in the same folder. A run
     that ends before the first step writes no film, and does not touch an older one.
-
-    Raises:
-        LoadFailed: the renderer cannot be started, or the file not be written.
     """
 
     def __init__(self, path: Path, instance: str) -> None:

@@ -86,11 +86,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self._write(step)
 
     def do_step(self, step: int) -> None:
-        """Take the inputs of row ``step``, compute the model, write the outputs to row ``step + 1``.
-
-        Raises:
-            StepFailed: an input or an output is not a number, or the model cannot be computed.
-        """
+        """Take the inputs of row ``step``, compute the model, write the outputs to row ``step + 1``."""
         for own, rows, columns, mask in self._takes:
             own[:] = rows[step & mask, columns]
         self._compute()

@@ -142,11 +142,8 @@ def _is_component(value: object) -> TypeGuard[type[Component]]:
 def component_section(cls: object) -> tuple[dict[str, str], ModelDescription]:
     """The keys of the section of a class that a program has, and its model description.
 
-    Example:
-        ``component_section(Controller)[0]`` is ``{"python": "/home/me/controller.py:Controller"}``
-
-    Raises:
-        ConfigurationError: other processes cannot import the class; says what to do.
+    The keys are such as ``{"python": "/home/me/controller.py:Controller"}``. `ConfigurationError`: other processes
+    cannot import the class.
     """
     if not _is_component(cls):
         name = getattr(cls, "__name__", repr(cls))

@@ -46,11 +46,7 @@ class _State(NamedTuple):
 
 
 class PythonInstance:
-    """A component in Python that is stepped by a mesh.
-
-    Raises:
-        LoadFailed: the class cannot be imported or called, or is another one than when the run was planned.
-    """
+    """A component in Python that is stepped by a mesh."""
 
     def __init__(self, opening: Opening[PythonConfig]) -> None:
         self.name = opening.name
@@ -139,12 +135,7 @@ class PythonInstance:
             write(step & mask, _as_attribute(values[name], self._variables[name]))
 
     def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, call `step` of the component, write its outputs to row ``step + 1``.
-
-        Raises:
-            StepFailed: the component raised an exception, or an output has no value or a wrong one.
-            TerminationRequested: the component raised it.
-        """
+        """Set the inputs of row ``step``, call `step` of the component, write its outputs to row ``step + 1``."""
         values, slot = self._values, step & self._input_mask
         for name, read in self._reads:
             values[name] = read(slot)

@@ -46,18 +46,9 @@ class Contents(msgspec.Struct, frozen=True):
 
 
 class OpenFmu(ABC):
-    """An FMU that is open and meets its terms.
+    """An FMU that is `opened` and meets its terms; whoever needs several things from one FMU opens it once.
 
-    Whoever needs several things from one FMU opens it once:
-
-    ```python
-    with opened(path, terms) as fmu:
-        description = description_of(fmu)
-        compile_sources(fmu, description, tell)
-    ```
-
-    Raises:
-        LoadFailed: by each method: a file cannot be read or is damaged.
+    Each method raises `LoadFailed` if a file cannot be read or is damaged.
     """
 
     def __init__(self, path: Path, limits: LimitsConfig) -> None:

@@ -37,21 +37,10 @@ def read_description(
     *,
     to_run: bool = True,
 ) -> ModelDescription:
-    """Read the model description of the FMU at ``path``.
+    """Read the model description of the FMU at ``path``, a file or a folder; `LoadFailed` says why there is none.
 
-    ```python
-    description = read_description(Path("fmus/DampedPendulum.fmu"))
-    print(description.model_name, [variable.name for variable in description.variables])
-    ```
-
-    Args:
-        path: the .fmu file, or the folder of an unpacked FMU.
-        terms: the conditions that the FMU must meet.
-        kind: the kind to use; ``auto``: co-simulation if the FMU has both.
-        to_run: whether it must be able to run on this platform.
-
-    Raises:
-        LoadFailed: it is not an FMU, or it cannot run here; the message says why and what would help.
+    ``kind`` is the kind to use, for ``auto`` co-simulation if the FMU has both; with ``to_run`` it must be able to run
+    on this platform.
     """
     with opened(path, terms) as fmu:
         return description_of(fmu, kind, to_run=to_run)

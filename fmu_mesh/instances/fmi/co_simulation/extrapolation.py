@@ -29,9 +29,8 @@ class TakesDerivatives(Instance, KeepsState, Protocol):
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """Set the slopes of inputs within the next step (FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives).
 
-        Args:
-            derivatives: time derivatives in 1/s.
-            continuous: whether no input jumps at the start of the step, apart from the error of an extrapolation.
+        They are in 1/s. If ``continuous``, no input jumps at the start of the step, apart from the error of an
+        extrapolation.
         """
         ...
 

@@ -26,7 +26,7 @@ from ....simtime import TimeGrid, resolvable, step_within
 from ....variables.model_description import ModelDescription
 from ....variables.value_types import Value
 from ..calls import Function, Pointer, cffi_function, pointer
-from ..clocks import Clocks
+from ..clocks import Clocks, updated
 from ..fmi_versions import FMI3_NEEDED, FMI3_VALUES, Fmi3
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING, PartCall, SolverFailed, Verb
@@ -39,7 +39,7 @@ __all__ = ["Fmi3Instance", "Fmi3Steps"]
 _NEEDED = "fmi3InstantiateCoSimulation", *FMI3_NEEDED, "fmi3DoStep"
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 MOST_RETURNS: Final = 1000
-"""After this many returns of fmi3DoStep, or events, at the same time, an FMU makes no progress."""
+"""After this many returns of fmi3DoStep at the same time, an FMU makes no progress."""
 
 
 class Fmi3Instance(NativeInstance, Fmi3):
@@ -281,16 +281,8 @@ class Fmi3Steps:
     def _update(self, time: float) -> None:
         """In event mode at ``time`` (s): update the discrete states, then step mode."""
         self._event_time = time
-        self.clocks.set_due(time)
-        for _ in range(MOST_RETURNS):
-            again, self.terminated, _nominals, _states, defined, next_event = self._fmu.updateDiscreteStates()
-            self.clocks.read()
-            if self.terminated:
-                return
-            if not again:
-                break
-        else:
-            raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {MOST_RETURNS} updates")
-        self._next_event = next_event if defined else math.inf
-        self.clocks.update_intervals(time)
-        self._fmu.enterStepMode()
+        info = self.clocks.settle(time, lambda: updated(self._fmu))
+        self.terminated = info.terminate
+        if not self.terminated:
+            self._next_event = info.next_event
+            self._fmu.enterStepMode()

@@ -16,21 +16,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final
 
 import numpy as np
 
 from ....simtime import resolvable
-from ..clocks import NO_CLOCKS, Clocks
+from ..clocks import EVENT_ITERATIONS, NO_CLOCKS, Clocks
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
 from .model_calls import ModelCalls
 from .solver import make_solver
 
 __all__ = ["EventLoop"]
-
-EVENT_ITERATIONS: Final = 1000
-"""After this many event iterations, or events at the same time, a model does not converge."""
 
 
 class EventLoop:
@@ -164,19 +160,9 @@ class EventLoop:
 
     def _update(self) -> None:
         """The event iteration, in event mode, and back to continuous-time mode."""
-        self._clocks.set_due(self._time)
-        self.terminated, next_event = self._iterate()
+        info = self._clocks.settle(self._time, self._calls.update_discrete_states)
+        self.terminated = info.terminate
         if not self.terminated:
-            self._clocks.update_intervals(self._time)
-            self._next_event = min(next_event, self._clocks.next_tick)
+            self._next_event = min(info.next_event, self._clocks.next_tick)
             self._calls.enter_continuous_time_mode()
             self._solver.restart()
-
-    def _iterate(self) -> tuple[bool, float]:
-        """Update the discrete states until they are settled; whether the FMU asks to end, and its next time event."""
-        for _ in range(EVENT_ITERATIONS):
-            info = self._calls.update_discrete_states()
-            self._clocks.read()
-            if info.terminate or not info.again:
-                return info.terminate, info.next_event
-        raise SolverFailed(f"the discrete states at t = {self._time:.12g} s need more than {EVENT_ITERATIONS} updates")
