@@ -80,25 +80,23 @@ class ControllerKind(Kind[PidConfig]):
         return PidInstance(opening.name)
 
 
-KIND_OF_CONTROLLERS = ControllerKind()
-"""What the entry point `controller` names."""
+KIND_OF_CONTROLLERS = ControllerKind()  # what the entry point `controller` names
 
 
 def describe_pid() -> ModelDescription:
     """The model description of the controller."""
-    variables = [
-        *(_variable(name, "parameter", text, start) for name, (start, text) in _PARAMETERS.items()),
-        *(_variable(name, "input", text, 0.0) for name, text in _INPUTS.items()),
-        _variable("effort", "output", "what the controller asks for, in N m or N"),
+    variables: list[tuple[str, Causality, str, float | None]] = [
+        *((name, "parameter", text, start) for name, (start, text) in _PARAMETERS.items()),
+        *((name, "input", text, 0.0) for name, text in _INPUTS.items()),
+        ("effort", "output", "what the controller asks for, in N m or N", None),
     ]
-    numbered = tuple(msgspec.structs.replace(variable, value_reference=n) for n, variable in enumerate(variables))
     return ModelDescription(
         model_name="position_pid",
         model_identifier="position_pid",
         fmi_version="",
         kind="controller",
         guid="{position_pid}",
-        variables=numbered,
+        variables=tuple(_variable(number, *row) for number, row in enumerate(variables)),
         description="position controller of a joint",
         generation_tool="fmu_mesh",
         can_get_and_set_state=True,
@@ -106,10 +104,10 @@ def describe_pid() -> ModelDescription:
     )
 
 
-def _variable(name: str, causality: Causality, text: str, start: float | None = None) -> Variable:
+def _variable(number: int, name: str, causality: Causality, text: str, start: float | None) -> Variable:
     return Variable(
         name=name,
-        value_reference=0,
+        value_reference=number,
         type="Float64",
         causality=causality,
         variability="tunable" if causality == "parameter" else "continuous",

@@ -60,8 +60,7 @@ class Fmi1(FmuInstance):
     """
 
     _initialized = False
-    _end: str
-    """The function that ends the simulation, after the prefix."""
+    _end: str  # the function that ends the simulation, after the prefix
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name; before the end of Initialization Mode this initializes the instance."""

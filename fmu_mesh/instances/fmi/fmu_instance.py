@@ -70,14 +70,11 @@ class FmuInstance(ABC):
     Its arguments are those of `Opening`, and the ``terms`` of its archive and the ``options`` of its steps.
     """
 
-    _functions: FmuFunctions
-    """Those of this version of FMI and this kind of FMU."""
+    _functions: FmuFunctions  # those of this version of FMI and this kind of FMU
 
-    _component: int
-    """The address of the instance, for functions called through ctypes; ``_self`` is the same for cffi."""
+    _component: int  # the address of the instance, for functions called through ctypes; ``_self`` is the same for cffi
 
-    _solver = ""
-    """What the error of a solver begins with."""
+    _solver = ""  # what the error of a solver begins with
 
     description: ModelDescription
     """The model description; arrays have the shapes that the structural parameters give them."""
@@ -192,6 +189,13 @@ class FmuInstance(ABC):
     @abstractmethod
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
+
+    @abstractmethod
+    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
+        """Set the slopes of Real inputs within the next step, in 1/s (FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives).
+
+        If ``continuous``, no input jumps at the start of the step, apart from the error of an extrapolation.
+        """
 
     @abstractmethod
     def advance(self, time: float, step_size: float) -> None:

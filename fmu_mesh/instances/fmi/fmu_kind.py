@@ -223,8 +223,7 @@ class FmuKind(Kind[FmuConfig]):
         return stepped(instance, options)
 
 
-KIND_OF_FMUS = FmuKind()
-"""What the entry point `fmu` names."""
+KIND_OF_FMUS = FmuKind()  # what the entry point `fmu` names
 
 
 def _takes_no_tolerance(description: ModelDescription) -> tuple[str, str] | None:

@@ -8,7 +8,7 @@ from typing import Final, cast
 from ...variables.model_description import Kind, ModelDescription
 from ..contract import Instance
 from ..kept_models import KeptModels
-from .co_simulation.extrapolation import LinearInputs, TakesDerivatives
+from .co_simulation.extrapolation import LinearInputs
 from .co_simulation.fmi1 import Fmi1Instance
 from .co_simulation.fmi2 import Fmi2Instance
 from .co_simulation.fmi3 import Fmi3Instance
@@ -50,4 +50,4 @@ def stepped(instance: FmuInstance, options: StepOptions) -> Instance:
     """The instance with linear inputs if it has some; ``instance`` stays the one to close."""
     if not options.linear_inputs:
         return instance
-    return LinearInputs(cast("TakesDerivatives", instance), options.linear_inputs)
+    return LinearInputs(instance, options.linear_inputs)

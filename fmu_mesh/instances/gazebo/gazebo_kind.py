@@ -49,5 +49,4 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
         return GazeboClassicInstance(opening.path, opening.name, opening.section)
 
 
-KIND_OF_GAZEBO_CLASSIC = GazeboClassicKind()
-"""What the entry point `gazebo_classic` names."""
+KIND_OF_GAZEBO_CLASSIC = GazeboClassicKind()  # what the entry point `gazebo_classic` names

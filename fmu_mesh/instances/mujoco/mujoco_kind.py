@@ -104,5 +104,4 @@ def _candidates(reference: str, folders: set[Path]) -> Iterator[Path]:
                 yield candidate
 
 
-KIND_OF_MUJOCO = MujocoKind()
-"""What the entry point `mujoco` names."""
+KIND_OF_MUJOCO = MujocoKind()  # what the entry point `mujoco` names

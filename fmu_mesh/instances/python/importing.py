@@ -46,13 +46,11 @@ class ImportedComponent:
     """
 
     def __init__(self, path: Path, target: ClassPlace) -> None:
-        self._path = path
         self._target = target
         # Those of its folder; call `forget_names` after each call into the component.
         self.modules = OwnModules(path.parent)
         self._file = path if target.file else None
         self.cls: type[Component] = Component  # known after `load`
-        self.description: ModelDescription | None = None
 
     @property
     def file(self) -> str | None:
@@ -88,8 +86,7 @@ class ImportedComponent:
                 what, hint = "class", "Derive it from `fmu_mesh.Component`."
             raise CallRefused(f"'{target.name}' in '{place}' is a {what} and no component", hint=hint)
         self.cls = found
-        self.description = description_of(found, hashlib.sha256(data).hexdigest())
-        return self.description
+        return description_of(found, hashlib.sha256(data).hexdigest())
 
     def told(self, error: BaseException) -> str:
         """An exception of the code of the user in one line, with the file and the line: `controller.py:12: ...`."""

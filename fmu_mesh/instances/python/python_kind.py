@@ -100,5 +100,4 @@ def _check_version(python: str) -> None:
         raise LoadFailed(f"the Python '{python}' {has}", hint=hint)
 
 
-KIND_OF_COMPONENTS = PythonKind()
-"""What the entry point `python` names."""
+KIND_OF_COMPONENTS = PythonKind()  # what the entry point `python` names

@@ -16,7 +16,7 @@ from ..calls import cffi_function, checked_function
 from ..fmi_versions import FMI1_VALUES, Fmi1
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from .discarded_steps import PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
+from .discarded_steps import SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi1Instance"]
@@ -63,8 +63,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
             if self._derivatives:
                 self._set_derivatives(self._derivatives)
             status = self._do_step(self._self, time, step_size, _NEW)
-        if status == PENDING:
-            status = self._step_status.wait()
+        status = self._step_status.settled(status)
         model = self.description
         repeats = status == DISCARD and model.can_handle_variable_step_size and model.can_reject_steps
         repeats = repeats and not self._options.linear_inputs  # sub-steps would need derivatives of their own
@@ -85,9 +84,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
 
         def attempt(start: float, size: float) -> int:
             nonlocal new_step
-            status = self._do_step(self._self, start, size, new_step)
-            if status == PENDING:
-                status = self._step_status.wait()
+            status = self._step_status.settled(self._do_step(self._self, start, size, new_step))
             new_step = _REPEATED if status == DISCARD else _NEW
             return status
 

@@ -33,18 +33,14 @@ class NativeInstance(FmuInstance):
     """
 
     _kind: StepKind
-    _do_step: Function
-    """The function of the FMU, as cffi calls it."""
+    _do_step: Function  # the function of the FMU, as cffi calls it
 
-    _by_calls = False
-    """Whether the steps have a part that the library does not know."""
+    _by_calls = False  # whether the steps have a part that the library does not know
 
-    _derivatives: Mapping[str, float] = {}
-    """Of the linear inputs, in 1/s, for the next step."""
+    _derivatives: Mapping[str, float] = {}  # of the linear inputs, in 1/s, for the next step
 
     _native: NativeStep | None = None
-    _member: MemberTable | None = None
-    """The member that takes the steps of `do_step`."""
+    _member: MemberTable | None = None  # the member that takes the steps of `do_step`
 
     @property
     def native(self) -> NativeStep | None:
@@ -79,7 +75,7 @@ class NativeInstance(FmuInstance):
         self._in_step = take, pointer(ctypes.addressof(member))
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
-        """See `TakesDerivatives` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
+        """See `FmuInstance` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
         self._derivatives = derivatives  # the FMU gets them after the values of these inputs
 
     def do_step(self, step: int) -> None:

@@ -60,19 +60,16 @@ _NEEDED_3 = (
 class ContinuousInstance(FmuInstance):
     """The part of model exchange that all versions share; to be named before the base class of the version."""
 
-    _calls: type[ModelCalls] = ModelCalls
-    """Those of this version."""
+    _calls: type[ModelCalls] = ModelCalls  # those of this version
 
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
     _clocks: Clocks = NO_CLOCKS
-    _row: _RowBytes = ()
-    """The inputs of the last step that are held."""
+    _row: _RowBytes = ()  # the inputs of the last step that are held
     _linear_columns: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
     """The columns of the other ones among those of type Float64."""
     _slopes: Mapping[str, float] = {}
-    _goes_on = False
-    """Whether the linear inputs begin where the last step has left them."""
+    _goes_on = False  # whether the linear inputs begin where the last step has left them
     _time_of_start = 0.0
     _stop_time = math.inf
 
@@ -106,7 +103,7 @@ class ContinuousInstance(FmuInstance):
             self._checked(lambda: loop.event(lambda: set_values(values)))
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
-        """See `TakesDerivatives`."""
+        """See `FmuInstance`."""
         self._slopes, self._goes_on = derivatives, continuous
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:

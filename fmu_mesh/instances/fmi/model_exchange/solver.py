@@ -178,8 +178,7 @@ class CVodeSolver(Solver):
         self._rhs = _RHS(lambda time, x, dx, _: self._guarded(self._derivatives, time, data(x), data(dx)))
         self._root = _ROOT(lambda time, x, z, _: self._guarded(self._indicators, time, data(x), z))
         self._handler = _HANDLER(told)
-        self._is_new = True
-        """Whether CVode begins anew in its next step."""
+        self._is_new = True  # whether CVode begins anew in its next step
         self._started = False
         self._stalled = 0
         self._context = ctypes.c_void_p()
