@@ -16,39 +16,9 @@ from .calls import checked_function
 from .fmu_instance import FmuInstance
 from .fmu_values import ValueFunctions
 
-__all__ = [
-    "FMI1_VALUES",
-    "FMI2_NAMES",
-    "FMI2_NEEDED",
-    "FMI2_VALUES",
-    "FMI3_NEEDED",
-    "FMI3_VALUES",
-    "Fmi1",
-    "Fmi2",
-    "Fmi3",
-]
+__all__ = ["Fmi1", "Fmi2", "Fmi3"]
 
-FMI1_VALUES: Final = ValueFunctions("fmi", np.int8, sized=False)  # a Boolean is a `char` (FMI 1.0 ME, 2.1.2)
-FMI2_VALUES: Final = ValueFunctions("fmi2", np.intc, sized=False)
-FMI3_VALUES: Final = ValueFunctions("fmi3", np.uint8, sized=True)
-FMI2_NAMES: Final = {
-    "instantiate": "fmi2Instantiate",
-    "getFMUState": "fmi2GetFMUstate",
-    "setFMUState": "fmi2SetFMUstate",
-    "freeFMUState": "fmi2FreeFMUstate",
-    "serializeFMUState": "fmi2SerializeFMUstate",
-    "deserializeFMUState": "fmi2DeSerializeFMUstate",
-}
-"""FMI functions whose name does not follow from the name of FMPy's method, by that name."""
-FMI2_NEEDED: Final = (
-    "fmi2Instantiate",
-    "fmi2SetupExperiment",
-    "fmi2EnterInitializationMode",
-    "fmi2ExitInitializationMode",
-)
 _TERMINATE: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
-FMI3_NEEDED: Final = ("fmi3EnterInitializationMode", "fmi3ExitInitializationMode")
-"""The functions that co-simulation and model exchange need, and so above for FMI 2.0."""
 
 
 class Fmi1(FmuInstance):
@@ -58,6 +28,8 @@ class Fmi1(FmuInstance):
     (FMI 1.0 CS, 3.6; ME, 2.8). So the instance is initialized when the first value is read, or else when Initialization
     Mode is left; inputs that are set later hold from the first step on.
     """
+
+    VALUES = ValueFunctions("fmi", np.int8, sized=False)  # a Boolean is a `char` (FMI 1.0 ME, 2.1.2)
 
     _initialized = False
     _end: str  # the function that ends the simulation, after the prefix
@@ -99,6 +71,25 @@ class Fmi1(FmuInstance):
 class Fmi2(FmuInstance):
     """An FMI 2.0 instance."""
 
+    VALUES = ValueFunctions("fmi2", np.intc, sized=False)
+    NAMES: Final = {
+        "instantiate": "fmi2Instantiate",
+        "getFMUState": "fmi2GetFMUstate",
+        "setFMUState": "fmi2SetFMUstate",
+        "freeFMUState": "fmi2FreeFMUstate",
+        "serializeFMUState": "fmi2SerializeFMUstate",
+        "deserializeFMUState": "fmi2DeSerializeFMUstate",
+    }
+    """FMI functions whose name does not follow from the name of FMPy's method, by that name."""
+
+    NEEDED: Final = (
+        "fmi2Instantiate",
+        "fmi2SetupExperiment",
+        "fmi2EnterInitializationMode",
+        "fmi2ExitInitializationMode",
+    )
+    """The functions that co-simulation and model exchange need."""
+
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(callbacks=fmi2_callbacks(id(self._model)), **arguments)
 
@@ -112,6 +103,9 @@ class Fmi2(FmuInstance):
 
 class Fmi3(FmuInstance):
     """An FMI 3.0 instance."""
+
+    VALUES = ValueFunctions("fmi3", np.uint8, sized=True)
+    NEEDED: Final = ("fmi3EnterInitializationMode", "fmi3ExitInitializationMode")
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(logMessage=FMI3_LOGGER, **arguments)

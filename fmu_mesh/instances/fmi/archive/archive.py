@@ -68,6 +68,11 @@ class OpenFmu(ABC):
             raise LoadFailed(text, hint=LIMITS_HINT)
         return self.read_binary(name)
 
+    def _known(self, name: str) -> str:
+        if name not in self._names():
+            raise LoadFailed(f"'{self.path}' has no file '{name}'.")
+        return name
+
     @abstractmethod
     def read_binary(self, name: str) -> bytes:
         """The content of one of its libraries, of any size that the limits of an archive allow."""
@@ -202,7 +207,7 @@ class _Archive(OpenFmu):
 
     def read_binary(self, name: str) -> bytes:
         with reading(self.path):
-            return self._zip.read(self._entry(name))
+            return self._zip.read(self._entries[self._known(name)])
 
     def content_sha256(self) -> str:
         with reading(self.path):
@@ -220,25 +225,16 @@ class _Archive(OpenFmu):
         return frozenset(self._entries)
 
     def _size(self, name: str) -> int:
-        return self._entry(name).file_size
+        return self._entries[self._known(name)].file_size
 
     @cached_property
     def _entries(self) -> dict[str, ZipInfo]:
         return {entry_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
 
-    def _entry(self, name: str) -> ZipInfo:
-        if name not in self._entries:
-            raise _no_file(self.path, name)
-        return self._entries[name]
-
     def _sha256(self) -> str:
         if self._digest is None:
             self._digest = files.sha256_of_open(self._file, again=self._verifies)
         return self._digest
-
-
-def _no_file(path: Path, name: str) -> LoadFailed:
-    return LoadFailed(f"'{path}' has no file '{name}'.")
 
 
 # --- a folder
@@ -258,7 +254,7 @@ class _Folder(OpenFmu):
 
     def read_binary(self, name: str) -> bytes:
         with reading(self.path):
-            return self._file(name).read_bytes()
+            return (self.path / self._known(name)).read_bytes()
 
     def content_sha256(self) -> str:
         with reading(self.path):
@@ -284,12 +280,7 @@ class _Folder(OpenFmu):
 
     def _size(self, name: str) -> int:
         with reading(self.path):
-            return self._file(name).stat().st_size
-
-    def _file(self, name: str) -> Path:
-        if name not in _names_in(self.path):
-            raise _no_file(self.path, name)
-        return self.path / name
+            return (self.path / self._known(name)).stat().st_size
 
 
 def _names_in(path: Path) -> frozenset[str]:

@@ -13,7 +13,7 @@ from fmpy.fmi1 import FMU1Slave
 from ....rings.native import StepKind
 from ...call_guard import call_named
 from ..calls import cffi_function, checked_function
-from ..fmi_versions import FMI1_VALUES, Fmi1
+from ..fmi_versions import Fmi1
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
 from .discarded_steps import SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
@@ -41,7 +41,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
 
     _kind = StepKind.FMI1
     _end = "TerminateSlave"
-    _functions = FmuFunctions(FMU1Slave, FMI1_VALUES, "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
+    _functions = FmuFunctions(FMU1Slave, Fmi1.VALUES, "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""

@@ -13,7 +13,7 @@ from ....rings.native import StepKind
 from ....simtime import resolvable
 from ....variables.value_types import Value
 from ..calls import cffi_function
-from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, FMI2_VALUES, Fmi2
+from ..fmi_versions import Fmi2
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
@@ -31,7 +31,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _kind = StepKind.FMI2
-    _functions = FmuFunctions(FMU2Slave, FMI2_VALUES, "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
+    _functions = FmuFunctions(FMU2Slave, Fmi2.VALUES, "fmi2FreeInstance", (*Fmi2.NEEDED, "fmi2DoStep"), Fmi2.NAMES)
     _terminated = False  # whether the FMU has asked to end the simulation with the step that is complete now
 
     def advance(self, time: float, step_size: float) -> None:

@@ -27,7 +27,7 @@ from ....variables.model_description import ModelDescription
 from ....variables.value_types import Value
 from ..calls import Function, Pointer, cffi_function, pointer
 from ..clocks import Clocks, updated
-from ..fmi_versions import FMI3_NEEDED, FMI3_VALUES, Fmi3
+from ..fmi_versions import Fmi3
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING, PartCall, SolverFailed, Verb
 from ..loaded_fmu import FmuFunctions
@@ -36,7 +36,7 @@ from .native_instance import NativeInstance
 
 __all__ = ["Fmi3Instance", "Fmi3Steps"]
 
-_NEEDED = "fmi3InstantiateCoSimulation", *FMI3_NEEDED, "fmi3DoStep"
+_NEEDED = "fmi3InstantiateCoSimulation", *Fmi3.NEEDED, "fmi3DoStep"
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 MOST_RETURNS: Final = 1000
 """After this many returns of fmi3DoStep at the same time, an FMU makes no progress."""
@@ -46,7 +46,7 @@ class Fmi3Instance(NativeInstance, Fmi3):
     """One instance of an FMI 3.0 co-simulation FMU."""
 
     _kind = StepKind.FMI3
-    _functions = FmuFunctions(FMU3Slave, FMI3_VALUES, "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
+    _functions = FmuFunctions(FMU3Slave, Fmi3.VALUES, "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
     _steps: Fmi3Steps
     _discrete_row: tuple[bytes | list[Any], ...] = ()
 

@@ -24,17 +24,7 @@ from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ..calls import cffi_function, memory
 from ..clocks import NO_CLOCKS, Clocks
-from ..fmi_versions import (
-    FMI1_VALUES,
-    FMI2_NAMES,
-    FMI2_NEEDED,
-    FMI2_VALUES,
-    FMI3_NEEDED,
-    FMI3_VALUES,
-    Fmi1,
-    Fmi2,
-    Fmi3,
-)
+from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping, FmuInstance
 from ..fmu_values import WARNING
 from ..loaded_fmu import FmuFunctions
@@ -47,10 +37,10 @@ _RowBytes = tuple[bytes | list[Any], ...]
 
 _NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
 _NEEDED_1 = "fmiInstantiateModel", "fmiSetTime", "fmiInitialize", "fmiEventUpdate"
-_NEEDED_2 = *FMI2_NEEDED, "fmi2SetTime", "fmi2NewDiscreteStates", "fmi2EnterContinuousTimeMode"
+_NEEDED_2 = *Fmi2.NEEDED, "fmi2SetTime", "fmi2NewDiscreteStates", "fmi2EnterContinuousTimeMode"
 _NEEDED_3 = (
     "fmi3InstantiateModelExchange",
-    *FMI3_NEEDED,
+    *Fmi3.NEEDED,
     "fmi3SetTime",
     "fmi3UpdateDiscreteStates",
     "fmi3EnterContinuousTimeMode",
@@ -228,7 +218,7 @@ class ContinuousInstance(FmuInstance):
 class Fmi1ModelInstance(ContinuousInstance, Fmi1):
     """One instance of an FMI 1.0 FMU for model exchange (FMI 1.0, 2.8)."""
 
-    _functions = FmuFunctions(FMU1Model, FMI1_VALUES, "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
+    _functions = FmuFunctions(FMU1Model, Fmi1.VALUES, "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
     _calls = Fmi1Calls
     _end = "Terminate"
 
@@ -242,13 +232,13 @@ class Fmi1ModelInstance(ContinuousInstance, Fmi1):
 class Fmi2ModelInstance(ContinuousInstance, Fmi2):
     """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
 
-    _functions = FmuFunctions(FMU2Model, FMI2_VALUES, "fmi2FreeInstance", _NEEDED_2, FMI2_NAMES)
+    _functions = FmuFunctions(FMU2Model, Fmi2.VALUES, "fmi2FreeInstance", _NEEDED_2, Fmi2.NAMES)
 
 
 class Fmi3ModelInstance(ContinuousInstance, Fmi3):
     """One instance of an FMI 3.0 FMU for model exchange (FMI 3.0, 3.2)."""
 
-    _functions = FmuFunctions(FMU3Model, FMI3_VALUES, "fmi3FreeInstance", _NEEDED_3, {"instantiate": _NEEDED_3[0]})
+    _functions = FmuFunctions(FMU3Model, Fmi3.VALUES, "fmi3FreeInstance", _NEEDED_3, {"instantiate": _NEEDED_3[0]})
     _calls = Fmi3Calls
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
