@@ -90,11 +90,7 @@ class Clocks:
         self._find_next()
 
     def settle(self, time: float, update: Callable[[], EventInfo]) -> EventInfo:
-        """In event mode at ``time`` (s): let clocks tick, and ``update`` the discrete states until they are settled.
-
-        Raises:
-            SolverFailed: they need updates for ever.
-        """
+        """In event mode at ``time`` (s): let clocks tick, and ``update`` the discrete states until they are settled."""
         self._set_due(time)
         for _ in range(EVENT_ITERATIONS):
             info = update()

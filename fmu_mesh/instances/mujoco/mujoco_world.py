@@ -132,15 +132,20 @@ def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[W
 def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     positions = model.qpos0 if keyframe is None else model.key_qpos[keyframe]
     velocities = [0.0] * model.nv if keyframe is None else model.key_qvel[keyframe]
-    for number in range(model.njnt):
-        joint = model.joint(number)
-        revolute = joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
-        if not joint.name or not (revolute or joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE):
+    for joint in _of_one_axis(mujoco, model):
+        if not joint.name:
             continue
+        revolute = joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
         qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
         places = {what: (what, dof) for what in _OF_DOFS} | {"position": ("position", qpos)}
         start = {"position": float(positions[qpos]), "velocity": float(velocities[dof])}
         yield from joint_variables(joint.name, places, revolute=revolute, start=start)
+
+
+def _of_one_axis(mujoco: ModuleType, model: Any) -> list[Any]:  # noqa: ANN401  mujoco has no types
+    """The revolute and prismatic joints."""
+    types = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    return [joint for joint in map(model.joint, range(model.njnt)) if int(joint.type[0]) in types]
 
 
 def _bodies(model: Any) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
@@ -154,23 +159,19 @@ def _bodies(model: Any) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has 
 
 
 def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types
-    for number in range(model.njnt):
-        joint = model.joint(number)
-        scalar = int(joint.type[0]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-        if scalar and model.jnt_actfrclimited[number] and joint.name not in free:
-            lower, upper = model.jnt_actfrcrange[number]
+    for joint in _of_one_axis(mujoco, model):
+        if model.jnt_actfrclimited[joint.id] and joint.name not in free:
+            lower, upper = model.jnt_actfrcrange[joint.id]
             yield int(joint.dofadr[0]), float(lower), float(upper)
 
 
 def _left_out(mujoco: ModuleType, model: Any, data: bytes) -> Iterator[str]:  # noqa: ANN401  mujoco has no types
     """Parts of the file that have no variables. A free joint needs none: its body has position and velocity."""
-    joints = [model.joint(number) for number in range(model.njnt)]
-    for joint in joints:
+    for joint in map(model.joint, range(model.njnt)):
         if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
             yield f"the joint '{joint.name}' is simulated, and has no variables, as it is a ball joint"
-    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     nameless = {
-        "joints": sum(not joint.name for joint in joints if int(joint.type[0]) in scalar),
+        "joints": sum(not joint.name for joint in _of_one_axis(mujoco, model)),
         "sensors": sum(not model.sensor(number).name for number in range(model.nsensor)),
         "actuators": sum(not model.actuator(number).name for number in range(model.nu)),
     }

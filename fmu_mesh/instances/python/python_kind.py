@@ -76,16 +76,13 @@ def answer_to(request: str) -> bytes:
             description = component.load()
             check_arguments(component.cls, arguments)
         except (Exception, SystemExit) as error:  # it is code of the user
-            raise LoadFailed(component.told(error), hint=_hint(error)) from error
+            hint = error.hint if isinstance(error, FmuMeshError) else None
+            if isinstance(error, ModuleNotFoundError):
+                hint = "Is it installed in the Python that runs the component?"
+            raise LoadFailed(component.told(error), hint=hint) from error
         return description
 
     return described(describe)
-
-
-def _hint(error: BaseException) -> str | None:
-    if isinstance(error, ModuleNotFoundError):
-        return "Is it installed in the Python that runs the component?"
-    return error.hint if isinstance(error, FmuMeshError) else None
 
 
 def _check_version(python: str) -> None:

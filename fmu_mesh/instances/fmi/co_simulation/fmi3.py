@@ -207,11 +207,7 @@ class Fmi3Steps:
         self._look_ahead()
 
     def step(self, start: float, step_size: float, end: float) -> float:
-        """Take the step from ``start`` by ``step_size`` to ``end`` (s).
-
-        Returns:
-            The time reached in s: ``end``, or an earlier time at which the FMU asked to end the simulation.
-        """
+        """Take the step from ``start`` by ``step_size`` to ``end`` (s); the time reached, if the FMU ends it earlier."""
         status = None
         if self._said.quiet_until > end:
             status = self._attempt(start, step_size)
@@ -234,7 +230,10 @@ class Fmi3Steps:
             if status == DISCARD and self._varies and largest > step_size / SMALLEST:
                 largest, status = largest / 2.0, None
                 continue
-            self._check(status, retried=largest < step_size)
+            if status == DISCARD and largest < step_size:
+                raise SolverFailed(f"fmi3DoStep returned discard down to 1/{SMALLEST} of the step")
+            if status > WARNING:
+                raise FMICallException(function="fmi3DoStep", status=status)
             status = None
             before, time = time, said.last_time if said.early else target
             stuck = 0 if time > before else stuck + 1
@@ -252,12 +251,6 @@ class Fmi3Steps:
     def _attempt(self, time: float, size: float) -> int:
         self._said.clear()
         return self._do_step(self._self, time, size, True, *self._results)  # noqa: FBT003 a C function
-
-    def _check(self, status: int, *, retried: bool) -> None:
-        if status == DISCARD and retried:
-            raise SolverFailed(f"fmi3DoStep returned discard down to 1/{SMALLEST} of the step")
-        if status > WARNING:
-            raise FMICallException(function="fmi3DoStep", status=status)
 
     def _is_due(self, time: float) -> bool:
         """Whether event mode is needed at ``time`` (s).
