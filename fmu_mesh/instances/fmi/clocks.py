@@ -105,9 +105,9 @@ class Clocks:
     def _set_due(self, time: float) -> None:
         """Activate every input clock whose tick is at ``time`` (s)."""
         due = []
-        for number, clock in enumerate(self._periodic):
-            if not resolvable(time, self._next_ticks()[number]):
-                due.append(clock.value_reference)
+        for number, tick in enumerate(self._next_ticks()):
+            if not resolvable(time, tick):
+                due.append(self._periodic[number].value_reference)
                 self._ticks[number] += 1
         for reference, tick in self._aperiodic.items():
             if not resolvable(time, tick):

@@ -207,7 +207,7 @@ class Fmi3Steps:
         self._look_ahead()
 
     def step(self, start: float, step_size: float, end: float) -> float:
-        """Take the step from ``start`` by ``step_size`` to ``end`` (s); the time reached, if the FMU ends it earlier."""
+        """Take the step from ``start`` by ``step_size`` to ``end`` (s); the time reached, if the FMU ends earlier."""
         status = None
         if self._said.quiet_until > end:
             status = self._attempt(start, step_size)
