@@ -36,16 +36,9 @@ def relative_velocity(rotation: Sequence[float], velocity: Sequence[float], wind
 def wrench_at_center(
     rotation: Sequence[float], lever: Sequence[float], force: Sequence[float], moment: Sequence[float]
 ) -> tuple[Vector, Vector]:
-    """A force at a body's origin and a moment about it, as a force at its centre of mass and a moment about that.
+    """A force (N) and moment (N m) in body axes at a body's origin, as both in world axes at its centre of mass.
 
-    Args:
-        rotation: of the body.
-        lever: from the centre of mass to the origin in world axes, in m.
-        force: in body axes, in N.
-        moment: about the origin in body axes, in N m.
-
-    Returns:
-        Force in N and moment about the centre of mass in N m, both in world axes.
+    ``lever`` goes from the centre of mass to the origin in world axes, in m.
     """
     fx, fy, fz = acting = to_world(rotation, force)
     mx, my, mz = to_world(rotation, moment)

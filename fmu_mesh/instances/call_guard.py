@@ -102,10 +102,8 @@ class CallWatch:
         True
         >>> watch.close()
 
-    Args:
-        on_overrun: called with the error, which says the instance, the call and the point. The watched thread is still
-            in the call.
-        survives: whether ``on_overrun`` is also called after a crash at the end; see `surviving`.
+    ``on_overrun`` is called with the error, which says the instance, the call and the point, while the watched thread
+    is still in the call. With ``survives`` it is also called after a crash at the end; see `surviving`.
     """
 
     def __init__(self, on_overrun: Callable[[FmuError], None], *, survives: bool = False) -> None:

@@ -40,8 +40,7 @@ _Answer = ModelDescription | tuple[str, str | None]
 def ask_description_of(what: str, module: str, request: object, python: str = sys.executable) -> ModelDescription:
     """What ``answer_to`` of a module answers to a request in a child process; ``what`` happens there, as errors say it.
 
-    Raises:
-        LoadFailed: there is no description, or the process ended without an answer; says why.
+    `LoadFailed` says why there is no description, also if the process ended without an answer.
     """
     try:
         text = msgspec.json.encode(request).decode()
@@ -66,11 +65,7 @@ def described(describe: Callable[[], ModelDescription]) -> bytes:
 
 
 def run_child(command: Sequence[str]) -> tuple[bytes, str]:
-    """The output of a command, which ends with this process, and in words how it ended.
-
-    Raises:
-        LoadFailed: it cannot be started.
-    """
+    """The output of a command, which ends with this process, and in words how it ended."""
     reading, writing = os.pipe()
     try:
         child = subprocess.Popen(

@@ -23,11 +23,7 @@ def examine_data(
 
 
 def installed_config() -> type[Config]:
-    """The type of a configuration with all installed kinds of instances, for its JSON Schema.
-
-    Raises:
-        ConfigurationError: a package with a kind cannot be imported, or two packages have the same key.
-    """
+    """The type of a configuration with all installed kinds of instances, for its JSON Schema."""
     own = KINDS.own()
     others = {name: KINDS.section(name) for name in KINDS.names() if name not in own}
     return config_type((*own.values(), *others.values()))

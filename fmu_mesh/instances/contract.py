@@ -168,7 +168,6 @@ class Kind(ABC, Generic[Section]):
         Raises:
             LoadFailed: it cannot; says why, with a hint what to install.
         """
-        return
 
     def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
         """Check that this host has what one model needs; nothing is checked by default.
@@ -188,14 +187,12 @@ class Kind(ABC, Generic[Section]):
         Raises:
             ConfigurationError: it cannot; says why.
         """
-        return
 
     def preload(self) -> None:
         """Import what `open` needs, so that the processes of a run share it; nothing is imported by default.
 
         Called in a process with one thread, which forks them: an import must start no thread.
         """
-        return
 
     def prepare(self, opening: Opening[Section]) -> None:
         """Do once what every `open` of a model needs, such as unpacking it; nothing is prepared by default.
@@ -205,7 +202,6 @@ class Kind(ABC, Generic[Section]):
         Raises:
             LoadFailed: it cannot be done; `open` says so again.
         """
-        return
 
     @abstractmethod
     def open(self, opening: Opening[Section]) -> Instance:

@@ -20,12 +20,11 @@ class Trajectory:
         >>> trajectory.value(1.0, resolution=1e-9)
         2.0
 
-    Args:
-        linear: whether the input is linear between two times, or constant from each time on.
+    ``linear`` says whether the input is linear between two times, or constant from each time on.
     """
 
     def __init__(self, *, linear: bool) -> None:
-        self._linear = linear
+        self.linear = linear
         self._times: list[float] = []
         self._values: list[Value] = []
 
@@ -51,7 +50,7 @@ class Trajectory:
             del self._times[:place], self._values[:place]
             place = 0
         start, value = self._times[place], self._values[place]
-        if not self._linear or place + 1 == len(self._times) or start >= time - resolution:
+        if not self.linear or place + 1 == len(self._times) or start >= time - resolution:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
         return between(value, right, (time - start) / (end - start))
@@ -60,8 +59,3 @@ class Trajectory:
         """The first time (s) after ``time``; None if no value has a later one."""
         place = bisect_right(self._times, time)
         return self._times[place] if place < len(self._times) else None
-
-    @property
-    def linear(self) -> bool:
-        """Whether it is linear between two times."""
-        return self._linear

@@ -101,11 +101,7 @@ class AroundInstance(Generic[Within]):
         return call(*arguments)
 
     def _keeper(self) -> KeepsState:
-        """The inner instance as one that has states.
-
-        Raises:
-            FmuError: this kind of instance has none.
-        """
+        """The inner instance as one that has states; `FmuError` if its kind has none."""
         if not hasattr(self._instance, "get_state"):
             raise FmuError("its state cannot be kept", instance=getattr(self._instance, "name", None))
         return cast("KeepsState", self._instance)
@@ -117,11 +113,7 @@ def packed(own: msgspec.Struct | tuple[msgspec.Struct, ...], within: bytes) -> b
 
 
 def unpacked(data: bytes, kind: type[Own], instance: str | None) -> tuple[Own, bytes]:
-    """The two arguments of `packed`.
-
-    Raises:
-        FmuMeshError: ``data`` is no such state.
-    """
+    """The two arguments of `packed`; `FmuMeshError` if ``data`` is no such state."""
     try:
         return msgspec.msgpack.decode(data, type=tuple[kind, bytes])  # type: ignore[valid-type]  # a variable here
     except msgspec.DecodeError as error:
@@ -151,11 +143,7 @@ class AroundNativeSteps(AroundInstance[Instance]):
 
 
 def of_kind(kind: type[Own], state: object) -> Own:
-    """``state``, which has to be one of this kind.
-
-    Raises:
-        TypeError: it is another object.
-    """
+    """``state``, which has to be one of this kind."""
     if not isinstance(state, kind):
         msg = f"{type(state).__name__} is no state of this instance"
         raise TypeError(msg)

@@ -28,9 +28,8 @@ class KeptModel(Protocol):
 class KeptModels:
     """At most one model for each instance name, so two instances of one FMU never share a library.
 
-    Args:
-        folder: an existing private folder for files that are kept.
-        resets: whether an instance is kept and reset for the next run, where its model can be reset.
+    They keep files in ``folder``, an existing private one. With ``resets``, an instance is kept and reset for the next
+    run, where its model can be reset.
     """
 
     def __init__(self, folder: Path, *, resets: bool = False) -> None:

@@ -80,25 +80,23 @@ class ControllerKind(Kind[PidConfig]):
         return PidInstance(opening.name)
 
 
-KIND_OF_CONTROLLERS = ControllerKind()
-"""What the entry point `controller` names."""
+KIND_OF_CONTROLLERS = ControllerKind()  # what the entry point `controller` names
 
 
 def describe_pid() -> ModelDescription:
     """The model description of the controller."""
-    variables = [
-        *(_variable(name, "parameter", text, start) for name, (start, text) in _PARAMETERS.items()),
-        *(_variable(name, "input", text, 0.0) for name, text in _INPUTS.items()),
-        _variable("effort", "output", "what the controller asks for, in N m or N"),
+    variables: list[tuple[str, Causality, str, float | None]] = [
+        *((name, "parameter", text, start) for name, (start, text) in _PARAMETERS.items()),
+        *((name, "input", text, 0.0) for name, text in _INPUTS.items()),
+        ("effort", "output", "what the controller asks for, in N m or N", None),
     ]
-    numbered = tuple(msgspec.structs.replace(variable, value_reference=n) for n, variable in enumerate(variables))
     return ModelDescription(
         model_name="position_pid",
         model_identifier="position_pid",
         fmi_version="",
         kind="controller",
         guid="{position_pid}",
-        variables=numbered,
+        variables=tuple(_variable(number, *row) for number, row in enumerate(variables)),
         description="position controller of a joint",
         generation_tool="fmu_mesh",
         can_get_and_set_state=True,
@@ -106,10 +104,10 @@ def describe_pid() -> ModelDescription:
     )
 
 
-def _variable(name: str, causality: Causality, text: str, start: float | None = None) -> Variable:
+def _variable(number: int, name: str, causality: Causality, text: str, start: float | None) -> Variable:
     return Variable(
         name=name,
-        value_reference=0,
+        value_reference=number,
         type="Float64",
         causality=causality,
         variability="tunable" if causality == "parameter" else "continuous",
@@ -127,14 +125,9 @@ class PidInstance(KeepsStateAsBytes):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._description = describe_pid()
-        self._values = {v.name: float(v.start) for v in self._description.variables if isinstance(v.start, float)}
+        self.description = describe_pid()
+        self._values = {v.name: float(v.start) for v in self.description.variables if isinstance(v.start, float)}
         self._integral = 0.0
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
@@ -161,11 +154,7 @@ class PidInstance(KeepsStateAsBytes):
         self._write(step)
 
     def do_step(self, step: int) -> None:
-        """Read the inputs of row ``step``, integrate the error over the step, and write the effort to row ``step + 1``.
-
-        Raises:
-            StepFailed: an input is infinite or no number.
-        """
+        """Read the inputs of row ``step``, integrate the error over the step, write the effort to row ``step + 1``."""
         row = self._inputs.part("Float64")[step & self._inputs.mask].tolist()
         values = self._values
         values.update(zip(self._inputs.layout.names, row, strict=True))
@@ -179,13 +168,12 @@ class PidInstance(KeepsStateAsBytes):
 
     def get_state(self) -> bytes:
         """The inputs, the gains and the integral."""
-        return msgspec.json.encode(_State(self._values, self._integral))
+        return msgspec.json.encode((self._values, self._integral))
 
     def set_state(self, state: object) -> None:
         """Restore what `get_state` of this or another controller returned."""
         assert isinstance(state, bytes)
-        decoded = msgspec.json.decode(state, type=_State)
-        self._values, self._integral = dict(decoded.values), decoded.integral
+        self._values, self._integral = msgspec.json.decode(state, type=tuple[dict[str, float], float])
 
     def close(self) -> None:
         """Nothing to free."""
@@ -199,13 +187,6 @@ class PidInstance(KeepsStateAsBytes):
     def _write(self, step: int) -> None:
         for ring in self._outputs:
             ring.part("Float64")[step & ring.mask] = self.get_values(ring.layout.names)
-
-
-class _State(msgspec.Struct, frozen=True):
-    """The state of a controller between two steps."""
-
-    values: dict[str, float]
-    integral: float
 
 
 def _limited(value: float, most: float) -> float:

@@ -86,13 +86,10 @@ class ProcessState:
     """What an FMU could change of its process and of this thread, as it is now; the floating-point mode is not in it.
 
     Handlers of other signals are left to the FMU: a timer or a virtual machine in it may need them.
-
-    Attributes:
-        changed: whether `restore` has found anything changed.
     """
 
     def __init__(self) -> None:
-        self.changed = False
+        self.changed = False  # whether `restore` has found anything changed
         self._signals, signals = _signals(None)
         self._before = _Seen.now(signals)
 
@@ -118,19 +115,15 @@ class ProcessState:
 
 
 class _Seen(NamedTuple):
-    """What is compared.
-
-    Attributes:
-        signals: the handlers in C, of which Python does not know all, and the signals that this thread blocks.
-        environment: the addresses of the variables.
-    """
+    """What is compared."""
 
     folder: str | None
     locale: str
     thread_locale: int
+    # the handlers in C, of which Python does not know all, and the signals that this thread blocks
     signals: list[bytes]
     umask: int
-    environment: bytes
+    environment: bytes  # the addresses of the variables
 
     @classmethod
     def now(cls, signals: list[bytes]) -> _Seen:

@@ -59,11 +59,7 @@ class InstalledKinds:
         return _names()
 
     def section(self, key: str) -> type[InstanceSection]:
-        """The section of the kind with the key ``key``.
-
-        Raises:
-            ConfigurationError: its package cannot be imported or offers something else, or two packages have this key.
-        """
+        """The section of the kind with the key ``key``; `ConfigurationError` says why there is none."""
         section: type[InstanceSection] = _kind(key).section
         return section
 
@@ -98,20 +94,12 @@ def describe(
     limits: LimitsConfig = LimitsConfig(),  # noqa: B008  a frozen Struct
     tell: Callable[[str], None] = lambda _text: None,
 ) -> ModelDescription:
-    """The model description of an instance; see `Kind.describe`.
-
-    Raises:
-        LoadFailed: the model cannot be read.
-    """
+    """The model description of an instance; see `Kind.describe`."""
     return _kind_of(section).describe(path, section, limits, tell)
 
 
 def content(path: Path, section: InstanceSection) -> str:
-    """A SHA-256 of all files that the model of an instance consists of; see `Kind.content`.
-
-    Raises:
-        LoadFailed: a file cannot be read.
-    """
+    """A SHA-256 of all files that the model of an instance consists of; `LoadFailed` if one cannot be read."""
     try:
         return _kind_of(section).content(path)
     except OSError as error:
@@ -119,11 +107,7 @@ def content(path: Path, section: InstanceSection) -> str:
 
 
 def claims(path: Path, section: InstanceSection, description: ModelDescription, limits: LimitsConfig) -> Claims:
-    """What an instance claims of its process; see `Kind.claims`.
-
-    Raises:
-        LoadFailed: the model cannot be read.
-    """
+    """What an instance claims of its process; see `Kind.claims`."""
     only_once = {f"the FMU {description.guid} allows one instance per process": ""}
     try:
         claimed = _kind_of(section).claims(path, section, description, limits)
@@ -143,22 +127,14 @@ def preload() -> None:
 
 
 def prepare(opening: Opening[Any]) -> None:
-    """Do once what every `open_instance` of a model needs; see `Kind.preload` and `Kind.prepare`.
-
-    Raises:
-        LoadFailed: it cannot be done; `open_instance` says so again.
-    """
+    """Do once what every `open_instance` of a model needs; see `Kind.preload` and `Kind.prepare`."""
     kind = _kind_of(opening.section)
     kind.preload()
     kind.prepare(opening)
 
 
 def open_instance(opening: Opening[Any]) -> Instance:
-    """Open an instance of whatever kind; the caller closes it.
-
-    Raises:
-        LoadFailed: it cannot be opened.
-    """
+    """Open an instance of whatever kind; the caller closes it."""
     kind = _kind_of(opening.section)
     if opening.showing and not kind.can_be_shown:
         opening = replace(opening, showing=Showing())
@@ -187,7 +163,11 @@ def check_engines(
         }
         for what, check in asked.items():
             if what not in reasons:
-                reasons[what] = _refusal(check)
+                reasons[what] = None
+                try:
+                    check()
+                except LoadFailed as error:
+                    reasons[what] = error
             if (reason := reasons[what]) is not None:
                 needed = "an engine that runs here" if what == key else "a system that has all libraries"
                 expected = f"{needed}, or the `host` of the instance. {reason.hint or ''}".rstrip()
@@ -195,21 +175,10 @@ def check_engines(
                 break
 
 
-def _refusal(check: Callable[[], None]) -> LoadFailed | None:
-    try:
-        check()
-    except LoadFailed as error:
-        return error
-    return None
-
-
 def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> None:
     """Check that there is one world to show, and that this host can show it.
 
     Call it before any model is described: an engine may have to know of a film when it is imported.
-
-    Raises:
-        ConfigurationError: there is no world or there are several, or this host cannot show it.
     """
     if not showing:
         return
@@ -226,11 +195,7 @@ def _kind_of(section: InstanceSection) -> Kind[Any]:
 
 
 def _kind(key: str) -> Kind[Any]:
-    """The kind with a key.
-
-    Raises:
-        ConfigurationError: nobody offers it, two packages do, or what is offered is no kind with this key.
-    """
+    """The kind with a key."""
     kind = plugin(GROUP, key)
     if kind is None:
         text = f"no installed package offers the kind of instance '{key}'; there are {listed(plugin_names(GROUP))}."

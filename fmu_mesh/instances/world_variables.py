@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from ..variables.model_description import Variable
 
-__all__ = ["Place", "WorldVariable", "joint_variables", "numbered", "world_input", "world_output"]
+__all__ = ["Place", "WorldVariable", "body_variables", "joint_variables", "numbered", "world_input", "world_output"]
 
 Place = tuple[str, int]
 """Where a value is stored: the kind of value, and the place in the flat array of that kind."""
@@ -73,6 +73,34 @@ def joint_variables(
     yield world_input(f"{joint}.{command}", places[command], effort, "what a controller asks for")
     text = "what is applied, such as the torque of an actuator"
     yield world_input(f"{joint}.effort", places["effort"], effort, text)
+
+
+def body_variables(
+    body: str, word: str, places: Mapping[str, Place], wind: tuple[str, ...] = ()
+) -> Iterator[WorldVariable]:
+    """The variables of a body, which the engine calls a ``word``; each place is that of the first of a vector.
+
+    ``wind`` are the inputs that the wind in its axes, and its velocity against the wind, depend on.
+    """
+    rows = {
+        "position": ("xyz", "m", f"of the {word}'s origin in world axes"),
+        "orientation": ("wxyz", "1", f"attitude as a unit quaternion, {word} axes to world axes"),
+        "linear_velocity": ("xyz", "m/s", f"of the {word}'s origin in world axes"),
+        "angular_velocity": ("xyz", "rad/s", "in world axes"),
+        "wind": ("xyz", "m/s", f"velocity of the medium in {word} axes"),
+        "relative_velocity": ("xyz", "m/s", f"velocity of the {word}'s origin against the medium in {word} axes"),
+        "force": ("xyz", "N", f"acts at the {word}'s origin, in {word} axes"),
+        "moment": ("xyz", "N.m", f"acts about the {word}'s origin, in {word} axes"),
+    }
+    for what, (letters, unit, text) in rows.items():
+        where, first = places[what]
+        for number, letter in enumerate(letters):
+            name, place = f"{body}.{what}_{letter}", (where, first + number)
+            if what in ("force", "moment"):
+                yield world_input(name, place, unit, text)
+            else:
+                depends_on = wind if what in ("wind", "relative_velocity") else ()
+                yield world_output(name, place, unit, text, None, depends_on)
 
 
 def numbered(variables: Iterable[WorldVariable]) -> tuple[WorldVariable, ...]:

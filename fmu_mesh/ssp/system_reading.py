@@ -20,8 +20,8 @@ from ..config.loading import PlainConfig
 from ..config.mesh import LimitsConfig
 from ..config.yaml_text import Plain
 from ..errors import ConfigurationError, LoadFailed
-from ..instances.fmi.archive.archive import Terms
 from ..instances.fmi.archive.reading import read_description
+from ..instances.fmi.step_options import Terms
 from ..system.graph import feedback_edges, fewest_feedback_edges
 from ..text import listed, meant, nearest
 from ..variables.model_description import Kind, ModelDescription, Variable

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.files import remove_tree
-from fmu_mesh.instances.fmi.archive.archive import Terms
 from fmu_mesh.instances.fmi.archive.library_names import rename_libraries
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract, prepare
+from fmu_mesh.instances.fmi.step_options import Terms
 from tests.fmus.packing import repacked, unpacked
 from tests.helpers import Launched, Place, write_config
 

@@ -73,7 +73,7 @@ class Driven:
             path,
             "world",
             config or MujocoConfig(mujoco="world.xml"),
-            lambda _status, text, _step: self.messages.append(text),
+            lambda message: self.messages.append(message.message),
             picture,
         )
         self.inputs = Ring(Layout.of([(name, "Float64") for name in inputs]), ROWS)

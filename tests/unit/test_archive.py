@@ -14,10 +14,11 @@ import pytest
 
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import LoadFailed
-from fmu_mesh.instances.fmi.archive.archive import Terms, sha256_of
+from fmu_mesh.instances.fmi.archive.archive import sha256_of
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract, prepare
 from fmu_mesh.instances.fmi.opening import open_instance
+from fmu_mesh.instances.fmi.step_options import Terms
 from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
 

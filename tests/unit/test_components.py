@@ -18,8 +18,7 @@ from fmu_mesh import Component, Input, Output, Parameter, component
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import CallRefused, ConfigurationError, FmuError, InitializationFailed, StepFailed
 from fmu_mesh.instances.contract import Opening
-from fmu_mesh.instances.python.component_description import description_of
-from fmu_mesh.instances.python.importing import component_section
+from fmu_mesh.instances.python.importing import component_section, description_of
 from fmu_mesh.instances.python.python_instance import PythonInstance
 from fmu_mesh.instances.python.python_kind import KIND_OF_COMPONENTS
 from fmu_mesh.instances.python.python_section import PythonConfig, class_place_of, importing

@@ -15,7 +15,7 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import CallRefused, ConfigurationError, UnknownName
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.position_pid import describe_pid
-from fmu_mesh.instances.python.component_description import description_of
+from fmu_mesh.instances.python.importing import description_of
 from fmu_mesh.ros.gateway.mapping import resolve as resolve_ros
 from fmu_mesh.sweeps.planned_sweep import planned_sweep
 from fmu_mesh.system.plan import make_plan

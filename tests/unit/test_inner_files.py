@@ -16,10 +16,11 @@ from fmu_mesh import files
 from fmu_mesh.archives import inner_files
 from fmu_mesh.config.mesh import LimitsConfig
 from fmu_mesh.errors import ConfigurationError, LoadFailed
-from fmu_mesh.instances.fmi.archive.archive import Terms, content_of, opened, sha256_of, size_of
+from fmu_mesh.instances.fmi.archive.archive import content_of, opened, sha256_of, size_of
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.archive.sources import extract
 from fmu_mesh.instances.fmi.opening import open_instance
+from fmu_mesh.instances.fmi.step_options import Terms
 from tests.fmus.helpers import FMUS
 from tests.fmus.packing import without_binaries
 from tests.planning import prepare

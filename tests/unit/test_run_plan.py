@@ -9,9 +9,10 @@ import pytest
 from msgspec.structs import replace
 
 from fmu_mesh.errors import ConfigurationError, LoadFailed
-from fmu_mesh.instances.fmi.archive.archive import Terms, sha256_of
+from fmu_mesh.instances.fmi.archive.archive import sha256_of
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.opening import open_instance
+from fmu_mesh.instances.fmi.step_options import Terms
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.run.run_plan import RunPlan, read_node, read_run
 from tests.helpers import FMUS

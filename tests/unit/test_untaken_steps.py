@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import cast
 
 import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import StepFailed, TerminationRequested
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.instances.fmi.co_simulation.extrapolation import TakesDerivatives
 from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import StepOptions
 from fmu_mesh.rings.ring import Ring
@@ -216,7 +214,7 @@ def test_a_discarded_step_with_a_linear_input_is_a_failure(version: int, steps: 
     options = StepOptions(linear_inputs=(LinearInput("u", 1),))
 
     with running(steps(version), tmp_path, "co_simulation", 0.25, options, longest_step=0.2) as instance:
-        cast("TakesDerivatives", instance).set_input_derivatives({"u": 0.0})
+        instance.set_input_derivatives({"u": 0.0})
         with pytest.raises(StepFailed, match=r"DoStep returned discard; .*Smaller steps \(`step_size`\) may help"):
             instance.do_step(0)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from itertools import groupby
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -23,23 +23,6 @@ _TYPE_IN_MOVE: Final = {
     np.dtype(DTYPES[type_]): number for type_, number in NUMBER_TYPES.items() if type_ not in ("Boolean", "Enumeration")
 }
 """The types of `Move` by the C type of a number."""
-
-
-class Buffer(Protocol):
-    """Memory for a fixed number of elements: `load`, then a setter; or a getter, then `values`."""
-
-    @property
-    def address(self) -> int:
-        """Address of the first element."""
-        ...
-
-    def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
-        """Write elements to the memory."""
-        ...
-
-    def values(self) -> Sequence[Any] | NDArray[Any]:
-        """The elements in the memory; text is copied, because the FMU may free it in its next call."""
-        ...
 
 
 class NumberBuffer:
@@ -58,11 +41,7 @@ class NumberBuffer:
         self.address: int = self._memory.ctypes.data
 
     def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
-        """Write numbers to the memory.
-
-        Raises:
-            OverflowError: the C type cannot hold one of them, or its opposite.
-        """
+        """Write numbers to the memory; `OverflowError` if the C type cannot hold one of them, or its opposite."""
         if self._is_boolean and self._signs is not None:
             self._memory[:] = np.asarray(elements, dtype=np.bool_) ^ (self._signs < 0)
             return
@@ -145,3 +124,10 @@ class BinaryBuffer:
         """The bytes; what has no address is empty."""
         pairs = zip(self._pointers, self._sizes, strict=True)
         return [ctypes.string_at(pointer, size) if pointer and size else b"" for pointer, size in pairs]
+
+
+Buffer: TypeAlias = NumberBuffer | StringBuffer | BinaryBuffer
+"""Memory for a fixed number of elements, from `address` on: `load`, then a setter; or a getter, then `values`.
+
+Text is copied by `values`, because the FMU may free it in its next call.
+"""

@@ -13,18 +13,7 @@ import ctypes
 from typing import Any, Final, Protocol
 
 import fmpy
-from fmpy.fmi1 import (
-    fmi1CallbackAllocateMemoryTYPE,
-    fmi1CallbackFreeMemoryTYPE,
-    fmi1CallbackFunctions,
-    fmi1CallbackLoggerTYPE,
-)
-from fmpy.fmi2 import (
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
+from fmpy import fmi1, fmi2
 from fmpy.logging import addLoggerProxy
 
 from ...rings.library import load_library
@@ -92,9 +81,9 @@ def unregister(instance: Logged) -> None:
         del _by_address[address]
 
 
-def fmi2_callbacks(environment: int) -> fmi2CallbackFunctions:
+def fmi2_callbacks(environment: int) -> fmi2.fmi2CallbackFunctions:
     """The callbacks for an instance of FMI 2.0 with a registered environment; they must live as long as it does."""
-    callbacks = fmi2CallbackFunctions.from_buffer_copy(_FMI2_CALLBACKS)
+    callbacks = fmi2.fmi2CallbackFunctions.from_buffer_copy(_FMI2_CALLBACKS)
     callbacks.componentEnvironment = environment
     return callbacks
 
@@ -139,24 +128,24 @@ def _log(address: int | None, name: bytes | None, status: int, category: bytes |
     _pass_on(ctypes.pointer(_Message(0, address, 0, status, *texts)))
 
 
-def _fmi2_callbacks() -> fmi2CallbackFunctions:
-    callbacks = fmi2CallbackFunctions()
-    callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
-    callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(fmpy.free)
+def _fmi2_callbacks() -> fmi2.fmi2CallbackFunctions:
+    callbacks = fmi2.fmi2CallbackFunctions()
+    callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
+    callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
     if _library is not None:
-        callbacks.logger = ctypes.cast(_library.log_fmi1_2, fmi2CallbackLoggerTYPE)
+        callbacks.logger = ctypes.cast(_library.log_fmi1_2, fmi2.fmi2CallbackLoggerTYPE)
     else:
-        callbacks.logger = fmi2CallbackLoggerTYPE(_log)
+        callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_log)
         addLoggerProxy(ctypes.byref(callbacks))
     return callbacks
 
 
-def _fmi1_callbacks() -> fmi1CallbackFunctions:
+def _fmi1_callbacks() -> fmi1.fmi1CallbackFunctions:
     """The logger is that of FMI 2.0, which has the same arguments; the proxy must not be added twice."""
-    callbacks = fmi1CallbackFunctions()
-    callbacks.logger = ctypes.cast(_FMI2_CALLBACKS.logger, fmi1CallbackLoggerTYPE)
-    callbacks.allocateMemory = fmi1CallbackAllocateMemoryTYPE(fmpy.calloc)
-    callbacks.freeMemory = fmi1CallbackFreeMemoryTYPE(fmpy.free)
+    callbacks = fmi1.fmi1CallbackFunctions()
+    callbacks.logger = ctypes.cast(_FMI2_CALLBACKS.logger, fmi1.fmi1CallbackLoggerTYPE)
+    callbacks.allocateMemory = fmi1.fmi1CallbackAllocateMemoryTYPE(fmpy.calloc)
+    callbacks.freeMemory = fmi1.fmi1CallbackFreeMemoryTYPE(fmpy.free)
     callbacks.stepFinished = None
     return callbacks
 

@@ -43,6 +43,8 @@ _ffi = FFI()
 class FmpyCalls:
     """FMPy's object of an FMU; a deadline watch can ask which FMI function one of its methods is in.
 
+    ``names`` has the FMI functions whose name is not the prefix and the name of the method, by the name of the method.
+
     Example:
         >>> import threading
         >>> from types import SimpleNamespace
@@ -50,11 +52,6 @@ class FmpyCalls:
         >>> fmu = SimpleNamespace(enterEventMode=lambda: current_function(threading.get_ident()))
         >>> FmpyCalls(fmu, "fmi2", {}).enterEventMode()
         'fmi2EnterEventMode'
-
-    Args:
-        fmu: FMPy's object; its attributes are attributes of this, too.
-        prefix: the prefix of the FMI functions.
-        names: FMI functions whose name is not the prefix and the name of the method, by the name of the method.
     """
 
     def __init__(self, fmu: Any, prefix: str, names: Mapping[str, str]) -> None:  # noqa: ANN401 FMPy is untyped
@@ -77,12 +74,9 @@ def declared(library: FmuLibrary, name: str, prototype: Any) -> Any:  # noqa: AN
 
 
 def checked_function(library: FmuLibrary, symbols: str, name: str, prototype: Any) -> Any:  # noqa: ANN401 as above
-    """As `declared`, but a status above warning is an exception, as it is where FMPy calls.
+    """As `declared`, but a status above warning is an `FMICallException`, as it is where FMPy calls.
 
     Its symbol is ``symbols`` and ``name``; ``symbols`` begins with the model identifier in FMI 1.0.
-
-    Raises:
-        FMICallException: by the function: the FMU returned a status above warning.
     """
 
     def check(status: int, _function: object, _arguments: object) -> int:

@@ -7,41 +7,54 @@ multiplication. The caller enters and leaves event mode.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
 from fmpy.fmi3 import fmi3Float64, fmi3IntervalQualifier, fmi3ValueReference
 
 from ...simtime import resolvable
 from ...variables.model_description import Clock
+from .fmu_values import SolverFailed
 
-__all__ = ["NO_CLOCKS", "Clocks"]
+__all__ = ["EVENT_ITERATIONS", "NO_CLOCKS", "Clocks", "EventInfo", "updated"]
+
+EVENT_ITERATIONS: Final = 1000
+"""After this many event iterations, or events at the same time, a model does not converge."""
 
 _INTERVAL_CHANGED: Final = 2
 _PERIODIC: Final = ("constant", "fixed", "tunable")
 _APERIODIC: Final = ("changing", "countdown")
 
 
+class EventInfo(NamedTuple):
+    """What one event iteration returns (FMI 2.0, 3.2.2: fmi2EventInfo)."""
+
+    again: bool  # the iteration has not converged yet
+    terminate: bool  # the FMU asks to end the simulation
+    next_event: float  # time of the next time event in s; infinite if there is none
+
+
+def updated(fmu: Any) -> EventInfo:  # noqa: ANN401 FMPy is untyped
+    """One event iteration of FMI 3.0 (fmi3UpdateDiscreteStates)."""
+    again, terminate, _nominals, _states, defined, time = fmu.updateDiscreteStates()
+    return EventInfo(bool(again), bool(terminate), float(time) if defined else math.inf)
+
+
 class Clocks:
     """The clocks of one instance.
 
-    Attributes:
-        next_tick: time of the next tick of an input clock in s; infinite if there is none.
-        ticked: the output clocks that have ticked since this was last emptied.
-
-    Call sequence: `start` in Initialization Mode; then in every event mode `set_due`, after each update of the discrete
-    states `read`, and at its end `update_intervals`.
-
-    Raises:
-        FMICallException: by every method: the FMU did not return OK.
+    Call sequence: `start` in Initialization Mode; then `settle` in every event mode. Each raises `FMICallException` if
+    the FMU does not return OK.
     """
 
     def __init__(self, fmu: Any, clocks: Sequence[Clock]) -> None:  # noqa: ANN401 FMPy is untyped
         inputs = [clock for clock in clocks if clock.causality == "input"]
-        self.next_tick = math.inf
-        self.ticked: set[str] = set()
+        self.next_tick = math.inf  # of an input clock in s; infinite if there is none
+        self.ticked: set[str] = set()  # the output clocks that have ticked since this was last emptied
         self._fmu = fmu
-        self._periodic = [_Periodic(clock) for clock in inputs if clock.interval_variability in _PERIODIC]
+        self._periodic = [clock for clock in inputs if clock.interval_variability in _PERIODIC]
+        self._ticks = [0] * len(self._periodic)  # of each, so far
+        self._first_and_interval = [(0.0, math.inf)] * len(self._periodic)  # of each: the time of tick 0, both in s
         self._aperiodic = {
             clock.value_reference: math.inf for clock in inputs if clock.interval_variability in _APERIODIC
         }
@@ -53,31 +66,49 @@ class Clocks:
 
     def start(self, time: float) -> None:
         """In Initialization Mode at ``time`` (s): ask for the intervals that depend on parameters."""
-        for clock in self._periodic:
-            clock.start(time, None if clock.is_known else self._interval_and_shift(clock.value_reference))
+        for number, clock in enumerate(self._periodic):
+            interval, shift = clock.interval or math.inf, clock.shift
+            if clock.interval is None:
+                shifts = (fmi3Float64 * 1)()
+                interval, _ = self._interval(clock.value_reference)
+                self._fmu.getShiftDecimal(_references(clock.value_reference), shifts)
+                shift = float(shifts[0])
+            self._first_and_interval[number] = time + shift, interval
         self._find_next()
 
     @property
     def place(self) -> tuple[float | None, ...]:
         """The ticks of each periodic clock, then the next tick of each aperiodic one in s; None if it has none."""
         aperiodic = (tick if math.isfinite(tick) else None for tick in self._aperiodic.values())
-        return (*(float(clock.ticks) for clock in self._periodic), *aperiodic)
+        return (*map(float, self._ticks), *aperiodic)
 
     def resume(self, place: Sequence[float | None]) -> None:
         """Continue where `place` was."""
-        for clock, ticks in zip(self._periodic, place, strict=False):
-            clock.resume(int(ticks or 0))
+        self._ticks = [int(ticks or 0) for ticks in place[: len(self._periodic)]]
         for reference, tick in zip(self._aperiodic, place[len(self._periodic) :], strict=True):
             self._aperiodic[reference] = math.inf if tick is None else tick
         self._find_next()
 
-    def set_due(self, time: float) -> None:
-        """In event mode: activate every input clock whose tick is at ``time`` (s)."""
+    def settle(self, time: float, update: Callable[[], EventInfo]) -> EventInfo:
+        """In event mode at ``time`` (s): let clocks tick, and ``update`` the discrete states until they are settled."""
+        self._set_due(time)
+        for _ in range(EVENT_ITERATIONS):
+            info = update()
+            self._read()
+            if info.terminate:
+                return info
+            if not info.again:
+                self._update_intervals(time)
+                return info
+        raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {EVENT_ITERATIONS} updates")
+
+    def _set_due(self, time: float) -> None:
+        """Activate every input clock whose tick is at ``time`` (s)."""
         due = []
-        for clock in self._periodic:
-            if not resolvable(time, clock.next_tick):
-                due.append(clock.value_reference)
-                clock.tick()
+        for number, tick in enumerate(self._next_ticks()):
+            if not resolvable(time, tick):
+                due.append(self._periodic[number].value_reference)
+                self._ticks[number] += 1
         for reference, tick in self._aperiodic.items():
             if not resolvable(time, tick):
                 due.append(reference)
@@ -86,13 +117,13 @@ class Clocks:
             self._fmu.setClock(due, [True] * len(due))
         self._find_next()
 
-    def read(self) -> None:
-        """In event mode: note which output clocks tick (FMI 3.0, 2.2.8.3)."""
+    def _read(self) -> None:
+        """Note which output clocks tick (FMI 3.0, 2.2.8.3)."""
         if self._outputs:
             active = self._fmu.getClock([clock.value_reference for clock in self._outputs])
             self.ticked.update(clock.name for clock, ticks in zip(self._outputs, active, strict=True) if ticks)
 
-    def update_intervals(self, time: float) -> None:
+    def _update_intervals(self, time: float) -> None:
         """At the end of event mode: ask when aperiodic clocks tick next (FMI 3.0, 2.2.8.4)."""
         for reference in self._aperiodic:
             interval, qualifier = self._interval(reference)
@@ -100,56 +131,18 @@ class Clocks:
                 self._aperiodic[reference] = time + interval
         self._find_next()
 
-    def _interval_and_shift(self, reference: int) -> tuple[float, float]:
-        interval, _ = self._interval(reference)
-        shifts = (fmi3Float64 * 1)()
-        self._fmu.getShiftDecimal(_references(reference), shifts)
-        return interval, float(shifts[0])
-
     def _interval(self, reference: int) -> tuple[float, int]:
         intervals, qualifiers = (fmi3Float64 * 1)(), (fmi3IntervalQualifier * 1)()
         self._fmu.getIntervalDecimal(_references(reference), intervals, qualifiers)
         return float(intervals[0]), int(qualifiers[0])
 
+    def _next_ticks(self) -> list[float]:
+        """The times of the next ticks of the periodic clocks in s."""
+        pairs = zip(self._ticks, self._first_and_interval, strict=True)
+        return [first + ticks * interval for ticks, (first, interval) in pairs]
+
     def _find_next(self) -> None:
-        ticks = [*(clock.next_tick for clock in self._periodic), *self._aperiodic.values()]
-        self.next_tick = min(ticks, default=math.inf)
-
-
-class _Periodic:
-    """A periodic input clock.
-
-    Attributes:
-        is_known: whether the model description has its interval.
-        ticks: number of ticks so far.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self.value_reference = clock.value_reference
-        self.is_known = clock.interval is not None
-        self.ticks = 0
-        self._interval = clock.interval or math.inf
-        self._shift = clock.shift
-        self._start = 0.0
-
-    def start(self, time: float, interval_and_shift: tuple[float, float] | None) -> None:
-        """Start at ``time``; all in s; None keeps the interval and shift of the model description."""
-        self._start = time
-        if interval_and_shift is not None:
-            self._interval, self._shift = interval_and_shift
-
-    def tick(self) -> None:
-        """Count a tick."""
-        self.ticks += 1
-
-    def resume(self, ticks: int) -> None:
-        """Continue after so many ticks."""
-        self.ticks = ticks
-
-    @property
-    def next_tick(self) -> float:
-        """Time of the next tick in s."""
-        return self._start + self._shift + self.ticks * self._interval
+        self.next_tick = min((*self._next_ticks(), *self._aperiodic.values()), default=math.inf)
 
 
 NO_CLOCKS: Final = Clocks(None, ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Final
@@ -9,42 +10,15 @@ from typing import Final
 import numpy as np
 
 from ...variables.value_types import Value
+from ..call_guard import call_named
 from .callbacks import FMI1_CALLBACKS, FMI3_LOGGER, fmi2_callbacks
+from .calls import checked_function
 from .fmu_instance import FmuInstance
 from .fmu_values import ValueFunctions
 
-__all__ = [
-    "FMI1_VALUES",
-    "FMI2_NAMES",
-    "FMI2_NEEDED",
-    "FMI2_VALUES",
-    "FMI3_NEEDED",
-    "FMI3_VALUES",
-    "Fmi1",
-    "Fmi2",
-    "Fmi3",
-]
+__all__ = ["Fmi1", "Fmi2", "Fmi3"]
 
-FMI1_VALUES: Final = ValueFunctions("fmi", np.int8, sized=False)  # a Boolean is a `char` (FMI 1.0 ME, 2.1.2)
-FMI2_VALUES: Final = ValueFunctions("fmi2", np.intc, sized=False)
-FMI3_VALUES: Final = ValueFunctions("fmi3", np.uint8, sized=True)
-FMI2_NAMES: Final = {
-    "instantiate": "fmi2Instantiate",
-    "getFMUState": "fmi2GetFMUstate",
-    "setFMUState": "fmi2SetFMUstate",
-    "freeFMUState": "fmi2FreeFMUstate",
-    "serializeFMUState": "fmi2SerializeFMUstate",
-    "deserializeFMUState": "fmi2DeSerializeFMUstate",
-}
-"""FMI functions whose name does not follow from the name of FMPy's method, by that name."""
-FMI2_NEEDED: Final = (
-    "fmi2Instantiate",
-    "fmi2SetupExperiment",
-    "fmi2EnterInitializationMode",
-    "fmi2ExitInitializationMode",
-)
-FMI3_NEEDED: Final = ("fmi3EnterInitializationMode", "fmi3ExitInitializationMode")
-"""The functions that co-simulation and model exchange need, and so above for FMI 2.0."""
+_TERMINATE: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 
 
 class Fmi1(FmuInstance):
@@ -55,7 +29,10 @@ class Fmi1(FmuInstance):
     Mode is left; inputs that are set later hold from the first step on.
     """
 
+    VALUES = ValueFunctions("fmi", np.int8, sized=False)  # a Boolean is a `char` (FMI 1.0 ME, 2.1.2)
+
     _initialized = False
+    _end: str  # the function that ends the simulation, after the prefix
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name; before the end of Initialization Mode this initializes the instance."""
@@ -82,6 +59,10 @@ class Fmi1(FmuInstance):
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """Call the function of FMI that initializes (times in s)."""
 
+    def _terminate(self) -> None:
+        function = checked_function(self._fmu.dll, self._symbols, self._end, _TERMINATE)
+        call_named(f"fmi{self._end}", function, self._component)
+
     def _end_run(self, *, resets: bool) -> bool:
         """As in the state machine of FMI 1.0 for co-simulation, fmiResetSlave takes the place of fmiTerminateSlave."""
         return (resets and self._model.reset()) or super()._end_run(resets=False)
@@ -89,6 +70,25 @@ class Fmi1(FmuInstance):
 
 class Fmi2(FmuInstance):
     """An FMI 2.0 instance."""
+
+    VALUES = ValueFunctions("fmi2", np.intc, sized=False)
+    NAMES: Final = {
+        "instantiate": "fmi2Instantiate",
+        "getFMUState": "fmi2GetFMUstate",
+        "setFMUState": "fmi2SetFMUstate",
+        "freeFMUState": "fmi2FreeFMUstate",
+        "serializeFMUState": "fmi2SerializeFMUstate",
+        "deserializeFMUState": "fmi2DeSerializeFMUstate",
+    }
+    """FMI functions whose name does not follow from the name of FMPy's method, by that name."""
+
+    NEEDED: Final = (
+        "fmi2Instantiate",
+        "fmi2SetupExperiment",
+        "fmi2EnterInitializationMode",
+        "fmi2ExitInitializationMode",
+    )
+    """The functions that co-simulation and model exchange need."""
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(callbacks=fmi2_callbacks(id(self._model)), **arguments)
@@ -100,19 +100,19 @@ class Fmi2(FmuInstance):
         self.set_values(start_values)
         self._checked(self._fmu.enterInitializationMode)
 
-    def _exit_initialization(self) -> None:
-        self._checked(self._fmu.exitInitializationMode)
-
 
 class Fmi3(FmuInstance):
     """An FMI 3.0 instance."""
+
+    VALUES = ValueFunctions("fmi3", np.uint8, sized=True)
+    NEEDED: Final = ("fmi3EnterInitializationMode", "fmi3ExitInitializationMode")
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(logMessage=FMI3_LOGGER, **arguments)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """Structural parameters in Configuration Mode, then all others (FMI 3.0, 2.3.3 and 2.3.2)."""
-        structural = {v.name for v in self._description.with_causality("structuralParameter")}
+        structural = {v.name for v in self.description.with_causality("structuralParameter")}
         sizes = {name: value for name, value in start_values.items() if name in structural}
         if sizes:
             self._checked(self._fmu.enterConfigurationMode)
@@ -121,6 +121,3 @@ class Fmi3(FmuInstance):
         self.set_values({name: value for name, value in start_values.items() if name not in structural})
         times = {"startTime": start_time, "stopTime": stop_time}
         self._checked(lambda: self._fmu.enterInitializationMode(tolerance=self._tolerance(), **times))
-
-    def _exit_initialization(self) -> None:
-        self._checked(self._fmu.exitInitializationMode)

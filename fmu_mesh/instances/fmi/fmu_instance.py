@@ -28,14 +28,13 @@ from ..call_guard import call_named, doing
 from ..contract import LogMessage
 from ..instance_wrapper import of_kind, packed, unpacked
 from ..kept_models import KeptModels
-from .archive.archive import Terms
 from .archive.system_libraries import missing_libraries
 from .buffers import BinaryBuffer, Buffer
 from .callbacks import recall, register, register_component, tell_counted, unregister
 from .calls import RowPointers, cffi_function, declared, memory, pointer
 from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
-from .step_options import StepOptions
+from .step_options import StepOptions, Terms
 
 __all__ = ["Bookkeeping", "FmuInstance", "LogSink"]
 
@@ -47,22 +46,14 @@ _OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
 class Bookkeeping(msgspec.Struct, frozen=True):
-    """What we know about an instance besides its FMU state.
+    """What we know about an instance besides its FMU state."""
 
-    Attributes:
-        step: own steps done; -1 in or before Initialization Mode.
-        time: the time of the FMU in s, where it does not follow from the step.
-        next_event: time of its next time event in s; None if there is none.
-        row: its held inputs.
-        ticks: the clocks; see `Clocks.place`.
-        last_event: time of its last event mode in s, where the steps depend on it; None if there was none.
-    """
-
-    step: int
-    time: float | None = None
-    next_event: float | None = None
-    row: tuple[bytes | list[Any], ...] = ()
-    ticks: tuple[float | None, ...] = ()
+    step: int  # own steps done; -1 in or before Initialization Mode
+    time: float | None = None  # the time of the FMU in s, where it does not follow from the step
+    next_event: float | None = None  # time of its next time event in s; None if there is none.
+    row: tuple[bytes | list[Any], ...] = ()  # its held inputs
+    ticks: tuple[float | None, ...] = ()  # the clocks; see `Clocks.place`
+    # time of its last event mode in s, where the steps depend on it; None if there was none.
     last_event: float | None = None
 
 
@@ -77,21 +68,17 @@ class FmuInstance(ABC):
     """One instance of an FMU; see `Instance` and `KeepsState` in `fmu_mesh.instances.contract`.
 
     Its arguments are those of `Opening`, and the ``terms`` of its archive and the ``options`` of its steps.
-
-    Raises:
-        LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
 
-    _functions: FmuFunctions
-    """Those of this version of FMI and this kind of FMU."""
+    _functions: FmuFunctions  # those of this version of FMI and this kind of FMU
 
-    _component: int
-    """The address of the instance, for functions called through ctypes; ``_self`` is the same for cffi."""
+    _component: int  # the address of the instance, for functions called through ctypes; ``_self`` is the same for cffi
 
-    _solver = ""
-    """What the error of a solver begins with."""
+    _solver = ""  # what the error of a solver begins with
 
-    _description: ModelDescription
+    description: ModelDescription
+    """The model description; arrays have the shapes that the structural parameters give them."""
+
     _variables: Mapping[str, Variable]
 
     def __init__(  # noqa: PLR0913, PLR0917 what an instance is made of; all of it is named where it is called
@@ -136,11 +123,6 @@ class FmuInstance(ABC):
             raise LoadFailed(f"'{path}' cannot be instantiated: {text}{self._message()}", instance=name) from error
 
     @property
-    def description(self) -> ModelDescription:
-        """The model description; arrays have the shapes that the structural parameters give them."""
-        return self._description
-
-    @property
     def changes_process(self) -> bool:
         """See `ChangesProcess`."""
         return self._model.changes_process
@@ -153,7 +135,7 @@ class FmuInstance(ABC):
         Binary values may be base64 as in a configuration.
         """
         self._check_live()
-        self._describe(self._description.sized(start_values))
+        self._describe(self.description.sized(start_values))
         values = {name: to_value(value, self._variables[name]) for name, value in start_values.items()}
         self._enter_initialization(start_time, stop_time, values)
         self._state = "initialization"
@@ -209,6 +191,13 @@ class FmuInstance(ABC):
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
 
     @abstractmethod
+    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
+        """Set the slopes of Real inputs within the next step, in 1/s (FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives).
+
+        If ``continuous``, no input jumps at the start of the step, apart from the error of an extrapolation.
+        """
+
+    @abstractmethod
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
 
@@ -218,7 +207,8 @@ class FmuInstance(ABC):
             return
         was_reset = False
         if self._live and self._state == "stepping":
-            was_reset = self._end_run(resets=self._kept is not None and (self._kept.resets or self._only_once))
+            resets = self._kept is not None and (self._kept.resets or self.description.only_once_per_process)
+            was_reset = self._end_run(resets=resets)
         elif self._live:
             self._quietly(self._release)
         self._leave_model(was_reset=was_reset)
@@ -255,11 +245,7 @@ class FmuInstance(ABC):
         return packed(own.kept, self._on_state(lambda: self._fmu.serializeFMUState(own.handle)))
 
     def deserialize_state(self, data: bytes) -> FmuState:
-        """See `KeepsState`.
-
-        Raises:
-            FmuMeshError: ``data`` is no state of an instance.
-        """
+        """See `KeepsState`."""
         self._check_state(self.description.can_serialize_state, "serialize its state")
         kept, rest = unpacked(data, Bookkeeping, self.name)
         return FmuState(self._on_state(lambda: self._fmu.deserializeFMUState(rest)), kept)
@@ -293,9 +279,9 @@ class FmuInstance(ABC):
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """Set the start values and enter Initialization Mode."""
 
-    @abstractmethod
     def _exit_initialization(self) -> None:
         """Leave Initialization Mode."""
+        self._checked(self._fmu.exitInitializationMode)
 
     def _terminate(self) -> None:
         """End the simulation."""
@@ -333,7 +319,7 @@ class FmuInstance(ABC):
             or not self._live
             or self._state == "failed"
             or model.is_lost
-            or (self._only_once and not was_reset)
+            or (self.description.only_once_per_process and not was_reset)
         ):
             model.close()
             return
@@ -341,13 +327,9 @@ class FmuInstance(ABC):
             model.free()
         self._kept.keep(self.name, model)
 
-    @property
-    def _only_once(self) -> bool:
-        return self._description.only_once_per_process
-
     def _tolerance(self) -> float | None:
         """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""
-        return self._options.tolerance or self._description.default_experiment.tolerance
+        return self._options.tolerance or self.description.default_experiment.tolerance
 
     def _bookkeeping(self) -> Bookkeeping:
         return Bookkeeping(self._said.step)
@@ -357,14 +339,14 @@ class FmuInstance(ABC):
         self._state = "stepping"
 
     def _describe(self, description: ModelDescription) -> None:
-        self._description = description
+        self.description = description
         self._variables = {variable.name: variable for variable in description.variables}
 
     def _check_functions(self) -> None:
         """Refuse a library without a function that every run needs; others may be missing until they are called."""
         names = {*self._functions.needed}
-        names |= {self._function_name("Get", variable.type) for variable in self._description.with_causality("output")}
-        names |= {self._function_name("Set", variable.type) for variable in self._description.with_causality("input")}
+        names |= {self._function_name("Get", variable.type) for variable in self.description.with_causality("output")}
+        names |= {self._function_name("Set", variable.type) for variable in self.description.with_causality("input")}
         missing = self._fmu.dll.missing  # in FMI 1.0 with the model identifier before the name
         if lacking := sorted(name for name in names if any(one.endswith(name) for one in missing)):
             raise RuntimeError(f"its library has no function {', '.join(lacking)}, which every run needs")

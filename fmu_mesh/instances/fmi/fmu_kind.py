@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from msgspec import Meta
 from msgspec.structs import replace
@@ -21,10 +21,7 @@ from ...errors import LoadFailed
 from ...system.process_sharing import Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
-from .step_options import SolverSettings, StepOptions
-
-if TYPE_CHECKING:
-    from .archive.archive import Terms
+from .step_options import SolverSettings, StepOptions, Terms
 
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
@@ -171,14 +168,12 @@ class FmuKind(Kind[FmuConfig]):
         self, path: Path, section: FmuConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
         """Read the model description; compile the FMU if it has no binary for this platform."""
-        from .archive.archive import Terms  # noqa: PLC0415  FMPy is slow to import
-        from .archive.sources import describe  # noqa: PLC0415  as above
+        from .archive.sources import describe  # noqa: PLC0415  FMPy is slow to import
 
         return describe(path, Terms(limits, section.sha256), section.kind, tell)
 
     def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
         """Look for the libraries of the system that the FMU needs."""
-        from .archive.archive import Terms  # noqa: PLC0415  as above
         from .archive.system_libraries import missing_libraries  # noqa: PLC0415  as above
 
         if description.library and (missing := missing_libraries(path, description.library, Terms(limits))):
@@ -192,7 +187,7 @@ class FmuKind(Kind[FmuConfig]):
 
     def claims(self, path: Path, section: FmuConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """What the libraries of the FMU have that a process has only once; nothing of those that are compiled here."""
-        from .archive.archive import Terms, opened  # noqa: PLC0415  as above
+        from .archive.archive import opened  # noqa: PLC0415  as above
         from .archive.library_names import claims_of  # noqa: PLC0415  as above
 
         if description.library is None:
@@ -208,7 +203,8 @@ class FmuKind(Kind[FmuConfig]):
         """Extract the FMU."""
         from .archive.sources import prepare  # noqa: PLC0415  as above
 
-        prepare(opening.path, opening.folder, _terms(opening), opening.description)
+        terms = Terms(opening.limits, opening.section.sha256, opening.content)
+        prepare(opening.path, opening.folder, terms, opening.description)
 
     def open(self, opening: Opening[FmuConfig]) -> Instance:
         """Extract, load and instantiate the FMU."""
@@ -222,19 +218,12 @@ class FmuKind(Kind[FmuConfig]):
             linear_inputs=opening.linear_inputs,
             deep_binding=section.deep_binding,
         )
-        path, folder, terms = opening.path, opening.folder, _terms(opening)
+        path, folder, terms = opening.path, opening.folder, Terms(opening.limits, section.sha256, opening.content)
         instance = open_instance(path, opening.name, description, folder, opening.log, terms, options, opening.kept)
         return stepped(instance, options)
 
 
-KIND_OF_FMUS = FmuKind()
-"""What the entry point `fmu` names."""
-
-
-def _terms(opening: Opening[FmuConfig]) -> Terms:
-    from .archive.archive import Terms  # noqa: PLC0415  as above
-
-    return Terms(opening.limits, opening.section.sha256, opening.content)
+KIND_OF_FMUS = FmuKind()  # what the entry point `fmu` names
 
 
 def _takes_no_tolerance(description: ModelDescription) -> tuple[str, str] | None:

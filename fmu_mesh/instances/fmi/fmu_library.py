@@ -95,17 +95,10 @@ _PROCESS: Final = _Library(None)
 
 
 class FmuLibrary(_Library):
-    """The library of one FMU.
-
-    Attributes:
-        missing: the functions that were asked for and that it does not have.
-
-    Raises:
-        OSError: it cannot be loaded.
-    """
+    """The library of one FMU; `OSError` if it cannot be loaded."""
 
     def __init__(self, path: Path, *, deep_binding: bool) -> None:
-        self.missing: set[str] = set()
+        self.missing: set[str] = set()  # the functions that were asked for and that it does not have
         self._folder = f"{path.parents[2]}/".encode()
         # A sanitizer ends a process that binds deeply.
         mode = _DEEP_BINDING if deep_binding and not hasattr(_PROCESS, "__asan_init") else 0

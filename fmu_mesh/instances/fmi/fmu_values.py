@@ -43,17 +43,12 @@ class SolverFailed(Exception):
 
 
 class ValueFunctions(NamedTuple):
-    """The functions of one version of FMI that get and set values, a pair for each type.
+    """The functions of one version of FMI that get and set values, a pair for each type."""
 
-    Attributes:
-        prefix: what the names of all functions begin with.
-        boolean: the C type of a Boolean.
-        sized: whether they also take the number of values, and each type has its own (FMI 3.0, 2.2.6 and 2.2.7);
-            otherwise an Enumeration is an `int` (FMI 2.0, 2.1.2).
-    """
-
-    prefix: str
-    boolean: type[Any]
+    prefix: str  # what the names of all functions begin with
+    boolean: type[Any]  # the C type of a Boolean
+    # whether they also take the number of values, and each type has its own (FMI 3.0, 2.2.6 and 2.2.7); otherwise an
+    # Enumeration is an `int` (FMI 2.0, 2.1.2)
     sized: bool
 
     @property
@@ -91,31 +86,18 @@ class ValueFunctions(NamedTuple):
 
 
 class PartCall(NamedTuple):
-    """The call that moves one part of a row between a ring and the FMU.
+    """The call that moves one part of a row between a ring and the FMU."""
 
-    Attributes:
-        type: the type of the part.
-        variables: its variables.
-        array: the memory of the ring, of shape (rows, elements).
-        base: what `place` is relative to, in the tables of the library.
-        place: of the elements in the row, in bytes; for `RowBase.FIXED` the address of those of row 0.
-        sizes: the number of elements, if the function takes it; otherwise empty.
-        buffer: what the function of the FMU works on; None: on the ring itself.
-        function: the getter or setter.
-        references: its value references.
-        rows: pointers to the elements in the ring.
-    """
-
-    type: VariableType
-    variables: Sequence[Variable]
-    array: NDArray[Any]
-    base: RowBase
-    place: int
-    sizes: tuple[int, ...]
-    buffer: Buffer | None
-    function: Function
-    references: Pointer
-    rows: RowPointers
+    type: VariableType  # the type of the part
+    variables: Sequence[Variable]  # its variables
+    array: NDArray[Any]  # the memory of the ring, of shape (rows, elements)
+    base: RowBase  # what `place` is relative to, in the tables of the library
+    place: int  # of the elements in the row, in bytes; for `RowBase.FIXED` the address of those of row 0
+    sizes: tuple[int, ...]  # the number of elements, if the function takes it; otherwise empty
+    buffer: Buffer | None  # what the function of the FMU works on; None: on the ring itself.
+    function: Function  # the getter or setter
+    references: Pointer  # its value references
+    rows: RowPointers  # pointers to the elements in the ring
 
     @property
     def names(self) -> list[str]:

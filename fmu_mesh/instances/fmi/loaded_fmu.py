@@ -17,12 +17,12 @@ from fmpy.fmi1 import FMICallException
 from ...variables.model_description import ModelDescription
 from ..process_end import process_ends
 from ..process_state import FOLDER
-from .archive.archive import Terms
 from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
+from .step_options import Terms
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
 
@@ -38,20 +38,13 @@ mode is checked after each step anyway, but for its traps."""
 
 
 class FmuFunctions(NamedTuple):
-    """The functions of one version of FMI and one kind of FMU.
+    """The functions of one version of FMI and one kind of FMU."""
 
-    Attributes:
-        library: FMPy's class for them.
-        values: those that get and set values.
-        free: FMPy's method that frees an instance.
-        needed: the functions, without their prefix, that every run needs.
-        names: FMI functions whose name does not follow from the name of FMPy's method, by that name.
-    """
-
-    library: type[Any]
-    values: ValueFunctions
-    free: str
-    needed: tuple[str, ...]
+    library: type[Any]  # FMPy's class for them
+    values: ValueFunctions  # those that get and set values
+    free: str  # FMPy's method that frees an instance
+    needed: tuple[str, ...]  # the functions, without their prefix, that every run needs
+    # FMI functions whose name does not follow from the name of FMPy's method, by that name
     names: Mapping[str, str] = {}
 
 
@@ -73,24 +66,13 @@ class FmuToLoad(NamedTuple):
 
 
 class LoadedFmu:
-    """One FMU with a folder and a library of its own.
-
-    It is extracted below ``folder``, an existing private folder.
-
-    Attributes:
-        key: what it was made from.
-        calls: FMPy's object, once it is loaded.
-        has_instance: whether the FMU is instantiated.
-        is_lost: whether it has returned fatal.
-
-    Raises:
-        LoadFailed: the FMU cannot be extracted.
-    """
+    """One FMU with a library and a folder of its own, below ``folder``; `LoadFailed` if it cannot be extracted."""
 
     def __init__(self, fmu: FmuToLoad, folder: Path) -> None:
         self.key = fmu.key
-        self.calls: Any = None
-        self.has_instance = self.is_lost = False
+        self.calls: Any = None  # FMPy's object, once it is loaded
+        self.has_instance = False
+        self.is_lost = False  # whether it has returned fatal
         self._fmu = fmu
         self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
         self._changes_process: bool | None = None
@@ -121,11 +103,7 @@ class LoadedFmu:
         return self._changes_process
 
     def instantiate(self, **arguments: object) -> None:
-        """Make an instance with these arguments for FMPy, if none is there that was reset.
-
-        Raises:
-            RuntimeError: there is no instance.
-        """
+        """Make an instance with these arguments for FMPy, if none is there that was reset."""
         if not self.has_instance:
             self.calls.instantiate(loggingOn=False, **arguments)
             self.has_instance = bool(self.calls.component)

@@ -8,14 +8,13 @@ from typing import Final, cast
 from ...variables.model_description import Kind, ModelDescription
 from ..contract import Instance
 from ..kept_models import KeptModels
-from .archive.archive import Terms
-from .co_simulation.extrapolation import LinearInputs, TakesDerivatives
+from .co_simulation.extrapolation import LinearInputs
 from .co_simulation.fmi1 import Fmi1Instance
 from .co_simulation.fmi2 import Fmi2Instance
 from .co_simulation.fmi3 import Fmi3Instance
 from .fmu_instance import FmuInstance, LogSink
 from .model_exchange.continuous import Fmi1ModelInstance, Fmi2ModelInstance, Fmi3ModelInstance
-from .step_options import StepOptions
+from .step_options import StepOptions, Terms
 
 __all__ = ["open_instance", "stepped"]
 
@@ -42,9 +41,6 @@ def open_instance(  # noqa: PLR0913, PLR0917 the parameters of `FmuInstance`
     """Extract the FMU at ``path`` below ``folder``, load it, and make the instance called ``name``.
 
     It has to keep to ``terms``. What an earlier instance of this name has ``kept`` is used again.
-
-    Raises:
-        LoadFailed: the FMU cannot be extracted, loaded or instantiated.
     """
     kind = cast("Kind", description.kind)
     return _CLASSES[description.fmi_version[0], kind](path, name, description, folder, log, terms, options, kept)
@@ -54,4 +50,4 @@ def stepped(instance: FmuInstance, options: StepOptions) -> Instance:
     """The instance with linear inputs if it has some; ``instance`` stays the one to close."""
     if not options.linear_inputs:
         return instance
-    return LinearInputs(cast("TakesDerivatives", instance), options.linear_inputs)
+    return LinearInputs(instance, options.linear_inputs)

@@ -6,37 +6,34 @@ from typing import Literal
 
 import msgspec
 
+from ...config.mesh import LimitsConfig
 from ...system.linear_inputs import LinearInput
 
-__all__ = ["SolverSettings", "StepOptions"]
+__all__ = ["SolverSettings", "StepOptions", "Terms"]
+
+
+class Terms(msgspec.Struct, frozen=True):
+    """The conditions that an FMU must meet before it is used."""
+
+    limits: LimitsConfig = LimitsConfig()
+    sha256: str | None = None  # the SHA-256 that the configuration asks for, in hexadecimal digits
+    content: str | None = None  # what `content_of` returned when the run was planned
 
 
 class SolverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the continuous states of a model-exchange FMU are solved.
-
-    Attributes:
-        relative_tolerance: bound of the local error. The absolute tolerance of a state is this times its nominal value.
-        maximum_step_size: in s; None: at most the communication step.
-    """
+    """How the continuous states of a model-exchange FMU are solved."""
 
     name: Literal["cvode", "euler"] = "cvode"
+    # bound of the local error. The absolute tolerance of a state is this times its nominal value.
     relative_tolerance: float = 1e-6
-    maximum_step_size: float | None = None
+    maximum_step_size: float | None = None  # in s; None: at most the communication step.
 
 
 class StepOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How one instance is loaded and stepped. The configuration has been checked against what its FMU can do.
+    """How one instance is loaded and stepped. The configuration has been checked against what its FMU can do."""
 
-    Attributes:
-        solver: of a model-exchange FMU.
-        tolerance: relative tolerance for a co-simulation FMU; None: that of its default experiment.
-        retry_discarded_steps: whether a step that the FMU discards is repeated in smaller steps.
-        linear_inputs: the inputs whose connections are extrapolated.
-        deep_binding: whether the library finds its own functions and variables before those of the process.
-    """
-
-    solver: SolverSettings = SolverSettings()
-    tolerance: float | None = None
-    retry_discarded_steps: bool = False
-    linear_inputs: tuple[LinearInput, ...] = ()
-    deep_binding: bool = True
+    solver: SolverSettings = SolverSettings()  # of a model-exchange FMU
+    tolerance: float | None = None  # relative tolerance for a co-simulation FMU; None: that of its default experiment.
+    retry_discarded_steps: bool = False  # whether a step that the FMU discards is repeated in smaller steps
+    linear_inputs: tuple[LinearInput, ...] = ()  # the inputs whose connections are extrapolated
+    deep_binding: bool = True  # whether the library finds its own functions and variables before those of the process

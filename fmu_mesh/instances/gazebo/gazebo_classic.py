@@ -26,42 +26,25 @@ from numpy.typing import NDArray
 from ...errors import InitializationFailed, LoadFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
-from ...variables.model_description import ModelDescription, Value
+from ...variables.model_description import Value
 from ..body_axes import relative_velocity, to_body
 from ..world_variables import WorldVariable
-from .gazebo_process import PROGRAM_VARIABLE, GazeboGone, GazeboProcess, check_program
+from .gazebo_process import HOW_TO_GET_IT, GazeboGone, GazeboProcess
 from .gazebo_section import GazeboClassicConfig
 from .gazebo_world import JOINT_STATE, LINK_STATE, load_gazebo_world
 
-__all__ = ["GazeboClassicInstance", "check_gazebo_classic"]
+__all__ = ["GazeboClassicInstance"]
 
 Floats = NDArray[np.float64]
 
-HOW_TO_GET_IT = f"Build bridges/gazebo_classic and put it on the path, or its command into ${PROGRAM_VARIABLE}."
-
-
-def check_gazebo_classic() -> None:
-    """Check that worlds of Gazebo classic can be opened on this host.
-
-    Raises:
-        LoadFailed: they cannot; says why.
-    """
-    try:
-        check_program()
-    except GazeboGone as error:
-        raise LoadFailed(f"Gazebo classic does not run on this host: {error}", hint=HOW_TO_GET_IT) from error
-
 
 class GazeboClassicInstance:
-    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
-
-    Raises:
-        LoadFailed: the world cannot be read, or Gazebo does not start or does not load it.
-    """
+    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(self, path: Path, name: str, config: GazeboClassicConfig) -> None:
         self.name = name
         self._world = world = load_gazebo_world(path, config)
+        self.description = world.description
         self._config = config
         try:
             self._process = GazeboProcess(
@@ -70,11 +53,8 @@ class GazeboClassicInstance:
                 [link.scoped for link in world.links],
             )
         except GazeboGone as error:
-            raise LoadFailed(
-                f"Gazebo classic does not run '{path}': {error}",
-                instance=name,
-                hint=HOW_TO_GET_IT,
-            ) from error
+            text = f"Gazebo classic does not run '{path}': {error}"
+            raise LoadFailed(text, instance=name, hint=HOW_TO_GET_IT) from error
         joints, links = len(world.joints), len(world.links)
         self._arrays: dict[str, Floats] = {
             "state": np.array(self._process.state, dtype=np.float64),
@@ -92,11 +72,6 @@ class GazeboClassicInstance:
         driven = {actuator.joint for actuator in config.actuators if actuator.enabled}
         self._direct = np.array([joint.name not in driven for joint in world.joints], dtype=bool)
         self._check_state()
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._world.description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ... import files
 from ...config.mesh import LimitsConfig
+from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .gazebo_section import GazeboClassicConfig
@@ -34,9 +35,12 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
 
     def check_engine(self) -> None:
         """Check that Gazebo classic runs on this host."""
-        from .gazebo_classic import check_gazebo_classic  # noqa: PLC0415  as above
+        from .gazebo_process import HOW_TO_GET_IT, GazeboGone, check_program  # noqa: PLC0415  as above
 
-        check_gazebo_classic()
+        try:
+            check_program()
+        except GazeboGone as error:
+            raise LoadFailed(f"Gazebo classic does not run on this host: {error}", hint=HOW_TO_GET_IT) from error
 
     def open(self, opening: Opening[GazeboClassicConfig]) -> Instance:
         """Start Gazebo with the world."""
@@ -45,5 +49,4 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
         return GazeboClassicInstance(opening.path, opening.name, opening.section)
 
 
-KIND_OF_GAZEBO_CLASSIC = GazeboClassicKind()
-"""What the entry point `gazebo_classic` names."""
+KIND_OF_GAZEBO_CLASSIC = GazeboClassicKind()  # what the entry point `gazebo_classic` names

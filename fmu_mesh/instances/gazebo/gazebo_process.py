@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 
-__all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
+__all__ = ["HOW_TO_GET_IT", "PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
 
 # Which processes meet here: the node and one Gazebo, over pipes (ADR 21). Gazebo ends when its standard input ends, so
 # it needs no signal when the node is killed. What it writes to standard error goes to a file: nobody reads it during a
@@ -27,6 +27,8 @@ __all__ = ["PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "
 
 PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
 """The environment variable with the command of the lock-step program, as a shell would split it."""
+
+HOW_TO_GET_IT = f"Build bridges/gazebo_classic and put it on the path, or its command into ${PROGRAM_VARIABLE}."
 
 PROGRAM = "gazebo_lockstep"
 
@@ -40,11 +42,7 @@ class GazeboGone(Exception):
 
 
 def find_program() -> list[str]:
-    """The command of the lock-step program: ``$FMU_MESH_GAZEBO``, or ``gazebo_lockstep`` on the path.
-
-    Raises:
-        GazeboGone: there is none.
-    """
+    """The command of the lock-step program: ``$FMU_MESH_GAZEBO``, or ``gazebo_lockstep`` on the path."""
     command = shlex.split(os.environ.get(PROGRAM_VARIABLE, "")) or [PROGRAM]
     if shutil.which(command[0]) is None:
         raise GazeboGone(f"there is no '{command[0]}'")
@@ -52,11 +50,7 @@ def find_program() -> list[str]:
 
 
 def check_program() -> None:
-    """Check that the lock-step program starts on this host, without a world.
-
-    Raises:
-        GazeboGone: it does not, or does not answer.
-    """
+    """Check that the lock-step program starts on this host, without a world; `GazeboGone` if not."""
     try:
         done = subprocess.run(
             find_program(),
@@ -75,21 +69,10 @@ def check_program() -> None:
 
 
 class GazeboProcess:
-    """One world in one process.
+    """One world in one process: ``joints`` are scoped names, and whether they have no limits, ``links`` scoped names.
 
-    Call sequence: the constructor, which loads the world and leaves its state in ``state``; then `set_step_size` and
-    `step`; at the end, and after any exception, `close`.
-
-    Args:
-        text: the SDF file.
-        joints: scoped name, and whether it has no limits.
-        links: scoped names.
-
-    Attributes:
-        state: the last state, as the protocol has it.
-
-    Raises:
-        GazeboGone: by every method but `close`.
+    Call sequence: the constructor, which loads the world and leaves its state, as the protocol has it, in ``state``;
+    then `set_step_size` and `step`; at the end, and after any exception, which is `GazeboGone`, `close`.
     """
 
     def __init__(self, text: bytes, joints: Sequence[tuple[str, bool]], links: Sequence[str]) -> None:

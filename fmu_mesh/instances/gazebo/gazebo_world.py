@@ -26,7 +26,7 @@ from ...archives.safe_xml import safe_xml
 from ...errors import LoadFailed
 from ...files import opened
 from ...variables.model_description import DefaultExperiment, ModelDescription
-from ..world_variables import WorldVariable, joint_variables, numbered, world_input, world_output
+from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input
 from .gazebo_section import GazeboClassicConfig
 
 __all__ = ["GazeboJoint", "GazeboLink", "GazeboWorld", "load_gazebo_world"]
@@ -58,51 +58,21 @@ _GROUND = """
 
 
 class GazeboModel(msgspec.Struct, frozen=True):
-    """A model, also one in another model.
+    """A model, also one in another model."""
 
-    Attributes:
-        scoped: the name in Gazebo, such as `outer::inner`.
-        moving: whether it is not static; Gazebo lets a model in a static one move.
-    """
-
-    scoped: str
+    scoped: str  # the name in Gazebo, such as `outer::inner`
     element: ET.Element
-    moving: bool
-
-
-class SdfWorld(msgspec.Struct, frozen=True):
-    """The file of a world.
-
-    Attributes:
-        text: the SDF that Gazebo gets; the unchanged file if nothing had to be changed.
-        source: the file.
-        element: the world as Gazebo gets it.
-        models: all models, outer ones first.
-        notes: parts that differ from the file or have no variables.
-    """
-
-    text: bytes
-    source: bytes
-    element: ET.Element
-    models: tuple[GazeboModel, ...]
-    notes: tuple[str, ...]
+    moving: bool  # whether it is not static; Gazebo lets a model in a static one move.
 
 
 class GazeboJoint(msgspec.Struct, frozen=True):
-    """A revolute or prismatic joint.
+    """A revolute or prismatic joint."""
 
-    Attributes:
-        scoped: the name in Gazebo, `model::joint`.
-        name: the name in variables.
-        effort_limit: largest absolute effort in N m or N; infinite without a limit.
-        free: whether it has no limits, whatever the file says.
-    """
-
-    scoped: str
-    name: str
+    scoped: str  # the name in Gazebo, `model::joint`
+    name: str  # the name in variables
     revolute: bool
-    effort_limit: float
-    free: bool
+    effort_limit: float  # largest absolute effort in N m or N; infinite without a limit
+    free: bool  # whether it has no limits, whatever the file says
 
 
 class GazeboLink(msgspec.Struct, frozen=True):
@@ -113,47 +83,37 @@ class GazeboLink(msgspec.Struct, frozen=True):
 
 
 class GazeboWorld(msgspec.Struct, frozen=True):
-    """A world.
+    """A world."""
 
-    Attributes:
-        text: the SDF that Gazebo gets.
-        step_size: of the engine in s.
-        places: the variables by name.
-    """
-
-    text: bytes
-    step_size: float
+    text: bytes  # the SDF that Gazebo gets
+    step_size: float  # of the engine in s
     joints: tuple[GazeboJoint, ...]
     links: tuple[GazeboLink, ...]
     description: ModelDescription
-    places: dict[str, WorldVariable]
+    places: dict[str, WorldVariable]  # the variables by name
 
 
 def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
-    """Read the world at ``path``.
-
-    Raises:
-        LoadFailed: it is no world that Gazebo could load without looking elsewhere.
-    """
-    sdf = _read(path)
-    step_size = _number(sdf.element.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
+    """Read the world at ``path``; `LoadFailed` if Gazebo could not load it without looking elsewhere."""
+    text, source, world, models, notes = _read(path)
+    step_size = _number(world.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
-    moving = [model for model in sdf.models if model.moving]
+    moving = [model for model in models if model.moving]
     joints, links = _joints(moving, free, path), _links(moving)
     variables = numbered(_variables(joints, links))
     description = ModelDescription(
-        model_name=sdf.element.get("name") or path.stem,
+        model_name=world.get("name") or path.stem,
         model_identifier="gazebo_classic",
         fmi_version="",
         kind="physics_engine",
-        guid=hashlib.sha256(sdf.source).hexdigest()[:32],
+        guid=hashlib.sha256(source).hexdigest()[:32],
         variables=tuple(own.variable for own in variables),
         generation_tool="Gazebo classic",
         default_experiment=DefaultExperiment(step_size=step_size),
-        problems=sdf.notes,
+        problems=tuple(notes),
     )
     places = {own.variable.name: own for own in variables}
-    return GazeboWorld(sdf.text, step_size, joints, links, description, places)
+    return GazeboWorld(text, step_size, joints, links, description, places)
 
 
 def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[GazeboJoint, ...]:
@@ -206,36 +166,24 @@ def _variables(joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]) -
 
 
 def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariable]:
-    in_state = (
-        ("position", "xyz", "m", "of the link's origin in world axes"),
-        ("orientation", "wxyz", "1", "attitude as a unit quaternion, link axes to world axes"),
-        ("linear_velocity", "xyz", "m/s", "of the link's origin, in world axes"),
-        ("angular_velocity", "xyz", "rad/s", "in world axes"),
-    )
-    for what, letters, unit, text in in_state:
-        for letter in letters:
-            yield world_output(f"{name}.{what}_{letter}", ("state", state), unit, text)
-            state += 1
-    for axis, letter in enumerate("xyz"):
-        place = 3 * number + axis
-        text = "velocity of the medium in link axes"
-        yield world_output(f"{name}.wind_{letter}", ("body_wind", place), "m/s", text)
-        text = "velocity of the link's origin against the medium in link axes"
-        yield world_output(f"{name}.relative_velocity_{letter}", ("relative_velocity", place), "m/s", text)
-        text = "acts at the link's origin, in link axes"
-        yield world_input(f"{name}.force_{letter}", ("wrench", 6 * number + axis), "N", text)
-        text = "acts about the link's origin, in link axes"
-        yield world_input(f"{name}.moment_{letter}", ("wrench", 6 * number + 3 + axis), "N.m", text)
+    in_state = {"position": 0, "orientation": 3, "linear_velocity": 7, "angular_velocity": 10}
+    places = {what: ("state", state + offset) for what, offset in in_state.items()}
+    places |= {"wind": ("body_wind", 3 * number), "relative_velocity": ("relative_velocity", 3 * number)}
+    places |= {"force": ("wrench", 6 * number), "moment": ("wrench", 6 * number + 3)}
+    variables = [*body_variables(name, "link", places)]
+    yield from variables[:LINK_STATE]
+    for axis in range(3):  # in the order of value references, all that is along x comes before y and z
+        yield from variables[LINK_STATE + axis :: 3]
 
 
 # --- reading the file
 
 
-def _read(path: Path) -> SdfWorld:
-    """Read the world at ``path``.
+def _read(path: Path) -> tuple[bytes, bytes, ET.Element, Sequence[GazeboModel], list[str]]:
+    """The world at ``path``: the text that Gazebo gets, and that of the file.
 
-    Raises:
-        LoadFailed: it is no world that Gazebo could simulate without looking elsewhere.
+    Then the element of the world as Gazebo gets it; all models, outer ones first; and the parts that differ from the
+    file or have no variables.
     """
     try:
         with opened(path) as file:
@@ -251,7 +199,7 @@ def _read(path: Path) -> SdfWorld:
     (world,) = worlds
     notes = list(_without_known_includes(world))
     _refuse_includes(world, path)
-    models = tuple(_models(world, ""))
+    models = [*_models(world, "")]
     _refuse_what_gazebo_leaves_out(world, models, path)
     changed = bool(notes)
     for joint in world.iter("joint"):
@@ -259,7 +207,7 @@ def _read(path: Path) -> SdfWorld:
             _make_revolute(joint)
             changed = True
     notes += _notes(world, models)
-    return SdfWorld(ET.tostring(root) if changed else source, source, world, models, tuple(notes))
+    return ET.tostring(root) if changed else source, source, world, models, notes
 
 
 def _models(parent: ET.Element, scope: str) -> Iterator[GazeboModel]:
@@ -299,7 +247,7 @@ def _refuse_includes(world: ET.Element, path: Path) -> None:
         )
 
 
-def _refuse_what_gazebo_leaves_out(world: ET.Element, models: tuple[GazeboModel, ...], path: Path) -> None:
+def _refuse_what_gazebo_leaves_out(world: ET.Element, models: Sequence[GazeboModel], path: Path) -> None:
     """Parts that Gazebo ignores although they change the motion; and names with spaces.
 
     A space ends a name in the protocol of Gazebo's process.
@@ -325,7 +273,7 @@ def _make_revolute(joint: ET.Element) -> None:
             limit.remove(end)
 
 
-def _notes(world: ET.Element, models: tuple[GazeboModel, ...]) -> Iterator[str]:
+def _notes(world: ET.Element, models: Sequence[GazeboModel]) -> Iterator[str]:
     for model in models:
         for joint in model.element.findall("joint"):
             name, kind = f"{model.scoped}::{joint.get('name')}", joint.get("type")

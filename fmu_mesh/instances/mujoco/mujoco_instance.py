@@ -27,18 +27,15 @@ from numpy.typing import NDArray
 from ...errors import InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
-from ...variables.model_description import ModelDescription, Value
+from ...variables.model_description import Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
-from ..contract import KeepsStateAsBytes
+from ..contract import KeepsStateAsBytes, LogMessage
 from ..world_variables import WorldVariable
 from .mujoco_section import MujocoConfig
 from .mujoco_world import engine, load_world, warnings
 from .rendering import Picture
 
 __all__ = ["MujocoInstance"]
-
-LogSink = Callable[[str, str, int], None]
-"""Takes status, text and own step of a message of the engine."""
 
 Floats = NDArray[np.float64]
 
@@ -49,23 +46,20 @@ _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
 
 
 class MujocoInstance(KeepsStateAsBytes):
-    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence.
-
-    Raises:
-        LoadFailed: MuJoCo is not installed, or cannot load the model.
-    """
+    """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
     def __init__(
         self,
         path: Path,
         name: str,
         config: MujocoConfig,
-        log: LogSink = lambda _status, _text, _step: None,
+        log: Callable[[LogMessage], None] = lambda _message: None,
         picture: Picture | None = None,
     ) -> None:
         self.name = name
         self._mujoco = engine()
         self._world = world = load_world(path, config)
+        self.description = world.description
         self._config = config
         self._log = log
         self._picture = picture
@@ -109,11 +103,6 @@ class MujocoInstance(KeepsStateAsBytes):
         self._bound = False
         self._set_limits()
 
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._world.description
-
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
@@ -139,7 +128,7 @@ class MujocoInstance(KeepsStateAsBytes):
             self._arrays[entry.where][entry.index] = value
             if entry.where == "effort_command" and not self._direct[entry.index] and self._bound:
                 text = f"'{name}' was set, but the joint has an actuator: set the actuator's own input"
-                self._log("warning", text, self._step)
+                self._warn(text)
         self._drive(self._entries[name] for name in values)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
@@ -195,11 +184,7 @@ class MujocoInstance(KeepsStateAsBytes):
         return b"".join(part.tobytes() for part in (state, *self._remembered()))
 
     def set_state(self, state: object) -> None:
-        """See `KeepsState`; also for a state of an equal instance.
-
-        Raises:
-            StepFailed: it is no state of this model.
-        """
+        """See `KeepsState`; also for a state of an equal instance."""
         assert isinstance(state, bytes)
         mujoco = self._mujoco
         kept = self._remembered()
@@ -265,11 +250,7 @@ class MujocoInstance(KeepsStateAsBytes):
             data.xfrc_applied[body] = (*acting, *about)
 
     def _look_at_warnings(self) -> None:
-        """Raise an error if the world cannot be computed any more; log all other warnings.
-
-        Raises:
-            StepFailed: names the input or the joint that is not finite or huge.
-        """
+        """Fail if the world cannot be computed any more, naming an input or a joint; log all other warnings."""
         texts = [" ".join(text.split()) for text in warnings]
         warnings.clear()
         kinds = self._mujoco.mjtWarning
@@ -278,7 +259,10 @@ class MujocoInstance(KeepsStateAsBytes):
             hint = "Are the inputs of this instance right? Otherwise a smaller step or more `physics_steps` may help."
             raise StepFailed(f"MuJoCo says: {' '.join(texts)}", instance=self.name, variable=self._culprit(), hint=hint)
         for text in texts:
-            self._log("warning", text, self._step)
+            self._warn(text)
+
+    def _warn(self, text: str) -> None:
+        self._log(LogMessage(self.name, "warning", "engine", text, self._step))
 
     def _culprit(self) -> str | None:
         """The first input that is not finite, or else the first joint with a huge acceleration."""

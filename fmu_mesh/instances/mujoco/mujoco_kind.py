@@ -17,7 +17,7 @@ from ...config.mesh import LimitsConfig
 from ...files import sha256_of
 from ...variables.model_description import ModelDescription
 from ..child_question import ask_description_of, described
-from ..contract import Instance, Kind, LogMessage, Opening, Showing
+from ..contract import Instance, Kind, Opening, Showing
 from .mujoco_section import MujocoConfig
 
 __all__ = ["KIND_OF_MUJOCO"]
@@ -70,11 +70,7 @@ class MujocoKind(Kind[MujocoConfig]):
         picture: Picture | None = Window() if opening.showing.view else None
         if opening.showing.video is not None:
             picture = Film(opening.showing.video, opening.name)
-
-        def log(status: str, text: str, step: int) -> None:
-            opening.log(LogMessage(opening.name, status, "engine", text, step))
-
-        return MujocoInstance(opening.path, opening.name, opening.section, log, picture)
+        return MujocoInstance(opening.path, opening.name, opening.section, opening.log, picture)
 
 
 def answer_to(request: str) -> bytes:
@@ -108,5 +104,4 @@ def _candidates(reference: str, folders: set[Path]) -> Iterator[Path]:
                 yield candidate
 
 
-KIND_OF_MUJOCO = MujocoKind()
-"""What the entry point `mujoco` names."""
+KIND_OF_MUJOCO = MujocoKind()  # what the entry point `mujoco` names

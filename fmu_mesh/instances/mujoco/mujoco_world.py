@@ -36,9 +36,9 @@ import msgspec
 from ...errors import LoadFailed
 from ...files import opened
 from ...installing import importing
-from ...text import listed, nearest
+from ...text import did_you_mean, listed
 from ...variables.model_description import DefaultExperiment, ModelDescription
-from ..world_variables import Place, WorldVariable, joint_variables, numbered, world_input, world_output
+from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input, world_output
 from .mujoco_section import MujocoConfig
 
 __all__ = ["World", "engine", "load_world", "warnings"]
@@ -53,28 +53,18 @@ _OF_DOFS = ("velocity", "acceleration", "effort_applied", "effort_command", "eff
 
 
 class World(msgspec.Struct, frozen=True):
-    """A loaded model.
+    """A loaded model."""
 
-    Attributes:
-        model: the `mujoco.MjModel`.
-        entries: all variables.
-        limits: (index of the joint's velocity, smallest, largest effort) of joints whose effort is limited.
-        keyframe: number of the keyframe to start from, or None.
-    """
-
-    model: Any
+    model: Any  # the `mujoco.MjModel`
     description: ModelDescription
-    entries: tuple[WorldVariable, ...]
+    entries: tuple[WorldVariable, ...]  # all variables
+    # (index of the joint's velocity, smallest, largest effort) of joints whose effort is limited
     limits: tuple[tuple[int, float, float], ...]
-    keyframe: int | None
+    keyframe: int | None  # number of the keyframe to start from, or None
 
 
 def load_world(path: Path, config: MujocoConfig) -> World:
-    """Load the model at ``path`` (MJCF or URDF).
-
-    Raises:
-        LoadFailed: MuJoCo is not installed, or cannot load the model; says why.
-    """
+    """Load the model at ``path`` (MJCF or URDF); `LoadFailed` if MuJoCo is not installed, or says why it cannot."""
     mujoco = engine()
     try:
         with opened(path) as file:
@@ -104,11 +94,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
 
 
 def engine() -> ModuleType:
-    """The module `mujoco`; it is imported on first use, because it is optional and slow to import.
-
-    Raises:
-        LibraryMissing: it is not installed.
-    """
+    """The module `mujoco`; it is imported on first use, because it is optional and slow to import."""
     with importing("mujoco", "worlds of MuJoCo"):
         import mujoco  # noqa: PLC0415  an extra, and slow to import
     mujoco.set_mju_user_warning(warnings.append)
@@ -122,9 +108,7 @@ def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: 
     names = [model.key(number).name for number in range(model.nkey)]
     if name in names:
         return names.index(name)
-    close = nearest(name, names)
-    hint = f"Did you mean '{close}'?" if close is not None else None
-    raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=hint)
+    raise LoadFailed(f"'{path}' has no keyframe '{name}', but {listed(names)}", hint=did_you_mean(name, names))
 
 
 def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
@@ -148,63 +132,46 @@ def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[W
 def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     positions = model.qpos0 if keyframe is None else model.key_qpos[keyframe]
     velocities = [0.0] * model.nv if keyframe is None else model.key_qvel[keyframe]
-    for number in range(model.njnt):
-        joint = model.joint(number)
-        revolute = joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
-        if not joint.name or not (revolute or joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE):
+    for joint in _of_one_axis(mujoco, model):
+        if not joint.name:
             continue
+        revolute = joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
         qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
         places = {what: (what, dof) for what in _OF_DOFS} | {"position": ("position", qpos)}
         start = {"position": float(positions[qpos]), "velocity": float(velocities[dof])}
         yield from joint_variables(joint.name, places, revolute=revolute, start=start)
 
 
+def _of_one_axis(mujoco: ModuleType, model: Any) -> list[Any]:  # noqa: ANN401  mujoco has no types
+    """The revolute and prismatic joints."""
+    types = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    return [joint for joint in map(model.joint, range(model.njnt)) if int(joint.type[0]) in types]
+
+
 def _bodies(model: Any) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     for number in range(_WORLD_BODY + 1, model.nbody):
-        name = model.body(number).name
-        if not name:
-            continue
-        in_world, place = "of the body's origin in world axes", 3 * number
-        yield from _vector(f"{name}.position", ("body_position", place), "m", in_world)
-        text = "attitude as a unit quaternion, body axes to world axes"
-        for part, letter in enumerate("wxyz"):
-            yield world_output(f"{name}.orientation_{letter}", ("body_orientation", 4 * number + part), "1", text)
-        yield from _vector(f"{name}.linear_velocity", ("linear_velocity", place), "m/s", in_world)
-        yield from _vector(f"{name}.angular_velocity", ("angular_velocity", place), "rad/s", "in world axes")
-        text = "velocity of the medium in body axes"
-        yield from _vector(f"{name}.wind", ("body_wind", place), "m/s", text, _WIND)
-        text = "velocity of the body's origin against the medium in body axes"
-        yield from _vector(f"{name}.relative_velocity", ("relative_velocity", place), "m/s", text, _WIND)
-        for offset, (what, unit, where) in enumerate((("force", "N", "at"), ("moment", "N.m", "about"))):
-            for axis, letter in enumerate("xyz"):
-                text = f"acts {where} the body's origin, in body axes"
-                yield world_input(f"{name}.{what}_{letter}", ("wrench", 6 * number + 3 * offset + axis), unit, text)
-
-
-def _vector(name: str, place: Place, unit: str, text: str, depends_on: tuple[str, ...] = ()) -> Iterator[WorldVariable]:
-    where, first = place
-    for axis, letter in enumerate("xyz"):
-        yield world_output(f"{name}_{letter}", (where, first + axis), unit, text, None, depends_on)
+        if name := model.body(number).name:
+            vectors = ("linear_velocity", "angular_velocity", "relative_velocity")
+            places = {what: (what, 3 * number) for what in vectors}
+            places |= {"position": ("body_position", 3 * number), "orientation": ("body_orientation", 4 * number)}
+            places |= {"force": ("wrench", 6 * number), "moment": ("wrench", 6 * number + 3)}
+            yield from body_variables(name, "body", {**places, "wind": ("body_wind", 3 * number)}, _WIND)
 
 
 def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types
-    for number in range(model.njnt):
-        joint = model.joint(number)
-        scalar = int(joint.type[0]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-        if scalar and model.jnt_actfrclimited[number] and joint.name not in free:
-            lower, upper = model.jnt_actfrcrange[number]
+    for joint in _of_one_axis(mujoco, model):
+        if model.jnt_actfrclimited[joint.id] and joint.name not in free:
+            lower, upper = model.jnt_actfrcrange[joint.id]
             yield int(joint.dofadr[0]), float(lower), float(upper)
 
 
 def _left_out(mujoco: ModuleType, model: Any, data: bytes) -> Iterator[str]:  # noqa: ANN401  mujoco has no types
     """Parts of the file that have no variables. A free joint needs none: its body has position and velocity."""
-    joints = [model.joint(number) for number in range(model.njnt)]
-    for joint in joints:
+    for joint in map(model.joint, range(model.njnt)):
         if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
             yield f"the joint '{joint.name}' is simulated, and has no variables, as it is a ball joint"
-    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     nameless = {
-        "joints": sum(not joint.name for joint in joints if int(joint.type[0]) in scalar),
+        "joints": sum(not joint.name for joint in _of_one_axis(mujoco, model)),
         "sensors": sum(not model.sensor(number).name for number in range(model.nsensor)),
         "actuators": sum(not model.actuator(number).name for number in range(model.nu)),
     }

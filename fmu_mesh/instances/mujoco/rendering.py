@@ -12,9 +12,10 @@ import logging
 import math
 import os
 import time
+from abc import ABC, abstractmethod
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from ... import files
 from ...errors import ConfigurationError, LoadFailed
@@ -35,32 +36,23 @@ WINDOW_RATE: Final = 60.0
 _BACKENDS = (("egl", "EGL"), ("osmesa", "OSMesa"))
 
 
-class Picture(Protocol):
+class Picture(ABC):
     """Shows a world. Call sequence: `show` at points, `finish` after the last one, `close` at the end of every run."""
 
+    @abstractmethod
     def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401  mujoco has no types
         """Show the world as it is at ``time_s``; may do nothing."""
-        ...
 
-    def finish(self) -> None:
-        """Complete the film: `show` is not called again.
+    def finish(self) -> None:  # noqa: B027 a window stays until the run has ended
+        """Complete the film: `show` is not called again; `LoadFailed` if it cannot be written."""
 
-        Raises:
-            LoadFailed: it cannot be written.
-        """
-        ...
-
+    @abstractmethod
     def close(self) -> None:
         """Release everything, also after a run that ended early. Never raises; may be called twice."""
-        ...
 
 
 def check_film(path: Path) -> None:
-    """See whether a film can be made, before a run.
-
-    Raises:
-        ConfigurationError: it cannot be a film, or something is not installed; says what.
-    """
+    """See whether a film can be made, before a run; `ConfigurationError` says what is missing."""
     if path.suffix not in FILM_RATES:
         raise ConfigurationError(f"`video={str(path)!r}`: a film is one of {', '.join(FILM_RATES)}")
     if files.is_folder(path):
@@ -70,23 +62,16 @@ def check_film(path: Path) -> None:
 
 
 def check_window() -> None:
-    """See whether a window can be opened, before a run.
-
-    Raises:
-        ConfigurationError: there is no screen.
-    """
+    """See whether there is a screen for a window, before a run; `ConfigurationError` if not."""
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigurationError("`view=True` needs a screen, and there is none.", hint="`video=...` needs none.")
 
 
-class Film:
+class Film(Picture):
     """A film file.
 
     A film is unreadable until it is complete. Until then, its file is `<name>.unfinished.mp4` in the same folder. A run
     that ends before the first step writes no film, and does not touch an older one.
-
-    Raises:
-        LoadFailed: the renderer cannot be started, or the file not be written.
     """
 
     def __init__(self, path: Path, instance: str) -> None:
@@ -166,7 +151,7 @@ class Film:
         return LoadFailed(f"the film '{self._path}' cannot be made: {reason}", instance=self._instance)
 
 
-class Window:
+class Window(Picture):
     """A window of MuJoCo's own viewer; when a person closes it, the run goes on.
 
     It shows a copy of the world, so that what a person does in the window does not change the run.
@@ -197,9 +182,6 @@ class Window:
         if self._viewer.is_running():
             engine().mj_copyData(self._data, model, data)
             self._viewer.sync()
-
-    def finish(self) -> None:
-        """Nothing to do: the window stays until the run has ended."""
 
     def close(self) -> None:
         """Close the window."""

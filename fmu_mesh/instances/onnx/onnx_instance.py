@@ -23,7 +23,7 @@ from ...errors import FmuError, InitializationFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...system.layout import Layout
-from ...variables.model_description import ModelDescription, Value
+from ...variables.model_description import Value
 from ...variables.value_conversion import to_value
 from ...variables.value_types import is_float
 from ..contract import KeepsStateAsBytes
@@ -42,6 +42,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self.name = name
         self._takes_nan = not_finite == "record"
         self._model = model
+        self.description = model.description
         self._variables = {variable.name: variable for variable in model.description.variables}
         self._values = Ring(Layout.of(model.description.variables), 1)
         self._tensors: dict[str, Array] = {t.variable.name: np.empty(t.sizes, t.dtype) for t in model.inputs}
@@ -53,11 +54,6 @@ class OnnxInstance(KeepsStateAsBytes):
         self._is_initialized = False
         self._is_computed = False
 
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._model.description
-
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:
@@ -65,11 +61,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self.set_values({name: to_value(value, self._variables[name]) for name, value in start_values.items()})
 
     def exit_initialization(self) -> None:
-        """Compute the outputs of the first point.
-
-        Raises:
-            InitializationFailed: for the reasons of `do_step`.
-        """
+        """Compute the outputs of the first point."""
         self._follow()
         self._is_initialized = True
 
@@ -80,11 +72,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self._is_computed = False
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
-        """Current values by name.
-
-        Raises:
-            InitializationFailed: for the reasons of `do_step`.
-        """
+        """Current values by name; those of outputs may have to be computed."""
         if any(self._variables[name].causality == "output" for name in names):
             self._follow()
         return [self._values.value(0, name) for name in names]
@@ -98,11 +86,7 @@ class OnnxInstance(KeepsStateAsBytes):
         self._write(step)
 
     def do_step(self, step: int) -> None:
-        """Take the inputs of row ``step``, compute the model, write the outputs to row ``step + 1``.
-
-        Raises:
-            StepFailed: an input or an output is not a number, or the model cannot be computed.
-        """
+        """Take the inputs of row ``step``, compute the model, write the outputs to row ``step + 1``."""
         for own, rows, columns, mask in self._takes:
             own[:] = rows[step & mask, columns]
         self._compute()
@@ -113,11 +97,7 @@ class OnnxInstance(KeepsStateAsBytes):
         return msgspec.msgpack.encode([part.tolist() for part in self._values.parts])
 
     def set_state(self, state: object) -> None:
-        """See `KeepsState`; also for a state of an equal instance.
-
-        Raises:
-            StepFailed: it is no state of this model.
-        """
+        """See `KeepsState`; also for a state of an equal instance."""
         assert isinstance(state, bytes)
         own = self._values.parts
         try:

@@ -72,5 +72,4 @@ def answer_to(request: str) -> bytes:
     return described(lambda: OnnxModel(Path(path), limits).description)
 
 
-KIND_OF_ONNX_MODELS = OnnxKind()
-"""What the entry point `onnx` names."""
+KIND_OF_ONNX_MODELS = OnnxKind()  # what the entry point `onnx` names

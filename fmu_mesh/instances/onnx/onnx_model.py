@@ -57,35 +57,20 @@ _NO_FOLDER = "/dev/null"
 
 
 class Tensor(msgspec.Struct, frozen=True):
-    """One input or output of a model.
+    """One input or output of a model."""
 
-    Attributes:
-        variable: what the mesh sees of it. An input of any floating-point type is a Float64, so that every
-            floating-point output can be connected to it; its value is rounded when the model is computed.
-        dtype: the type of the elements of the tensor.
-        sizes: the sizes of all its dimensions.
-    """
-
+    # what the mesh sees of it. An input of any floating-point type is a Float64, so that every floating-point output
+    # can be connected to it; its value is rounded when the model is computed.
     variable: Variable
-    dtype: Any
-    sizes: Sizes
+    dtype: Any  # the type of the elements of the tensor
+    sizes: Sizes  # the sizes of all its dimensions
 
 
 class OnnxModel:
-    """A model that onnxruntime computes on one thread.
+    """A model that onnxruntime computes on one thread; `LoadFailed` if that cannot, or no instance can be made of it.
 
-    Args:
-        path: the file.
-        limits: its `unpacked_bytes` is the largest size of the file.
-        content: the SHA-256 that the file has to have; None if it is not known.
-
-    Attributes:
-        inputs: in the order of the file.
-        outputs: in the order of the file.
-        description: the model description.
-
-    Raises:
-        LoadFailed: onnxruntime is not installed, it cannot load or compute the model, or no instance can be made of it.
+    ``content`` is the SHA-256 that the file has to have, None if it is not known; ``limits.unpacked_bytes`` its largest
+    size.
     """
 
     def __init__(
@@ -125,20 +110,12 @@ class OnnxModel:
         )
 
     def compute(self, inputs: Mapping[str, Array]) -> list[Array]:
-        """The outputs for these inputs, which have the types and sizes of their tensors.
-
-        Raises:
-            Exception: onnxruntime cannot compute them; its errors have no class in common.
-        """
+        """The outputs for inputs of the right types and sizes; the errors of onnxruntime have no class in common."""
         outputs: list[Array] = self._session.run(self._names, inputs)
         return outputs
 
     def _sizes_of_outputs(self, path: Path) -> list[Sizes]:
-        """What the sizes are when the model is computed; the file does not always say it.
-
-        Raises:
-            LoadFailed: the model cannot be computed, or gives other outputs for the same inputs.
-        """
+        """What the sizes are when the model is computed; the file does not always say it."""
         zeros = {
             tensor.variable.name: np.full(tensor.sizes, zero(tensor.variable.type), tensor.dtype)
             for tensor in self.inputs

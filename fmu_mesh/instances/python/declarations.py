@@ -251,11 +251,7 @@ class Output(Declared[T]):
 
     @overload
     def __init__(
-        self: Output[float],
-        start: float | None = None,
-        *,
-        type: FloatType = ...,
-        **details: Unpack[ScalarOutput],
+        self: Output[float], start: float | None = None, *, type: FloatType = ..., **details: Unpack[ScalarOutput]
     ) -> None: ...
     @overload
     def __init__(
@@ -275,11 +271,7 @@ class Output(Declared[T]):
     ) -> None: ...
     @overload
     def __init__(
-        self: Output[bytes],
-        start: bytes | None = None,
-        *,
-        type: BinaryType,
-        **details: Unpack[ScalarOutput],
+        self: Output[bytes], start: bytes | None = None, *, type: BinaryType, **details: Unpack[ScalarOutput]
     ) -> None: ...
     @overload
     def __init__(

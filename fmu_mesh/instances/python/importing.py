@@ -1,4 +1,4 @@
-"""Importing the class of a component: from a file, from an installed module, or as the program that is running has it.
+"""The class of a component: imported from a file, from a module, or as the running program has it; and described.
 
 A file is imported anew for each instance, under a name of its own, and so are the modules of its folder (`OwnModules`).
 So two instances share no global variables, whether they run in one process or in two.
@@ -15,8 +15,7 @@ import itertools
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from importlib.abc import FileLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import spec_from_file_location
@@ -24,14 +23,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, TypeGuard
 
+from msgspec.structs import replace
+
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
-from ...text import listed, nearest, short_path
-from ...variables.model_description import ModelDescription
-from .component import Component
-from .component_description import description_of
+from ...text import did_you_mean, listed, short_path
+from ...variables.model_description import ModelDescription, Variable
+from .component import Component, declared_variables
 from .python_section import ClassPlace, importing
 
-__all__ = ["ImportedComponent", "component_section"]
+__all__ = ["ImportedComponent", "check_arguments", "component_section", "description_of"]
 
 _OWN = Path(__file__).resolve().parents[2]
 _TEXT_CHARACTERS = 500
@@ -41,25 +41,16 @@ _numbers = itertools.count(1)
 class ImportedComponent:
     """The class of a component, imported for one instance.
 
-    ``path`` is the absolute path of its file; `Path()` for a module.
-
-    Raises:
-        Exception: whatever the code of the user raises; `told` says it in words.
-        CallRefused: there is no such class, or it is no component.
-
-    Attributes:
-        cls: the class; call `load` first.
-        description: its model description.
-        modules: those of its folder; call `forget_names` after each call into the component.
+    ``path`` is the absolute path of its file; `Path()` for a module. `load` raises whatever the code of the user
+    raises, which `told` says in words; and `CallRefused` if there is no such class, or it is no component.
     """
 
     def __init__(self, path: Path, target: ClassPlace) -> None:
-        self._path = path
         self._target = target
+        # Those of its folder; call `forget_names` after each call into the component.
         self.modules = OwnModules(path.parent)
         self._file = path if target.file else None
-        self.cls: type[Component] = Component
-        self.description: ModelDescription | None = None
+        self.cls: type[Component] = Component  # known after `load`
 
     @property
     def file(self) -> str | None:
@@ -73,20 +64,21 @@ class ImportedComponent:
         if not target.name.isidentifier():
             wanted = f"`{place}:Controller`, if the class is called Controller"
             raise CallRefused(f"'{place}' names no class at the top of the module, expected {wanted}")
-        with _marked(place):
+        token = importing.set(place)
+        try:
             if self._file is not None:
                 module, data = self._from_file(self._file)
             else:
                 module = importlib.import_module(target.module)
                 self._file = Path(module.__file__) if module.__file__ is not None else None
                 data = self._file.read_bytes() if self._file is not None else b""
+        finally:
+            importing.reset(token)
         found = getattr(module, target.name, None)
         if found is None:
             classes = [name for name, value in vars(module).items() if _is_component(value) and value is not Component]
-            suggestion = nearest(target.name, classes)
-            hint = f"Did you mean '{suggestion}'?" if suggestion else None
-            has = listed(classes, nothing="no component")
-            raise CallRefused(f"there is no '{target.name}' in '{place}', which has {has}", hint=hint)
+            text = f"there is no '{target.name}' in '{place}', which has {listed(classes, nothing='no component')}"
+            raise CallRefused(text, hint=did_you_mean(target.name, classes))
         if not _is_component(found):
             what = "function" if callable(found) and not isinstance(found, type) else type(found).__name__
             hint = "Put the decorator `fmu_mesh.component` before it." if what == "function" else None
@@ -94,8 +86,7 @@ class ImportedComponent:
                 what, hint = "class", "Derive it from `fmu_mesh.Component`."
             raise CallRefused(f"'{target.name}' in '{place}' is a {what} and no component", hint=hint)
         self.cls = found
-        self.description = description_of(found, hashlib.sha256(data).hexdigest())
-        return self.description
+        return description_of(found, hashlib.sha256(data).hexdigest())
 
     def told(self, error: BaseException) -> str:
         """An exception of the code of the user in one line, with the file and the line: `controller.py:12: ...`."""
@@ -141,15 +132,6 @@ class _SourceFile(FileLoader):
         return importlib.util.decode_source(self.data)
 
 
-@contextmanager
-def _marked(place: str) -> Iterator[None]:
-    token = importing.set(place)
-    try:
-        yield
-    finally:
-        importing.reset(token)
-
-
 def _is_component(value: object) -> TypeGuard[type[Component]]:
     return isinstance(value, type) and issubclass(value, Component)
 
@@ -157,11 +139,8 @@ def _is_component(value: object) -> TypeGuard[type[Component]]:
 def component_section(cls: object) -> tuple[dict[str, str], ModelDescription]:
     """The keys of the section of a class that a program has, and its model description.
 
-    Example:
-        ``component_section(Controller)[0]`` is ``{"python": "/home/me/controller.py:Controller"}``
-
-    Raises:
-        ConfigurationError: other processes cannot import the class; says what to do.
+    The keys are such as ``{"python": "/home/me/controller.py:Controller"}``. `ConfigurationError`: other processes
+    cannot import the class.
     """
     if not _is_component(cls):
         name = getattr(cls, "__name__", repr(cls))
@@ -188,6 +167,64 @@ def _cannot_import(cls: type, reason: str, hint: str) -> ConfigurationError:
     return ConfigurationError(f"other processes cannot import the component '{cls.__qualname__}': {reason}", hint=hint)
 
 
+# --- the description of a class
+
+
+def description_of(cls: type[Component], content: str) -> ModelDescription:
+    """The model description of a component class; `CallRefused` says why it cannot be one.
+
+    ``content`` is the SHA-256 of the file that defines it; processes that disagree about it refuse one another.
+    """
+    declared = declared_variables(cls)
+    if cls.step is Component.step:
+        raise CallRefused(f"'{cls.__name__}' has no method `step(self, time, step_size)`")
+    hidden = [name for name in declared if hasattr(Component, name)]
+    if hidden:
+        text = f"the variable '{hidden[0]}' of '{cls.__name__}' has the name of something that every component has"
+        raise CallRefused(text, hint="Give it another name.")
+    variables = tuple(own.variable(reference) for reference, own in enumerate(declared.values()))
+    inputs = [variable.name for variable in variables if variable.causality == "input"]
+    initializes = cls.initialize is not Component.initialize
+    return ModelDescription(
+        model_name=cls.__name__,
+        model_identifier=cls.__name__,
+        fmi_version="",
+        kind="component",
+        guid=f"{{{content}:{cls.__name__}}}",
+        variables=tuple(_with_dependencies(variable, inputs, initializes=initializes) for variable in variables),
+        description=(cls.__doc__ or "").strip().partition("\n")[0] or None,
+        generation_tool="Python",
+        can_handle_variable_step_size=True,
+        can_get_and_set_state=True,
+    )
+
+
+def check_arguments(cls: type[Component], arguments: Mapping[str, Any]) -> None:
+    """Check that a component class can be called with these arguments; `CallRefused` says which is wrong."""
+    own = cls.__init__ is not object.__init__  # otherwise Python ignores all arguments
+    if not own and arguments:
+        text = f"'{cls.__name__}' has no `__init__`, which could take the argument '{next(iter(arguments))}'"
+        raise CallRefused(text, hint="The values of parameters are `start_values`.")
+    if own:
+        try:
+            inspect.signature(cls.__init__).bind(None, **arguments)
+        except TypeError as error:
+            raise CallRefused(f"`arguments` do not fit `{cls.__name__}.__init__`: {error}") from error
+
+
+def _with_dependencies(variable: Variable, inputs: list[str], *, initializes: bool) -> Variable:
+    """An output with the inputs that its initial value depends on: all, if it is computed and nothing else is said."""
+    if variable.causality != "output":
+        return replace(variable, dependencies=())
+    if variable.dependencies is None:
+        return replace(variable, dependencies=tuple(inputs) if initializes else ())
+    unknown = next((name for name in variable.dependencies if name not in inputs), None)
+    if unknown is not None:
+        hint = did_you_mean(unknown, inputs, f"The inputs are {listed(inputs)}.")
+        raise CallRefused(f"'{variable.name}' depends on '{unknown}', which is no input", hint=hint)
+    return variable
+
+
 # --- the modules of the folder of a component, imported for one instance alone
 
 # Python has one table of modules for a process, `sys.modules`. Two components that `import helper` from two folders
@@ -205,17 +242,14 @@ def _cannot_import(cls: type, reason: str, hint: str) -> ConfigurationError:
 
 
 class OwnModules(MetaPathFinder):
-    """The modules of one instance. It finds them from the start until `close`.
-
-    Attributes:
-        lent: the names that were imported by name from elsewhere, in the call into the component that is under way.
-    """
+    """The modules of one instance. It finds them from the start until `close`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = str(folder)
         self._suffix = f"@{next(_numbers)}"
         self._builtins = {**vars(builtins), "__import__": self._import}
         self._kinds: dict[str, Literal["", "Python", "C"]] = {}
+        # The names that were imported by name from elsewhere, in the call into the component that is under way.
         self.lent: list[str] = []
         sys.meta_path.insert(0, self)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...errors import FmuError, FmuMeshError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
-from ...variables.model_description import ModelDescription, Variable
+from ...variables.model_description import Variable
 from ...variables.value_conversion import ValueRefused, to_value
 from ...variables.value_types import DTYPES, INTEGERS, Value, is_float, is_text, nested
 from ..call_guard import lines_shown_of
@@ -46,15 +46,11 @@ class _State(NamedTuple):
 
 
 class PythonInstance:
-    """A component in Python that is stepped by a mesh.
-
-    Raises:
-        LoadFailed: the class cannot be imported or called, or is another one than when the run was planned.
-    """
+    """A component in Python that is stepped by a mesh."""
 
     def __init__(self, opening: Opening[PythonConfig]) -> None:
         self.name = opening.name
-        self._description = opening.description
+        self.description = opening.description
         # A value may be beyond `min` and `max`, which are for whoever sets it.
         bare = (replace(v, minimum=None, maximum=None) for v in opening.description.variables)
         self._variables: dict[str, Variable] = {variable.name: variable for variable in bare}
@@ -84,11 +80,6 @@ class PythonInstance:
     def changes_process(self) -> bool:
         """Whether its code may change the state of the process in a step, such as the working directory."""
         return self._imported.modules.mention(_CHANGING)
-
-    @property
-    def description(self) -> ModelDescription:
-        """The model description."""
-        return self._description
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
@@ -144,12 +135,7 @@ class PythonInstance:
             write(step & mask, _as_attribute(values[name], self._variables[name]))
 
     def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, call `step` of the component, write its outputs to row ``step + 1``.
-
-        Raises:
-            StepFailed: the component raised an exception, or an output has no value or a wrong one.
-            TerminationRequested: the component raised it.
-        """
+        """Set the inputs of row ``step``, call `step` of the component, write its outputs to row ``step + 1``."""
         values, slot = self._values, step & self._input_mask
         for name, read in self._reads:
             values[name] = read(slot)
@@ -191,19 +177,11 @@ class PythonInstance:
         """Nothing to free: a state is Python objects."""
 
     def serialize_state(self, state: object) -> bytes:
-        """A state has Python objects of any kind, which only this process can use.
-
-        Raises:
-            FmuError: always.
-        """
+        """Refused with an `FmuError`: a state has Python objects of any kind, which only this process can use."""
         raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
 
     def deserialize_state(self, data: bytes) -> object:
-        """See `serialize_state`.
-
-        Raises:
-            FmuError: always.
-        """
+        """See `serialize_state`."""
         raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
 
     def close(self) -> None:
@@ -253,11 +231,7 @@ class PythonInstance:
         return self._component
 
     def _called(self, call: Callable[[], Any]) -> Any:  # noqa: ANN401 what the call returns
-        """Call code of the user.
-
-        Raises:
-            FmuError: it raised an exception.
-        """
+        """Call code of the user; what it raises becomes an `FmuError`."""
         try:
             return call()
         except (Exception, SystemExit) as error:
@@ -295,11 +269,7 @@ def _reader(ring: Ring, variable: Variable) -> Callable[[int], Any]:
 
 
 def _writer(ring: Ring, variable: Variable) -> Callable[[int, object], None]:
-    """A function that writes the value of an output to a slot of a ring.
-
-    Raises:
-        ValueRefused: by the function: it is no value of the variable's type and shape.
-    """
+    """A function that writes the value of an output to a slot of a ring; it raises `ValueRefused`."""
     place = ring.layout.place(variable.name)
     part, first = ring.parts[place.part], place.first
 

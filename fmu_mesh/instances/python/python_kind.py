@@ -66,8 +66,7 @@ class PythonKind(Kind[PythonConfig]):
 
 def answer_to(request: str) -> bytes:
     """In the child process: import what is asked for; returns the answer."""
-    from .component_description import check_arguments  # noqa: PLC0415  as above
-    from .importing import ImportedComponent  # noqa: PLC0415  as above
+    from .importing import ImportedComponent, check_arguments  # noqa: PLC0415  as above
 
     python, path, arguments = msgspec.json.decode(request, type=tuple[str, str, dict[str, Any]])
     component = ImportedComponent(Path(path), class_place_of(python))
@@ -77,24 +76,17 @@ def answer_to(request: str) -> bytes:
             description = component.load()
             check_arguments(component.cls, arguments)
         except (Exception, SystemExit) as error:  # it is code of the user
-            raise LoadFailed(component.told(error), hint=_hint(error)) from error
+            hint = error.hint if isinstance(error, FmuMeshError) else None
+            if isinstance(error, ModuleNotFoundError):
+                hint = "Is it installed in the Python that runs the component?"
+            raise LoadFailed(component.told(error), hint=hint) from error
         return description
 
     return described(describe)
 
 
-def _hint(error: BaseException) -> str | None:
-    if isinstance(error, ModuleNotFoundError):
-        return "Is it installed in the Python that runs the component?"
-    return error.hint if isinstance(error, FmuMeshError) else None
-
-
 def _check_version(python: str) -> None:
-    """Check that a Python has our version.
-
-    Raises:
-        LoadFailed: it has another one, or none.
-    """
+    """Check that a Python has our version."""
     output, _ = run_child([python, "-Pc", "import fmu_mesh; print(fmu_mesh.__version__)"])
     version = output.decode(errors="replace").strip()
     if version != __version__:
@@ -105,5 +97,4 @@ def _check_version(python: str) -> None:
         raise LoadFailed(f"the Python '{python}' {has}", hint=hint)
 
 
-KIND_OF_COMPONENTS = PythonKind()
-"""What the entry point `python` names."""
+KIND_OF_COMPONENTS = PythonKind()  # what the entry point `python` names

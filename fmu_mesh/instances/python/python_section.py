@@ -26,17 +26,11 @@ process that imports a component of that program.
 
 
 class ClassPlace(NamedTuple):
-    """Where a component class is.
+    """Where a component class is."""
 
-    Attributes:
-        file: the file, as it is written; empty if a module is named.
-        module: the name of an installed module; empty if a file is named.
-        name: the class; empty if none is named.
-    """
-
-    file: str
-    module: str
-    name: str
+    file: str  # the file, as it is written; empty if a module is named
+    module: str  # the name of an installed module; empty if a file is named
+    name: str  # the class; empty if none is named
 
 
 def class_place_of(text: str) -> ClassPlace:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from functools import cache
+from functools import cache, partial, reduce
 from typing import Final
 
 from ...variables.units import BASE_UNITS, BaseUnit
@@ -61,44 +61,36 @@ def base_unit_of(name: str) -> BaseUnit | None:
         (0.001, 'kg.m2.s-2')
     """
     over, _, under = name.replace(" ", "").partition("/")
-    product = _product(over)
-    if under:
-        if under.startswith("(") and under.endswith(")"):
-            under = under[1:-1]
-        divisor = _product(under)
-        product = None if product is None or divisor is None else _times(product, divisor, -1)
-    return product
+    if under.startswith("(") and under.endswith(")"):
+        under = under[1:-1]
+    try:
+        return _times(_product(over), _product(under), -1) if under else _product(over)
+    except LookupError:
+        return None
 
 
-def _product(text: str) -> BaseUnit | None:
-    factors = [_factor(part) for part in re.split(r"[.*]", text)]
-    product: BaseUnit | None = factors[0]
-    for factor in factors[1:]:
-        product = None if product is None or factor is None else _times(product, factor, 1)
-    return product
+def _product(text: str) -> BaseUnit:
+    return reduce(partial(_times, power=1), map(_factor, re.split(r"[.*]", text)))
 
 
-def _factor(text: str) -> BaseUnit | None:
+def _factor(text: str) -> BaseUnit:
     """One unit with its exponent."""
     match = _POWER.fullmatch(text)
-    unit = _unit(match[1]) if match is not None else None
-    if match is None or unit is None or match[2] is None:
-        return unit
-    return _times(BaseUnit(), unit, int(match[2]))
-
-
-def _unit(name: str) -> BaseUnit | None:
+    if match is None:
+        raise LookupError(text)
+    name, exponent = match.groups()
     if name in _KNOWN:
-        return _KNOWN[name]
-    prefix, rest = name[:1], name[1:]
-    if prefix not in _PREFIXES or rest not in _WITH_PREFIX:
-        return None
-    return _times(BaseUnit(factor=_PREFIXES[prefix]), _KNOWN[rest], 1)
+        unit = _KNOWN[name]
+    elif name[1:] in _WITH_PREFIX:
+        unit = _times(BaseUnit(factor=_PREFIXES[name[0]]), _KNOWN[name[1:]], 1)
+    else:
+        raise LookupError(name)
+    return unit if exponent is None else _times(BaseUnit(), unit, int(exponent))
 
 
-def _times(left: BaseUnit, right: BaseUnit, power: int) -> BaseUnit | None:
-    """``left * right ** power``; None for units with an offset, which cannot be multiplied."""
+def _times(left: BaseUnit, right: BaseUnit, power: int) -> BaseUnit:
+    """``left * right ** power``; units with an offset cannot be multiplied."""
     if left.offset or right.offset:
-        return None
+        raise LookupError("degC or degF in a product")
     exponents = {field: getattr(left, field) + power * getattr(right, field) for field in BASE_UNITS}
     return BaseUnit(**exponents, factor=left.factor * right.factor**power)

@@ -28,8 +28,9 @@ from ....archives.archive_entries import LIMITS_HINT, checked_archive, entry_nam
 from ....archives.inner_files import inner_file, inner_sha256, inner_size
 from ....config.mesh import LimitsConfig
 from ....errors import LoadFailed
+from ..step_options import Terms
 
-__all__ = ["Contents", "OpenFmu", "Terms", "content_of", "in_new_folder", "opened", "sha256_of", "size_of"]
+__all__ = ["Contents", "OpenFmu", "content_of", "in_new_folder", "opened", "sha256_of", "size_of"]
 
 _MARGIN: Final = 2**20
 """The bytes that the folder of a run keeps for everything else."""
@@ -37,44 +38,17 @@ _PLACE_HINT: Final = "Set FMU_MESH_RUNTIME_DIR, or TMPDIR, to a folder with room
 _XML_FILES: tuple[str, ...] = ("modelDescription.xml", "sources/buildDescription.xml")
 
 
-class Terms(msgspec.Struct, frozen=True):
-    """The conditions that an FMU must meet before it is used.
-
-    Attributes:
-        sha256: the SHA-256 that the configuration asks for, in hexadecimal digits.
-        content: what `content_of` returned when the run was planned.
-    """
-
-    limits: LimitsConfig = LimitsConfig()
-    sha256: str | None = None
-    content: str | None = None
-
-
 class Contents(msgspec.Struct, frozen=True):
-    """What is in an FMU.
+    """What is in an FMU."""
 
-    Attributes:
-        names: the names of all files, with `/` between the parts.
-        xml: the contents of the XML files that describe the FMU, by name.
-    """
-
-    names: frozenset[str]
-    xml: dict[str, bytes]
+    names: frozenset[str]  # the names of all files, with `/` between the parts
+    xml: dict[str, bytes]  # the contents of the XML files that describe the FMU, by name
 
 
 class OpenFmu(ABC):
-    """An FMU that is open and meets its terms.
+    """An FMU that is `opened` and meets its terms; whoever needs several things from one FMU opens it once.
 
-    Whoever needs several things from one FMU opens it once:
-
-    ```python
-    with opened(path, terms) as fmu:
-        description = description_of(fmu)
-        compile_sources(fmu, description, tell)
-    ```
-
-    Raises:
-        LoadFailed: by each method: a file cannot be read or is damaged.
+    Each method raises `LoadFailed` if a file cannot be read or is damaged.
     """
 
     def __init__(self, path: Path, limits: LimitsConfig) -> None:
@@ -93,6 +67,11 @@ class OpenFmu(ABC):
             text = f"the {name} of '{self.path}' has {size} bytes; the limit is {limit}."
             raise LoadFailed(text, hint=LIMITS_HINT)
         return self.read_binary(name)
+
+    def _known(self, name: str) -> str:
+        if name not in self._names():
+            raise LoadFailed(f"'{self.path}' has no file '{name}'.")
+        return name
 
     @abstractmethod
     def read_binary(self, name: str) -> bytes:
@@ -125,11 +104,7 @@ class OpenFmu(ABC):
 
 @contextmanager
 def opened(path: Path, terms: Terms = Terms()) -> Iterator[OpenFmu]:  # noqa: B008 a frozen Struct
-    """Open the FMU at ``path`` and check that it meets ``terms``.
-
-    Raises:
-        LoadFailed: there is no FMU, or it does not meet the terms.
-    """
+    """Open the FMU at ``path``; `LoadFailed` if there is none, or if it does not meet ``terms``."""
     kind = _Folder if files.is_folder(path) else _Archive
     with closing(kind(path, terms)) as fmu:
         if terms.content is not None and fmu.content_sha256() != terms.content:
@@ -143,11 +118,7 @@ def sha256_of(path: Path) -> str | None:
 
 
 def size_of(path: Path) -> int | None:
-    """The size of an archive in bytes; None for a folder.
-
-    Raises:
-        OSError, LoadFailed: it cannot be read.
-    """
+    """The size of an archive in bytes; None for a folder."""
     if files.is_folder(path):
         return None
     outer = files.archive_on_the_way(path)
@@ -155,12 +126,7 @@ def size_of(path: Path) -> int | None:
 
 
 def content_of(path: Path) -> str:
-    """A SHA-256 that identifies an FMU; see `OpenFmu.content_sha256`.
-
-    Raises:
-        OSError: it cannot be read.
-        LoadFailed: the archive in which it lies cannot be used.
-    """
+    """A SHA-256 that identifies an FMU; see `OpenFmu.content_sha256`. `OSError` or `LoadFailed`: it cannot be read."""
     if not files.is_folder(path):
         outer = files.archive_on_the_way(path)
         return files.sha256_of(path) if outer is None else inner_sha256(path, outer)
@@ -174,10 +140,7 @@ def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], No
     """Make a private folder for an FMU, with ``size`` bytes that ``fill`` writes; returns the folder.
 
     It is below ``parent``. If that has no room, or no code may run from there, it is in the folder for temporary files,
-    and `files.remove_tree` finds it by a link below ``parent``.
-
-    Raises:
-        LoadFailed: there is no place for it, or it is damaged; nothing is left behind.
+    and `files.remove_tree` finds it by a link below ``parent``. After `LoadFailed` nothing is left behind.
     """
     temporary = Path(tempfile.gettempdir())
     reasons: list[str] = []
@@ -244,7 +207,7 @@ class _Archive(OpenFmu):
 
     def read_binary(self, name: str) -> bytes:
         with reading(self.path):
-            return self._zip.read(self._entry(name))
+            return self._zip.read(self._entries[self._known(name)])
 
     def content_sha256(self) -> str:
         with reading(self.path):
@@ -262,25 +225,16 @@ class _Archive(OpenFmu):
         return frozenset(self._entries)
 
     def _size(self, name: str) -> int:
-        return self._entry(name).file_size
+        return self._entries[self._known(name)].file_size
 
     @cached_property
     def _entries(self) -> dict[str, ZipInfo]:
         return {entry_name(entry): entry for entry in self._zip.infolist() if not entry.is_dir()}
 
-    def _entry(self, name: str) -> ZipInfo:
-        if name not in self._entries:
-            raise _no_file(self.path, name)
-        return self._entries[name]
-
     def _sha256(self) -> str:
         if self._digest is None:
             self._digest = files.sha256_of_open(self._file, again=self._verifies)
         return self._digest
-
-
-def _no_file(path: Path, name: str) -> LoadFailed:
-    return LoadFailed(f"'{path}' has no file '{name}'.")
 
 
 # --- a folder
@@ -299,11 +253,11 @@ class _Folder(OpenFmu):
         """Nothing is open."""
 
     def read_binary(self, name: str) -> bytes:
-        with self._reading():
-            return self._file(name).read_bytes()
+        with reading(self.path):
+            return (self.path / self._known(name)).read_bytes()
 
     def content_sha256(self) -> str:
-        with self._reading():
+        with reading(self.path):
             return content_of(self.path)
 
     def unpacked_size(self) -> int:
@@ -325,20 +279,8 @@ class _Folder(OpenFmu):
         return _names_in(self.path)
 
     def _size(self, name: str) -> int:
-        with self._reading():
-            return self._file(name).stat().st_size
-
-    def _file(self, name: str) -> Path:
-        if name not in _names_in(self.path):
-            raise _no_file(self.path, name)
-        return self.path / name
-
-    @contextmanager
-    def _reading(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise LoadFailed(f"'{self.path}' cannot be read: {error.strerror}.") from error
+        with reading(self.path):
+            return (self.path / self._known(name)).stat().st_size
 
 
 def _names_in(path: Path) -> frozenset[str]:

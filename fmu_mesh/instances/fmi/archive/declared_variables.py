@@ -21,8 +21,6 @@ from ....variables.value_types import FMI2_TYPES, INTEGERS, TYPES, nested
 
 __all__ = ["number", "states_of", "variables_of"]
 
-_NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
-
 Dependencies = dict[str, tuple[str, ...] | None]
 
 
@@ -201,8 +199,8 @@ def _start(type_: VariableType, text: str | None) -> Value | None:
     if text is None:
         return None
     readers: dict[VariableType, Callable[[str], Value]] = {
-        "Float64": _float,
-        "Float32": _float,
+        "Float64": float,
+        "Float32": float,
         "Boolean": lambda word: word in ("true", "1"),
         "String": str,
         "Binary": bytes.fromhex,
@@ -212,10 +210,6 @@ def _start(type_: VariableType, text: str | None) -> Value | None:
     except ValueError:
         return None
     return value if not isinstance(value, int) or type_ == "Boolean" or value in INTEGERS[type_] else None
-
-
-def _float(text: str) -> float:
-    return _NOT_FINITE[text] if text in _NOT_FINITE else float(text)
 
 
 def number(text: str | float | None) -> float | None:

@@ -27,14 +27,10 @@ _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
 
 
 def examine(fmu: OpenFmu) -> tuple[Contents, Any, tuple[str, ...]]:
-    """Read the descriptions of an FMU; refuse it if they must not be parsed, or if it cannot run anywhere.
+    """Read the descriptions of an FMU; `LoadFailed` if they must not be parsed, or if it cannot run anywhere.
 
-    Returns:
-        What is in it, with the XML repaired and in UTF-8; the root of the model description, as lxml has it; and the
-        problems that were found.
-
-    Raises:
-        LoadFailed: it is not an FMU, or its XML is unsafe or has invalid values.
+    Returns what is in it, with the XML repaired and in UTF-8; the root of the model description, as lxml has it; and
+    the problems that were found.
     """
     path, contents = fmu.path, fmu.contents()
     if "modelDescription.xml" not in contents.names:
@@ -92,10 +88,7 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     """Find the library of an FMU for this platform: the one with the required name, or else the only one.
 
     ``identifiers`` are the model identifier of the kind to use, and that of the other kind if there is one. None: the
-    library has to be compiled from sources.
-
-    Raises:
-        LoadFailed: there is no library for this platform, or there are several; the message lists them.
+    library has to be compiled from sources. `LoadFailed`: there is none for this platform, or there are several.
     """
     identifier, *others_of_it = identifiers
     if "/" in identifier or "\\" in identifier or identifier.startswith("."):

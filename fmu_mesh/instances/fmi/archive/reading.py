@@ -20,7 +20,8 @@ from msgspec.structs import replace
 
 from ....errors import LoadFailed
 from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
-from .archive import Contents, OpenFmu, Terms, opened
+from ..step_options import Terms
+from .archive import Contents, OpenFmu, opened
 from .declared_variables import number, states_of, variables_of
 from .examining import examine, find_library, library_name
 
@@ -36,21 +37,10 @@ def read_description(
     *,
     to_run: bool = True,
 ) -> ModelDescription:
-    """Read the model description of the FMU at ``path``.
+    """Read the model description of the FMU at ``path``, a file or a folder; `LoadFailed` says why there is none.
 
-    ```python
-    description = read_description(Path("fmus/DampedPendulum.fmu"))
-    print(description.model_name, [variable.name for variable in description.variables])
-    ```
-
-    Args:
-        path: the .fmu file, or the folder of an unpacked FMU.
-        terms: the conditions that the FMU must meet.
-        kind: the kind to use; ``auto``: co-simulation if the FMU has both.
-        to_run: whether it must be able to run on this platform.
-
-    Raises:
-        LoadFailed: it is not an FMU, or it cannot run here; the message says why and what would help.
+    ``kind`` is the kind to use, for ``auto`` co-simulation if the FMU has both; with ``to_run`` it must be able to run
+    on this platform.
     """
     with opened(path, terms) as fmu:
         return description_of(fmu, kind, to_run=to_run)
@@ -121,11 +111,7 @@ def _readable(contents: Contents) -> BytesIO:
 
 
 def parsed(path: Path, contents: Contents) -> FmpyDescription:
-    """FMPy's model description of the FMU at ``path``, from what `examine` has returned.
-
-    Raises:
-        LoadFailed: it breaks a rule that `repair` does not know.
-    """
+    """FMPy's model description, from what `examine` has returned; `LoadFailed` if it breaks a rule beyond repair."""
     try:
         return read_model_description(_readable(contents), validate=False)
     except Exception as error:  # FMPy raises whatever the XML provokes in it

@@ -78,15 +78,10 @@ That is the one which promises least: a parameter that may not change later, a v
 
 
 class Repairs(NamedTuple):
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        problems: what breaks a rule, and what was done about it; the keys are the texts, in their order.
-        illegal: what keeps the FMU from being used.
-    """
-
-    problems: dict[str, None]
-    illegal: dict[str, None]
+    problems: dict[str, None]  # what breaks a rule, and what was done about it; the keys are the texts, in their order
+    illegal: dict[str, None]  # what keeps the FMU from being used
 
     def tell(self, element: Xml, what: str) -> None:
         """Add a problem of an element."""

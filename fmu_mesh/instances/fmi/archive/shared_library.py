@@ -31,28 +31,18 @@ SYMBOL: Final = np.dtype(
 
 
 class SharedLibrary(msgspec.Struct, frozen=True):
-    """A library as the dynamic linker sees it.
+    """A library as the dynamic linker sees it."""
 
-    Attributes:
-        sha256: of its content.
-        soname: the name that a process knows it by; empty if it has none: then that is the name of its file.
-        needed: the names of the libraries that it needs.
-        run_paths: the folders that it looks for them in, as written (`$ORIGIN` is its own folder).
-        unique: the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE): the bytes
-            of a constant, None for a variable.
-        machine: two bytes of its header that tell processors apart: the class and the machine.
-        versions: the versions of its symbols, such as `GLIBC_2.38` for the library of C.
-        needed_versions: the versions that it needs, by the names of libraries.
-    """
-
-    sha256: str = ""
-    soname: str = ""
-    needed: tuple[str, ...] = ()
-    run_paths: tuple[str, ...] = ()
+    sha256: str = ""  # of its content
+    soname: str = ""  # the name that a process knows it by; empty if it has none: then that is the name of its file
+    needed: tuple[str, ...] = ()  # the names of the libraries that it needs
+    run_paths: tuple[str, ...] = ()  # the folders that it looks for them in, as written (`$ORIGIN` is its own folder)
+    # the symbols that exist once in a process, whoever loads them and however (STB_GNU_UNIQUE): the bytes of a
+    # constant, None for a variable
     unique: dict[str, bytes | None] = {}
-    machine: bytes = b""
-    versions: frozenset[str] = frozenset()
-    needed_versions: dict[str, frozenset[str]] = {}
+    machine: bytes = b""  # two bytes of its header that tell processors apart: the class and the machine
+    versions: frozenset[str] = frozenset()  # the versions of its symbols, such as `GLIBC_2.38` for the library of C
+    needed_versions: dict[str, frozenset[str]] = {}  # the versions that it needs, by the names of libraries
 
     def folders(self, own: str) -> list[str]:
         """The run paths of a library that lies in the folder ``own`` (ld.so(8), $ORIGIN)."""

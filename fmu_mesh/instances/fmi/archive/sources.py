@@ -31,7 +31,8 @@ from .... import files
 from ....archives.archive_entries import reading
 from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
-from .archive import OpenFmu, Terms, in_new_folder, opened
+from ..step_options import Terms
+from .archive import OpenFmu, in_new_folder, opened
 from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed
@@ -73,14 +74,10 @@ _linked: set[Path] = set()
 
 
 class _Build(msgspec.Struct, frozen=True):
-    """What to compile and how.
-
-    Attributes:
-        sources: paths relative to the folder `sources` of the FMU.
-    """
+    """What to compile and how."""
 
     identifier: str
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # paths relative to the folder `sources` of the FMU
     includes: tuple[str, ...]
     options: tuple[str, ...]
 
@@ -95,11 +92,8 @@ def extract(
     """Unpack the FMU at ``path`` into a new private folder below ``parent``; returns the folder, ready to be loaded.
 
     If it has no library for this platform, its sources are compiled, or the library of an earlier compilation is used.
-    ``model`` says for which kind; without it, the library is for co-simulation if the FMU has that.
-
-    Raises:
-        LoadFailed: the archive is damaged or does not meet ``terms``, or the sources do not compile; nothing is left
-            behind.
+    ``model`` says for which kind; without it, the library is for co-simulation if the FMU has that. After `LoadFailed`
+    nothing is left behind.
     """
     if model is not None and (prepared := _prepared.get((path, terms, model.model_identifier, model.kind))) is not None:
         folder = _copied(path, prepared, parent)
@@ -114,9 +108,6 @@ def prepare(path: Path, parent: Path, terms: Terms, model: ModelDescription) -> 
     """Extract an FMU as `extract`, for each later `extract` in this process and in those that it forks: they copy it.
 
     Each has a folder of its own, because an FMU may write to its files.
-
-    Raises:
-        LoadFailed: as `extract`.
     """
     key = (path, terms, model.model_identifier, model.kind)
     if key not in _prepared:
@@ -151,10 +142,8 @@ def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Calla
     """Read the model description of an FMU and get it ready to run, while its archive is open once.
 
     If it has no library for this platform, its sources are compiled into the cache; ``tell`` is called before that.
-    Its SHA-256 is known afterwards, so that `content_of` does not read it again.
-
-    Raises:
-        LoadFailed: it cannot run here. If its sources do not compile, the message has the first lines of the compiler.
+    Its SHA-256 is known afterwards, so that `content_of` does not read it again. If its sources do not compile,
+    `LoadFailed` has the first lines of the compiler.
     """
     with opened(path, terms) as fmu:
         fmu.content_sha256()
@@ -340,11 +329,7 @@ def _run(path: Path, command: Sequence[str], folder: Path) -> None:
 
 
 def _compiler(path: Path, *, plus: bool) -> list[str]:
-    """The command of the C compiler, or of the C++ compiler if ``plus``: ``$CC`` (``$CXX``), or the first one found.
-
-    Raises:
-        LoadFailed: there is none.
-    """
+    """The command of the C compiler, or of the C++ compiler if ``plus``: ``$CC`` (``$CXX``), or the first one found."""
     own = shlex.split(os.environ.get("CXX" if plus else "CC", ""))
     candidates = [own] if own else [[name] for name in (("c++", "g++", "clang++") if plus else ("cc", "gcc", "clang"))]
     for candidate in candidates:

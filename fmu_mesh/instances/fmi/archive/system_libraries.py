@@ -14,7 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from .archive import Terms, opened
+from ..step_options import Terms
+from .archive import opened
 from .shared_library import SharedLibrary, libraries_beside, read_shared_library
 
 __all__ = ["missing_libraries"]
@@ -34,9 +35,6 @@ def missing_libraries(path: Path, library: str, terms: Terms = Terms()) -> tuple
     """What the library of an FMU needs and this host does not have: whole libraries, or newer versions of them.
 
     ``library`` is the name of the file in it, as `ModelDescription.library` has it.
-
-    Raises:
-        LoadFailed: the FMU cannot be read.
     """
     with opened(path, terms) as fmu:
         beside = libraries_beside(fmu, library)

@@ -50,25 +50,23 @@ class StepStatus:
         self._get_status = declared(dll, f"{symbols}GetStatus", _ASK)
         self._get_real_status = declared(dll, f"{symbols}GetRealStatus", _ASK)
 
-    def wait(self) -> int:
-        """Wait until a pending step is done, and return its status.
+    def settled(self, status: int) -> int:
+        """The status of a step that has returned ``status``; wait until a pending step is done.
 
         The FMU gets no function to call when it is done, so we have to ask (FMI 2.0, 2.1.5). `CallWatch` watches the
         deadline of the step.
-
-        Raises:
-            StepFailed: the FMU does not tell.
         """
         pause, longest = _PAUSES_S
-        while True:
+        while status == PENDING:
             answer = ctypes.c_int(PENDING)
             if self._get_status(self._component, _DO_STEP_STATUS, ctypes.addressof(answer)) > WARNING:
                 what = f"{self._prefix}DoStep returned pending, and {self._prefix}GetStatus does not tell when the step"
                 raise self._failed(f"{what} is done")
-            if answer.value != PENDING:
-                return answer.value
+            if (status := answer.value) != PENDING:
+                break
             time.sleep(pause)  # noqa: TID251 there is nothing to wait on
             pause = min(longest, pause + longest / 64)
+        return status
 
     def last_successful_time(self) -> float | None:
         """The time up to which a discarded step was calculated, in s of the FMU; None if the FMU does not tell."""
@@ -78,17 +76,13 @@ class StepStatus:
 
 
 def take_sub_steps(attempt: Callable[[float, float], int], time: float, step_size: float) -> int:
-    """Take a step in halves, quarters and so on, as small as necessary.
+    """Take a step from ``time`` by ``step_size`` (s) in halves, quarters and so on, as small as necessary.
 
-    Args:
-        attempt: takes a step of some size from a time (both in s), and returns its status. After `DISCARD`, the FMU is
-            back at the start of this step.
-        time: start of the whole step in s.
-        step_size: its size in s.
+    ``attempt`` takes a step of some size from a time (both in s), and returns its status. After `DISCARD`, the FMU is
+    back at the start of this step.
 
-    Returns:
-        `DISCARD` if even the smallest sub-step was discarded; a higher status that ended the step; or the status of the
-        last sub-step.
+    Returns `DISCARD` if even the smallest sub-step was discarded; a higher status that ended the step; or the status of
+    the last sub-step.
     """
     done, size, status = 0, SMALLEST // 2, DISCARD
     while done < SMALLEST:

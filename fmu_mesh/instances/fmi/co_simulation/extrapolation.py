@@ -3,13 +3,13 @@
 Owns the line of an input: the one through the last two rows of its source that the instance has got, at the points to
 which they belong. It follows from rows and points only, so it is the same in every process. A connection with delay 1
 gives a row of the start of a step or earlier: the input is extrapolated. One with delay 0 gives the row of the end of
-a step, if the source has one there: the input is interpolated. `TakesDerivatives` says how an FMU gets a derivative.
+a step, if the source has one there: the input is interpolated. `FmuInstance` says how an FMU gets a derivative.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, cast
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 import msgspec
 
@@ -17,33 +17,16 @@ from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....system.layout import Layout
 from ....system.linear_inputs import LinearInput
-from ...contract import Instance, KeepsState
 from ...instance_wrapper import AroundInstance, of_kind, packed, unpacked
+from ..fmu_instance import FmuInstance
 
-__all__ = ["LinearInputs", "TakesDerivatives"]
-
-
-class TakesDerivatives(Instance, KeepsState, Protocol):
-    """An instance of an FMU whose Real inputs may change linearly within a step."""
-
-    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
-        """Set the slopes of inputs within the next step (FMI 2.0, 4.2.1, fmi2SetRealInputDerivatives).
-
-        Args:
-            derivatives: time derivatives in 1/s.
-            continuous: whether no input jumps at the start of the step, apart from the error of an extrapolation.
-        """
-        ...
-
-    def remove_files(self) -> None:
-        """See `KeepsFiles`."""
-        ...
+__all__ = ["LinearInputs"]
 
 
-class LinearInputs(AroundInstance[TakesDerivatives]):
+class LinearInputs(AroundInstance[FmuInstance]):
     """An instance with inputs that change linearly within a step."""
 
-    def __init__(self, instance: TakesDerivatives, inputs: Sequence[LinearInput]) -> None:
+    def __init__(self, instance: FmuInstance, inputs: Sequence[LinearInput]) -> None:
         super().__init__(instance)
         self._inputs = inputs
         self._lines: list[_Line] = []
@@ -112,29 +95,18 @@ class LinearInputs(AroundInstance[TakesDerivatives]):
         return packed(own.lines, super().serialize_state(own.inner))
 
     def deserialize_state(self, data: bytes) -> object:
-        """See `KeepsState`.
-
-        Raises:
-            FmuMeshError: ``data`` is no state of an instance with linear inputs.
-        """
+        """See `KeepsState`."""
         lines, rest = unpacked(data, tuple[_Line, ...], None)
         return _LinearState(super().deserialize_state(rest), lines)
 
 
 class _Line(msgspec.Struct, frozen=True):
-    """The line through the last two rows of a source.
+    """The line through the last two rows of a source."""
 
-    Attributes:
-        value: the last value.
-        point: the point of the last value.
-        change: the last value minus the one before; 0 as long as there is only one.
-        distance: points between the two.
-    """
-
-    value: float
-    point: int = 0
-    change: float = 0.0
-    distance: int = 1
+    value: float  # the last value
+    point: int = 0  # the point of the last value
+    change: float = 0.0  # the last value minus the one before; 0 as long as there is only one
+    distance: int = 1  # points between the two
 
     def through(self, value: float, point: int) -> _Line:
         """The line with the value of this point, which may be the last one again."""

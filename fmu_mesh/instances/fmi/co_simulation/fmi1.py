@@ -13,17 +13,16 @@ from fmpy.fmi1 import FMU1Slave
 from ....rings.native import StepKind
 from ...call_guard import call_named
 from ..calls import cffi_function, checked_function
-from ..fmi_versions import FMI1_VALUES, Fmi1
+from ..fmi_versions import Fmi1
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from .discarded_steps import PENDING, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
+from .discarded_steps import SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi1Instance"]
 
 _DO_STEP = "int (*)(void *, double, double, char)"
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double, ctypes.c_char, ctypes.c_double)
-_TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _SET_DERIVATIVES = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p
 )
@@ -41,7 +40,8 @@ class Fmi1Instance(NativeInstance, Fmi1):
     """One instance of an FMI 1.0 co-simulation FMU."""
 
     _kind = StepKind.FMI1
-    _functions = FmuFunctions(FMU1Slave, FMI1_VALUES, "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
+    _end = "TerminateSlave"
+    _functions = FmuFunctions(FMU1Slave, Fmi1.VALUES, "fmi1FreeSlaveInstance", _NEEDED, _NAMES)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -58,18 +58,13 @@ class Fmi1Instance(NativeInstance, Fmi1):
         self._step(self._time_of(step), self._step_size, status)
 
     def _step(self, time: float, step_size: float, status: int | None) -> None:
-        """Take a step, or complete it after fmiDoStep has returned ``status``.
-
-        Raises:
-            StepFailed: the step cannot be completed.
-        """
+        """Take a step, or complete it after fmiDoStep has returned ``status``."""
         if status is None:
             if self._derivatives:
                 self._set_derivatives(self._derivatives)
             status = self._do_step(self._self, time, step_size, _NEW)
-        if status == PENDING:
-            status = self._step_status.wait()
-        model = self._description
+        status = self._step_status.settled(status)
+        model = self.description
         repeats = status == DISCARD and model.can_handle_variable_step_size and model.can_reject_steps
         repeats = repeats and not self._options.linear_inputs  # sub-steps would need derivatives of their own
         if repeats:
@@ -89,9 +84,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
 
         def attempt(start: float, size: float) -> int:
             nonlocal new_step
-            status = self._do_step(self._self, start, size, new_step)
-            if status == PENDING:
-                status = self._step_status.wait()
+            status = self._step_status.settled(self._do_step(self._self, start, size, new_step))
             new_step = _REPEATED if status == DISCARD else _NEW
             return status
 
@@ -112,7 +105,3 @@ class Fmi1Instance(NativeInstance, Fmi1):
         function = checked_function(self._fmu.dll, self._symbols, "InitializeSlave", _INITIALIZE)
         times = start_time, b"\x00" if stop_time is None else b"\x01", stop_time or 0.0
         self._checked(lambda: call_named("fmiInitializeSlave", function, self._component, *times))
-
-    def _terminate(self) -> None:
-        function = checked_function(self._fmu.dll, self._symbols, "TerminateSlave", _TERMINATE)
-        call_named("fmiTerminateSlave", function, self._component)

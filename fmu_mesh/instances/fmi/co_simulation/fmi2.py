@@ -13,11 +13,11 @@ from ....rings.native import StepKind
 from ....simtime import resolvable
 from ....variables.value_types import Value
 from ..calls import cffi_function
-from ..fmi_versions import FMI2_NAMES, FMI2_NEEDED, FMI2_VALUES, Fmi2
+from ..fmi_versions import Fmi2
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
-from .discarded_steps import PENDING, RETRY, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
+from .discarded_steps import RETRY, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
 from .native_instance import NativeInstance
 
 __all__ = ["Fmi2Instance"]
@@ -31,9 +31,8 @@ class Fmi2Instance(NativeInstance, Fmi2):
     """One instance of an FMI 2.0 co-simulation FMU."""
 
     _kind = StepKind.FMI2
-    _functions = FmuFunctions(FMU2Slave, FMI2_VALUES, "fmi2FreeInstance", (*FMI2_NEEDED, "fmi2DoStep"), FMI2_NAMES)
-    _terminated = False
-    """Whether the FMU has asked to end the simulation with the step that is complete now."""
+    _functions = FmuFunctions(FMU2Slave, Fmi2.VALUES, "fmi2FreeInstance", (*Fmi2.NEEDED, "fmi2DoStep"), Fmi2.NAMES)
+    _terminated = False  # whether the FMU has asked to end the simulation with the step that is complete now
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -55,8 +54,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
         self._do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
         self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
         self._by_calls = bool(options.retry_discarded_steps or options.linear_inputs)
-        self._kept_state = ctypes.c_void_p()
-        """That before the step, where steps are retried."""
+        self._kept_state = ctypes.c_void_p()  # that before the step, where steps are retried
 
     def _step_by_calls(self, step: int) -> None:
         self._check_not_terminated()
@@ -83,9 +81,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
 
         def attempt(start: float, size: float) -> int:
             fmu.fmi2GetFMUstate(self._component, state)
-            status = self._do_step(self._self, start, size, 0)
-            if status == PENDING:
-                status = self._step_status.wait()
+            status = self._step_status.settled(self._do_step(self._self, start, size, 0))
             if status == DISCARD:
                 if self._asks_to_end():
                     return _ENDS
@@ -103,12 +99,9 @@ class Fmi2Instance(NativeInstance, Fmi2):
     def _finish(self, status: int, end: float) -> None:
         """Complete a step to ``end`` (s) whose ``status`` is above warning (FMI 2.0, 4.2.1).
 
-        Raises:
-            StepFailed: the step cannot be completed.
-            TerminationRequested: the FMU asks to end the simulation before the end of the step.
+        `TerminationRequested`: the FMU asks to end the simulation before the end of the step.
         """
-        if status == PENDING:
-            status = self._step_status.wait()
+        status = self._step_status.settled(status)
         if status <= WARNING:
             return
         retries = self._options.retry_discarded_steps
@@ -127,7 +120,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
             raise self._failed(discarded("fmi2DoStep", None, SMALLEST), hint=SMALLER_STEPS)
         last_time = self._step_status.last_successful_time()
         self._last_messages = messages  # a message about these questions is not the reason of the failure
-        model = self._description
+        model = self.description
         can_retry = (
             model.can_handle_variable_step_size and model.can_get_and_set_state and not self._options.linear_inputs
         )

@@ -26,8 +26,8 @@ from ....simtime import TimeGrid, resolvable, step_within
 from ....variables.model_description import ModelDescription
 from ....variables.value_types import Value
 from ..calls import Function, Pointer, cffi_function, pointer
-from ..clocks import Clocks
-from ..fmi_versions import FMI3_NEEDED, FMI3_VALUES, Fmi3
+from ..clocks import Clocks, updated
+from ..fmi_versions import Fmi3
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING, PartCall, SolverFailed, Verb
 from ..loaded_fmu import FmuFunctions
@@ -36,17 +36,17 @@ from .native_instance import NativeInstance
 
 __all__ = ["Fmi3Instance", "Fmi3Steps"]
 
-_NEEDED = "fmi3InstantiateCoSimulation", *FMI3_NEEDED, "fmi3DoStep"
+_NEEDED = "fmi3InstantiateCoSimulation", *Fmi3.NEEDED, "fmi3DoStep"
 _DO_STEP = "int (*)(void *, double, double, _Bool, void *, void *, void *, void *)"
 MOST_RETURNS: Final = 1000
-"""After this many returns of fmi3DoStep, or events, at the same time, an FMU makes no progress."""
+"""After this many returns of fmi3DoStep at the same time, an FMU makes no progress."""
 
 
 class Fmi3Instance(NativeInstance, Fmi3):
     """One instance of an FMI 3.0 co-simulation FMU."""
 
     _kind = StepKind.FMI3
-    _functions = FmuFunctions(FMU3Slave, FMI3_VALUES, "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
+    _functions = FmuFunctions(FMU3Slave, Fmi3.VALUES, "fmi3FreeInstance", _NEEDED, {"instantiate": _NEEDED[0]})
     _steps: Fmi3Steps
     _discrete_row: tuple[bytes | list[Any], ...] = ()
 
@@ -79,14 +79,14 @@ class Fmi3Instance(NativeInstance, Fmi3):
         self._advance(end, lambda: self._steps.step(time, step_size, end))
 
     def _instantiate(self, **arguments: object) -> None:
-        has_event_mode = self._description.has_event_mode
+        has_event_mode = self.description.has_event_mode
         super()._instantiate(eventModeUsed=has_event_mode, earlyReturnAllowed=True, **arguments)
         self._do_step = cffi_function(self._fmu.dll.fmi3DoStep, _DO_STEP)
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)
         self._said.note(time=start_time)
-        self._steps = Fmi3Steps(self._fmu, self._do_step, self._description, self._said)
+        self._steps = Fmi3Steps(self._fmu, self._do_step, self.description, self._said)
         self._checked(lambda: self._steps.start(start_time))
         self._by_calls = bool(self._steps.clocks)
 
@@ -105,7 +105,7 @@ class Fmi3Instance(NativeInstance, Fmi3):
     def _is_discrete(self, part: PartCall) -> bool:
         """Whether the variables of a part change in event mode only."""
         continuous = all(variable.variability == "continuous" for variable in part.variables)
-        return self._description.has_event_mode and not continuous
+        return self.description.has_event_mode and not continuous
 
     def _complete(self, step: int, status: int | None) -> None:
         steps, start, size, end = self._steps, self._time_of(step), self._step_size, self._time_of(step + 1)
@@ -147,16 +147,8 @@ class Fmi3Instance(NativeInstance, Fmi3):
 class Fmi3Steps:
     """Steps of one instance: early return, event mode and clocks; it knows neither variables nor rings.
 
-    Args:
-        fmu: FMPy's object, instantiated with event mode if the description has it.
-        do_step: fmi3DoStep.
-        description: its model description.
-        said: what a step says besides its status. Up to `quiet_until`, a step is a single call of fmi3DoStep, unless
-            it says otherwise.
-
-    Attributes:
-        terminated: whether the FMU has asked to end the simulation; no step may be taken then.
-        clocks: its clocks.
+    ``fmu`` is FMPy's object, instantiated with event mode if the description has it; ``said`` what a step says besides
+    its status. Up to its `quiet_until`, a step is a single call of fmi3DoStep, unless it says otherwise.
 
     Call sequence: `start` in Initialization Mode, `exit_initialization` after it, then `step`, and `event` wherever
     values are set in event mode. A caller that calls fmi3DoStep itself continues with `finish` if needed.
@@ -166,14 +158,8 @@ class Fmi3Steps:
         SolverFailed: its events do not converge, or it makes no progress.
     """
 
-    def __init__(
-        self,
-        fmu: Any,  # noqa: ANN401 FMPy is untyped
-        do_step: Function,
-        description: ModelDescription,
-        said: Said,
-    ) -> None:
-        self.terminated = False
+    def __init__(self, fmu: Any, do_step: Function, description: ModelDescription, said: Said) -> None:  # noqa: ANN401 FMPy is untyped
+        self.terminated = False  # whether the FMU has asked to end the simulation; no step may be taken then
         self.clocks = Clocks(fmu, description.clocks)
         self._fmu = fmu
         self._self = pointer(fmu.component)
@@ -221,11 +207,7 @@ class Fmi3Steps:
         self._look_ahead()
 
     def step(self, start: float, step_size: float, end: float) -> float:
-        """Take the step from ``start`` by ``step_size`` to ``end`` (s).
-
-        Returns:
-            The time reached in s: ``end``, or an earlier time at which the FMU asked to end the simulation.
-        """
+        """Take the step from ``start`` by ``step_size`` to ``end`` (s); the time reached, if the FMU ends earlier."""
         status = None
         if self._said.quiet_until > end:
             status = self._attempt(start, step_size)
@@ -248,7 +230,10 @@ class Fmi3Steps:
             if status == DISCARD and self._varies and largest > step_size / SMALLEST:
                 largest, status = largest / 2.0, None
                 continue
-            self._check(status, retried=largest < step_size)
+            if status == DISCARD and largest < step_size:
+                raise SolverFailed(f"fmi3DoStep returned discard down to 1/{SMALLEST} of the step")
+            if status > WARNING:
+                raise FMICallException(function="fmi3DoStep", status=status)
             status = None
             before, time = time, said.last_time if said.early else target
             stuck = 0 if time > before else stuck + 1
@@ -266,12 +251,6 @@ class Fmi3Steps:
     def _attempt(self, time: float, size: float) -> int:
         self._said.clear()
         return self._do_step(self._self, time, size, True, *self._results)  # noqa: FBT003 a C function
-
-    def _check(self, status: int, *, retried: bool) -> None:
-        if status == DISCARD and retried:
-            raise SolverFailed(f"fmi3DoStep returned discard down to 1/{SMALLEST} of the step")
-        if status > WARNING:
-            raise FMICallException(function="fmi3DoStep", status=status)
 
     def _is_due(self, time: float) -> bool:
         """Whether event mode is needed at ``time`` (s).
@@ -295,16 +274,8 @@ class Fmi3Steps:
     def _update(self, time: float) -> None:
         """In event mode at ``time`` (s): update the discrete states, then step mode."""
         self._event_time = time
-        self.clocks.set_due(time)
-        for _ in range(MOST_RETURNS):
-            again, self.terminated, _nominals, _states, defined, next_event = self._fmu.updateDiscreteStates()
-            self.clocks.read()
-            if self.terminated:
-                return
-            if not again:
-                break
-        else:
-            raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {MOST_RETURNS} updates")
-        self._next_event = next_event if defined else math.inf
-        self.clocks.update_intervals(time)
-        self._fmu.enterStepMode()
+        info = self.clocks.settle(time, lambda: updated(self._fmu))
+        self.terminated = info.terminate
+        if not self.terminated:
+            self._next_event = info.next_event
+            self._fmu.enterStepMode()

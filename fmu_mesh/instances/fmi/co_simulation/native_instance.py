@@ -13,18 +13,7 @@ from typing import Final
 
 from ....errors import NotFinite
 from ....rings import native
-from ....rings.native import (
-    OUT_OF_RANGE,
-    STAGE_BITS,
-    WRONG_ROW,
-    MemberTable,
-    Move,
-    NativeStep,
-    OutputTable,
-    Span,
-    Stage,
-    StepKind,
-)
+from ....rings.native import MemberTable, Move, NativeStep, Span, Stage, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ..buffers import NumberBuffer
@@ -44,18 +33,14 @@ class NativeInstance(FmuInstance):
     """
 
     _kind: StepKind
-    _do_step: Function
-    """The function of the FMU, as cffi calls it."""
+    _do_step: Function  # the function of the FMU, as cffi calls it
 
-    _by_calls = False
-    """Whether the steps have a part that the library does not know."""
+    _by_calls = False  # whether the steps have a part that the library does not know
 
-    _derivatives: Mapping[str, float] = {}
-    """Of the linear inputs, in 1/s, for the next step."""
+    _derivatives: Mapping[str, float] = {}  # of the linear inputs, in 1/s, for the next step
 
     _native: NativeStep | None = None
-    _member: MemberTable | None = None
-    """The member that takes the steps of `do_step`."""
+    _member: MemberTable | None = None  # the member that takes the steps of `do_step`
 
     @property
     def native(self) -> NativeStep | None:
@@ -90,14 +75,14 @@ class NativeInstance(FmuInstance):
         self._in_step = take, pointer(ctypes.addressof(member))
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
-        """See `TakesDerivatives` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
+        """See `FmuInstance` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
         self._derivatives = derivatives  # the FMU gets them after the values of these inputs
 
     def do_step(self, step: int) -> None:
         """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
         take, member = self._in_step
         if outcome := take(member, step):
-            if outcome & 0xFFFFFF != WRONG_ROW:
+            if outcome & 0xFFFFFF != native.WRONG_ROW:
                 self.finish(step, outcome)
             own, library = self._member, native.library
             if own is not None and library is not None and not library.member_is_finite(ctypes.addressof(own), step):
@@ -112,7 +97,7 @@ class NativeInstance(FmuInstance):
 
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`."""
-        stage, status = divmod(outcome, 1 << STAGE_BITS)
+        stage, status = divmod(outcome, 1 << native.STAGE_BITS)
         match stage:
             case Stage.IN_PYTHON:
                 self._step_by_calls(step)
@@ -154,7 +139,7 @@ class NativeInstance(FmuInstance):
 
     def _table(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
         """The member that takes the steps in this process."""
-        own = [OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs]
+        own = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs]
         member = MemberTable(
             kind=tables.kind,
             component=tables.component,
@@ -164,7 +149,7 @@ class NativeInstance(FmuInstance):
             base_step_size=self._base_step_size,
             step_size=self._step_size,
             points=self._points,
-            outputs=(OutputTable * 2)(*own),
+            outputs=(native.OutputTable * 2)(*own),
             bases=(ctypes.c_void_p * native.RowBase.FIRST_GATE)(),
         )
         member.give(loads=tables.loads, setters=tables.setters, getters=tables.getters, stores=tables.stores)
@@ -172,7 +157,7 @@ class NativeInstance(FmuInstance):
 
     def _fail_to_set(self, step: int, status: int) -> None:
         """Raise the error for inputs that the library could not set."""
-        if status != OUT_OF_RANGE:
+        if status != native.OUT_OF_RANGE:
             raise self._part_failed("Set", self._setters[self._said.call], status)
         slot = step & self._input_mask
         for part in self._setters:
@@ -182,7 +167,7 @@ class NativeInstance(FmuInstance):
 
     def _fail_to_get(self, status: int) -> None:
         """Raise the error for outputs that the library could not get."""
-        if status != OUT_OF_RANGE:
+        if status != native.OUT_OF_RANGE:
             raise self._part_failed("Get", self._getters[self._said.call], status)
         for part in self._getters:
             if part.buffer is not None:

@@ -24,17 +24,7 @@ from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ..calls import cffi_function, memory
 from ..clocks import NO_CLOCKS, Clocks
-from ..fmi_versions import (
-    FMI1_VALUES,
-    FMI2_NAMES,
-    FMI2_NEEDED,
-    FMI2_VALUES,
-    FMI3_NEEDED,
-    FMI3_VALUES,
-    Fmi1,
-    Fmi2,
-    Fmi3,
-)
+from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping, FmuInstance
 from ..fmu_values import WARNING
 from ..loaded_fmu import FmuFunctions
@@ -47,10 +37,10 @@ _RowBytes = tuple[bytes | list[Any], ...]
 
 _NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
 _NEEDED_1 = "fmiInstantiateModel", "fmiSetTime", "fmiInitialize", "fmiEventUpdate"
-_NEEDED_2 = *FMI2_NEEDED, "fmi2SetTime", "fmi2NewDiscreteStates", "fmi2EnterContinuousTimeMode"
+_NEEDED_2 = *Fmi2.NEEDED, "fmi2SetTime", "fmi2NewDiscreteStates", "fmi2EnterContinuousTimeMode"
 _NEEDED_3 = (
     "fmi3InstantiateModelExchange",
-    *FMI3_NEEDED,
+    *Fmi3.NEEDED,
     "fmi3SetTime",
     "fmi3UpdateDiscreteStates",
     "fmi3EnterContinuousTimeMode",
@@ -60,19 +50,16 @@ _NEEDED_3 = (
 class ContinuousInstance(FmuInstance):
     """The part of model exchange that all versions share; to be named before the base class of the version."""
 
-    _calls: type[ModelCalls] = ModelCalls
-    """Those of this version."""
+    _calls: type[ModelCalls] = ModelCalls  # those of this version
 
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
     _clocks: Clocks = NO_CLOCKS
-    _row: _RowBytes = ()
-    """The inputs of the last step that are held."""
+    _row: _RowBytes = ()  # the inputs of the last step that are held
     _linear_columns: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
     """The columns of the other ones among those of type Float64."""
     _slopes: Mapping[str, float] = {}
-    _goes_on = False
-    """Whether the linear inputs begin where the last step has left them."""
+    _goes_on = False  # whether the linear inputs begin where the last step has left them
     _time_of_start = 0.0
     _stop_time = math.inf
 
@@ -106,7 +93,7 @@ class ContinuousInstance(FmuInstance):
             self._checked(lambda: loop.event(lambda: set_values(values)))
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
-        """See `TakesDerivatives`."""
+        """See `FmuInstance`."""
         self._slopes, self._goes_on = derivatives, continuous
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
@@ -130,7 +117,7 @@ class ContinuousInstance(FmuInstance):
 
     def _exit_initialization(self) -> None:
         """After Initialization Mode: the first event, then continuous-time mode."""
-        super()._exit_initialization()  # type: ignore[safe-super]  # that of the version, which is the next base class
+        super()._exit_initialization()
         self._checked(lambda: self._make_loop().start(self._time_of_start))
 
     def _bookkeeping(self) -> Bookkeeping:
@@ -155,9 +142,9 @@ class ContinuousInstance(FmuInstance):
 
     def _make_loop(self) -> EventLoop:
         self._loop = EventLoop(
-            self._calls(self._fmu, self._description, self._symbols),
+            self._calls(self._fmu, self.description, self._symbols),
             self._options.solver,
-            tell_completed_steps=self._description.tell_completed_steps,
+            tell_completed_steps=self.description.tell_completed_steps,
             stop_time=self._stop_time,
             clocks=self._clocks,
         )
@@ -170,11 +157,7 @@ class ContinuousInstance(FmuInstance):
         return self._loop
 
     def _advance(self, end: float) -> None:
-        """Advance the model to ``end`` (s).
-
-        Raises:
-            TerminationRequested: the model asks to end the simulation before.
-        """
+        """Advance the model to ``end`` (s); `TerminationRequested` if it asks to end the simulation before."""
         loop = self._event_loop()
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
             raise self._end_requested()
@@ -235,35 +218,30 @@ class ContinuousInstance(FmuInstance):
 class Fmi1ModelInstance(ContinuousInstance, Fmi1):
     """One instance of an FMI 1.0 FMU for model exchange (FMI 1.0, 2.8)."""
 
-    _functions = FmuFunctions(FMU1Model, FMI1_VALUES, "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
+    _functions = FmuFunctions(FMU1Model, Fmi1.VALUES, "fmi1FreeModelInstance", _NEEDED_1, _NAMES)
     _calls = Fmi1Calls
-
-    def _instantiate(self, **arguments: object) -> None:
-        super()._instantiate(**arguments)
-        self._own_calls = Fmi1Calls(self._fmu, self._description, self._symbols)
+    _end = "Terminate"
 
     def _initialize(self, start_time: float, stop_time: float | None) -> None:
         """FmiInitialize (FMI 1.0, 2.5)."""
         tolerance = self._options.solver.relative_tolerance
-        self._checked(lambda: self._own_calls.initialize(start_time, tolerance))
-
-    def _terminate(self) -> None:
-        self._own_calls.terminate()
+        calls = Fmi1Calls(self._fmu, self.description, self._symbols)
+        self._checked(lambda: calls.initialize(start_time, tolerance))
 
 
 class Fmi2ModelInstance(ContinuousInstance, Fmi2):
     """One instance of an FMI 2.0 FMU for model exchange (FMI 2.0, 3.2)."""
 
-    _functions = FmuFunctions(FMU2Model, FMI2_VALUES, "fmi2FreeInstance", _NEEDED_2, FMI2_NAMES)
+    _functions = FmuFunctions(FMU2Model, Fmi2.VALUES, "fmi2FreeInstance", _NEEDED_2, Fmi2.NAMES)
 
 
 class Fmi3ModelInstance(ContinuousInstance, Fmi3):
     """One instance of an FMI 3.0 FMU for model exchange (FMI 3.0, 3.2)."""
 
-    _functions = FmuFunctions(FMU3Model, FMI3_VALUES, "fmi3FreeInstance", _NEEDED_3, {"instantiate": _NEEDED_3[0]})
+    _functions = FmuFunctions(FMU3Model, Fmi3.VALUES, "fmi3FreeInstance", _NEEDED_3, {"instantiate": _NEEDED_3[0]})
     _calls = Fmi3Calls
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         super()._enter_initialization(start_time, stop_time, start_values)
-        self._clocks = Clocks(self._fmu, self._description.clocks)
+        self._clocks = Clocks(self._fmu, self.description.clocks)
         self._clocks.start(start_time)

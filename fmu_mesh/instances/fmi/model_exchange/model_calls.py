@@ -9,37 +9,23 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
 from ....variables.model_description import ModelDescription
 from ..calls import checked_function
+from ..clocks import EventInfo, updated
 from ..fmu_library import MISSING
 
-__all__ = ["EventInfo", "Fmi1Calls", "Fmi3Calls", "ModelCalls"]
+__all__ = ["Fmi1Calls", "Fmi3Calls", "ModelCalls"]
 
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
 _EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
-_TERMINATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
 _COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
-
-
-class EventInfo(NamedTuple):
-    """What one event iteration returns (FMI 2.0, 3.2.2: fmi2EventInfo).
-
-    Attributes:
-        again: the iteration has not converged yet.
-        terminate: the FMU asks to end the simulation.
-        next_event: time of the next time event in s; infinite if there is none.
-    """
-
-    again: bool
-    terminate: bool
-    next_event: float
 
 
 class ModelCalls:
@@ -140,11 +126,6 @@ class Fmi1Calls(ModelCalls):
         self._event_update = self._function("EventUpdate", _EVENT_UPDATE)
         self._completed_step = self._function("CompletedIntegratorStep", _COMPLETED)
         self._initialize = self._function("Initialize", _INITIALIZE)
-        self._terminate = self._function("Terminate", _TERMINATE)
-
-    def terminate(self) -> None:
-        """End the simulation."""
-        self._terminate(self._component)
 
     def initialize(self, time: float, tolerance: float) -> None:
         """Compute what follows from the values that were set, at ``time`` in s (FMI 1.0, 2.5)."""
@@ -183,5 +164,4 @@ class Fmi3Calls(ModelCalls):
 
     def update_discrete_states(self) -> EventInfo:
         """One event iteration, in event mode."""
-        again, terminate, _nominals, _states, defined, time = self._fmu.updateDiscreteStates()
-        return EventInfo(bool(again), bool(terminate), float(time) if defined else math.inf)
+        return updated(self._fmu)

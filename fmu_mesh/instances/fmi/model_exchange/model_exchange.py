@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final
 
 import numpy as np
 
 from ....simtime import resolvable
-from ..clocks import NO_CLOCKS, Clocks
+from ..clocks import EVENT_ITERATIONS, NO_CLOCKS, Clocks
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
 from .model_calls import ModelCalls
@@ -29,18 +28,12 @@ from .solver import make_solver
 
 __all__ = ["EventLoop"]
 
-EVENT_ITERATIONS: Final = 1000
-"""After this many event iterations, or events at the same time, a model does not converge."""
-
 
 class EventLoop:
     """One model between its communication points.
 
     The time of the FMU is never set to a later one than ``stop_time`` (s). It is told of completed integrator steps if
     it needs that.
-
-    Attributes:
-        terminated: whether the FMU has asked to end the simulation; nothing may be advanced then.
 
     Call sequence: `start` in event mode, then `advance`, and `event` wherever values are set in between; `close`.
 
@@ -58,7 +51,7 @@ class EventLoop:
         stop_time: float = math.inf,
         clocks: Clocks = NO_CLOCKS,
     ) -> None:
-        self.terminated = False
+        self.terminated = False  # whether the FMU has asked to end the simulation; nothing may be advanced then
         self._clocks = clocks
         self._calls = calls
         self._tell = tell_completed_steps
@@ -167,23 +160,9 @@ class EventLoop:
 
     def _update(self) -> None:
         """The event iteration, in event mode, and back to continuous-time mode."""
-        self._clocks.set_due(self._time)
-        self.terminated, next_event = self._iterate()
+        info = self._clocks.settle(self._time, self._calls.update_discrete_states)
+        self.terminated = info.terminate
         if not self.terminated:
-            self._clocks.update_intervals(self._time)
-            self._next_event = min(next_event, self._clocks.next_tick)
+            self._next_event = min(info.next_event, self._clocks.next_tick)
             self._calls.enter_continuous_time_mode()
             self._solver.restart()
-
-    def _iterate(self) -> tuple[bool, float]:
-        """Update the discrete states until they need no update; whether the FMU asks to end, and its next time event.
-
-        Raises:
-            SolverFailed: they need updates for ever.
-        """
-        for _ in range(EVENT_ITERATIONS):
-            info = self._calls.update_discrete_states()
-            self._clocks.read()
-            if info.terminate or not info.again:
-                return info.terminate, info.next_event
-        raise SolverFailed(f"the discrete states at t = {self._time:.12g} s need more than {EVENT_ITERATIONS} updates")

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, Final, NoReturn, Protocol
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
@@ -71,12 +71,14 @@ _MOST_STALLED: Final = 100
 """Solver steps in a row that do not advance time beyond rounding."""
 
 
-class Solver(Protocol):
-    """Call sequence: `restart`, then `step` from where the last one ended; `restart` after every event; `close`."""
+class Solver:
+    """Base of the solvers, and the one for a model with neither continuous states nor event indicators.
+
+    Call sequence: `restart`, then `step` from where the last one ended; `restart` after every event; `close`.
+    """
 
     def restart(self) -> None:
         """Begin anew, at the states and nominal values of the model."""
-        ...
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """One step from ``time`` to ``stop`` (s) at most: the time reached, and whether an event indicator crossed 0.
@@ -87,37 +89,22 @@ class Solver(Protocol):
             SolverFailed: the solver gave up; the text says why.
             FMICallException: the model could not be evaluated.
         """
-        ...
+        return stop, False  # the event loop puts a model without states there
 
     def close(self) -> None:
         """Free its memory."""
-        ...
 
 
 def make_solver(settings: SolverSettings, equations: ModelCalls) -> Solver:
     """The solver for these settings; one that does nothing for a model without states and event indicators."""
     if equations.n_states == 0 and equations.n_indicators == 0:
-        return NothingToSolve()
+        return Solver()
     if settings.name == "euler":
         return EulerSolver(equations, settings.maximum_step_size)
     return CVodeSolver(equations, settings.relative_tolerance, settings.maximum_step_size)
 
 
-class NothingToSolve:
-    """For a model with neither continuous states nor event indicators."""
-
-    def restart(self) -> None:
-        """Nothing to do."""
-
-    def step(self, time: float, stop: float) -> tuple[float, bool]:
-        """Go to ``stop``; the model is put there by its event loop."""
-        return stop, False
-
-    def close(self) -> None:
-        """Nothing to do."""
-
-
-class EulerSolver:
+class EulerSolver(Solver):
     """Forward Euler; events are seen at the end of the step in which they happen.
 
     ``maximum_step_size`` is in s; None: one step per communication step.
@@ -153,9 +140,6 @@ class EulerSolver:
         self._before = above
         return end, crossed
 
-    def close(self) -> None:
-        """Nothing to free."""
-
     def _divided(self, time: float, stop: float) -> list[float]:
         """The ends of equal steps, no longer than allowed, from ``time`` to ``stop``; the first is the last item."""
         if self._maximum is None:
@@ -170,7 +154,7 @@ class EulerSolver:
         return self._indicators > 0.0
 
 
-class CVodeSolver:
+class CVodeSolver(Solver):
     """CVode of SUNDIALS: variable-order BDF with root finding, one internal step per call and never beyond ``stop``.
 
     ``maximum_step_size`` is in s; None: as long as the communication step.
@@ -194,8 +178,7 @@ class CVodeSolver:
         self._rhs = _RHS(lambda time, x, dx, _: self._guarded(self._derivatives, time, data(x), data(dx)))
         self._root = _ROOT(lambda time, x, z, _: self._guarded(self._indicators, time, data(x), z))
         self._handler = _HANDLER(told)
-        self._is_new = True
-        """Whether CVode begins anew in its next step."""
+        self._is_new = True  # whether CVode begins anew in its next step
         self._started = False
         self._stalled = 0
         self._context = ctypes.c_void_p()
