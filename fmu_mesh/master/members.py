@@ -18,7 +18,7 @@ from ..rings.host_memory import Offer
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
-from ..wire.messages import HEADER, decode_json, encode_abort
+from ..wire.messages import ABORT, HEADER, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import tokens, undeclare_all
@@ -126,7 +126,7 @@ class Members:
     def abort(self, error: FmuMeshError) -> None:
         """Tell the nodes why the run ends, and wait so that they can end themselves."""
         for publisher in self._grants:
-            publisher.put(encode_abort(error.report()))
+            publisher.put(encode_json(ABORT, error.report()))
         for query in self._waiting.values():
             query.reply_err(str(error))
             query.drop()

@@ -48,10 +48,11 @@ from ..wire.messages import (
     HEADER,
     INITIAL,
     PROGRESS,
+    SET,
     NodeReport,
     SetValue,
     decode_json,
-    encode_set,
+    encode_json,
 )
 from ..wire.session import RouterLink
 from .activity import Activity
@@ -436,7 +437,7 @@ class Node:
     def _tell_set(self, value: SetValue) -> None:
         """Tell the recorder which value another program has set."""
         if RECORDER in dict(self._plan.windows):
-            self._put_set(encode_set(value))
+            self._put_set(encode_json(SET, value, value.point))
 
     def _has_no_master(self) -> bool:
         return self._token_went and self._membership.master_is_gone

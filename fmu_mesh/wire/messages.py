@@ -33,8 +33,7 @@ __all__ = [
     "NodeReport",
     "SetValue",
     "decode_json",
-    "encode_abort",
-    "encode_set",
+    "encode_json",
     "sealed",
 ]
 
@@ -94,14 +93,9 @@ def sealed(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-def encode_abort(report: ErrorReport) -> bytes:
-    """An ABORT message."""
-    return HEADER.pack(ABORT, 0, 0, 0) + msgspec.json.encode(report)
-
-
-def encode_set(value: SetValue) -> bytes:
-    """A SET message: another program has set a value."""
-    return HEADER.pack(SET, 0, 0, value.point) + msgspec.json.encode(value)
+def encode_json(kind: int, content: ErrorReport | SetValue, point: int = 0) -> bytes:
+    """An ABORT or SET message."""
+    return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
 
 
 def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:
