@@ -108,10 +108,8 @@ class FoxgloveServer:
     ) -> None:
         """Offer the topics and parameters of a run; clients forget the one before.
 
-        Args:
-            schemas: for every topic the JSON Schema of its messages, and its metadata.
-            parameters: what clients may read and set.
-            changed: called on a thread of the SDK when a client subscribes to a topic or unsubscribes.
+        ``schemas`` has for every topic the JSON Schema of its messages, and its metadata. ``changed`` is called on a
+        thread of the SDK when a client subscribes to a topic or unsubscribes.
         """
         for channel in self._variables.values():
             channel.close()

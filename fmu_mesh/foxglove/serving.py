@@ -54,12 +54,9 @@ class Serving(ServedMesh, frozen=True):
 
 
 def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | None = None) -> None:
-    """Serve a mesh, and again when it starts again.
+    """Serve a mesh, and again when it starts again; ``say`` gets what happens in sentences.
 
-    Args:
-        serving: what is served, and where.
-        say: told in sentences what happens.
-        stop: ends it when it is set, within a second if no mesh runs; None: only an exception ends it.
+    ``stop`` ends it when it is set, within a second if no mesh runs; without it, only an exception does.
 
     Raises:
         ConfigurationError: the port cannot be used, there are several meshes, or no variable fits a pattern.

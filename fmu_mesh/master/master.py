@@ -82,10 +82,7 @@ class Master:
     """The master of one run.
 
     Args:
-        plan: the plan of the whole mesh.
         session: the session of this process; the caller closes it.
-        events: gets the status and the log messages of the run.
-        settings: how the mesh is run.
         router: the link to the router that connects the nodes, if there is one.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.

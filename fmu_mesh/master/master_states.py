@@ -94,10 +94,6 @@ Action = AnswerAll | FollowClock | RaiseGrant | SendToAll | EndAll
 class MasterStates:
     """The state of one run, as its master sees it.
 
-    Args:
-        plan: the plan of the whole mesh.
-        paused: whether the run begins paused at its first point.
-
     Attributes:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.

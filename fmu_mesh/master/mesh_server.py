@@ -47,14 +47,7 @@ class Events(Protocol):
 
 
 class MasterServer:
-    """Serves the queries of one run.
-
-    Args:
-        session: the session of this process; the caller closes it.
-        inbox: the inbox of the master.
-        status: the state of the run right now.
-        instances: the names of all instances.
-    """
+    """Serves the queries of one run."""
 
     def __init__(  # noqa: PLR0913, PLR0917  the run and who learns of it
         self,

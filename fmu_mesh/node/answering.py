@@ -63,7 +63,6 @@ class Answers:
     """Answers for the instances of one node.
 
     Args:
-        inbox: the inbox of the node, to let the main thread do something.
         post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
         tell: tells the recorder, if there is one, which value was set; on the main thread.

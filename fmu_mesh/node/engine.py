@@ -99,9 +99,7 @@ class Engine(ABC):
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
-        Args:
-            wait_s: in s.
-            eager: whether to return instead of waiting when there was a step: its rows have to be sent.
+        If it is ``eager``, it returns instead of waiting when there was a step: its rows have to be sent.
 
         Raises:
             FmuMeshError: a step failed, or a ring has something that its writer never wrote.

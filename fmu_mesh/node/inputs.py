@@ -47,7 +47,6 @@ class TimedInputs(AroundNativeSteps):
 
     Args:
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
-        courses: what a scenario prescribes, by variable.
 
     Attributes:
         python_at: the next own step that `do_step` has to take, because a value may change in it.

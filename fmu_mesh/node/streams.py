@@ -143,12 +143,9 @@ class InstanceStreams:
         return matches(self._publisher)
 
     def look(self, seconds: float | None = None) -> bool:
-        """Find the variables that have subscribers; return whether `update` is due.
+        """On the server's thread: find the variables that have subscribers; return whether `update` is due.
 
-        On the server's thread.
-
-        Args:
-            seconds: go on with the present search for this time; None: search anew, to the end.
+        Go on with the present search for some ``seconds``; without them, search anew, to the end.
         """
         end = time.monotonic() + (seconds if seconds is not None else math.inf)
         if seconds is None or self._search is None or not self.is_followed:

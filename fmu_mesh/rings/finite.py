@@ -76,9 +76,7 @@ class FiniteRows:
     def explain(self, error: FmuMeshError, get: Get | None = None) -> None:
         """Add to a failure of the instance the first input that was not finite, and its source.
 
-        Args:
-            error: the failure; nothing is added to other errors.
-            get: reads the inputs after Initialization Mode; None: they are those of the last step.
+        ``get`` reads the inputs after Initialization Mode; without it, they are those of the last step.
         """
         if not isinstance(error, FmuError):
             return

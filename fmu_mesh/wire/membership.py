@@ -127,7 +127,6 @@ class Membership:
 
     Args:
         inbox: its inbox; opened by `join`.
-        launch: the launcher that started this process; None if it was started manually.
         memory: the shared memory, for a participant in the process of the master.
 
     Attributes:
@@ -168,9 +167,8 @@ class Membership:
     ) -> None:
         """Begin to register, on a separate thread: FMUs can be loaded meanwhile.
 
-        Args:
-            on_admitted: called on that thread when the master has admitted this node.
-            on_master_gone: called on a thread of Zenoh when the master's token seems to be gone; call `master_is_gone`.
+        ``on_admitted`` is called on that thread when the master has admitted this node, and ``on_master_gone`` on a
+        thread of Zenoh when the master's token seems to be gone: ask `master_is_gone`.
         """
 
         def run() -> None:

@@ -72,7 +72,6 @@ class SetValue(msgspec.Struct, frozen=True):
     """A value that another program gave to an input or a parameter while the mesh ran.
 
     Attributes:
-        value: the value, as JSON has it.
         point: the communication point at which the instance took it: the step from there is the first that may use it.
         time: simulation time in s from which on it holds; None: from `point` on.
         key: the Zenoh key under which it was sent.

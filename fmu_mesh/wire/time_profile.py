@@ -44,7 +44,6 @@ class UnitProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         steps: own steps of its first instance.
-        bursts: number of bursts.
         compute_s: time spent in them: in the FMU, and for reading and writing rows.
     """
 
@@ -62,8 +61,7 @@ class NodeProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ended: instant of the end of its last step.
         transport_s: time spent encoding and sending frames, and decoding received ones.
         wait_s: time spent waiting for a message, by the source instance that it waited for, or `GRANT`.
-        bursts: the time line of stepping; only the first ones, if there are too many.
-        waits: likewise, the time line of waiting.
+        bursts: the time line of stepping, and ``waits`` that of waiting; only the first ones, if there are too many.
         cut: number of entries that are missing in the time lines.
     """
 

@@ -39,7 +39,6 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
 
     Attributes:
         key: the key of its value, below that of the instance.
-        shape: the sizes of an array's dimensions.
         minimum: the smallest value that its model description allows; None without one. So is ``maximum``.
         items: item names and values of an Enumeration.
         settable: whether it can be set while the mesh runs (`fmu_mesh.system.start_values`).

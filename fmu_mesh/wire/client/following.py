@@ -117,7 +117,6 @@ class ValueStream:
     """Values as they come, as long as the `with` block lasts; from any thread.
 
     Args:
-        session: a session that reaches the mesh.
         limit: number of values that wait at most; of more, the oldest are lost.
     """
 

@@ -119,9 +119,7 @@ class MeshClient:
     ) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
         """The status of the mesh and of its instances, with one query; instances that do not answer are left out.
 
-        Args:
-            subscribed: by instance, the variables that this session has just subscribed to, so that the nodes know it;
-                None: all of the instance.
+        It tells the nodes what this session has just ``subscribed`` to: by instance, variables, or None for all.
         """
         key = f"{self.keys.root}/*/status" + (f"?{SUBSCRIBED}" if subscribed is not None else "")
         names = msgspec.json.encode(subscribed) if subscribed is not None else None
@@ -209,10 +207,7 @@ class MeshClient:
     def set(self, target: Target, value: object, at: float | None = None) -> SetAnswer:
         """Set an unconnected input or a tunable parameter; the answer says from which point on the value holds.
 
-        Args:
-            target: the variable.
-            value: a Python or numpy value.
-            at: simulation time in s from which on it holds; None: from the next point on.
+        That is the next one, or the one ``at`` a simulation time in s.
         """
         plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         try:
