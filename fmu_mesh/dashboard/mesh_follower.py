@@ -81,11 +81,9 @@ class MeshView(msgspec.Struct, frozen=True):
     """What is known of a mesh at one moment.
 
     Attributes:
-        key: its key, by which it is known here.
         info: None before it was reached.
         status: the newest one; after the end the last one.
-        instances: the newest statuses by instance.
-        before: those of the look before, for rates.
+        before: the ``instances`` of the look before, for rates.
         infos: what the instances are, in the order of the mesh.
         trouble: why it is not reached.
         failure: why the run failed; None if it did not, or goes on.

@@ -15,7 +15,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Final, Self
 from urllib.parse import urlencode
 
@@ -174,14 +174,10 @@ class FoxgloveServer:
                 graph.set_subscribed_topic(topic, list(readers))
         self._server.publish_connection_graph(graph)
 
-    @property
-    def subscribed_parameters(self) -> tuple[str, ...]:
-        """The names of the parameters that clients follow."""
-        return self._listener.subscribed_parameters
-
-    def show_parameters(self, parameters: Sequence[Parameter]) -> None:
-        """Send parameters to the clients that follow them."""
-        self._server.publish_parameter_values(list(parameters))
+    def show_parameters(self, parameters: MeshParameters) -> None:
+        """Send the parameters that have changed to the clients that follow them."""
+        if (names := self._listener.subscribed_parameters) and (changed := parameters.changes(names)):
+            self._server.publish_parameter_values(changed)
 
     def _send_lines(self) -> None:
         """Send the log messages that wait, if there is a reader."""

@@ -243,8 +243,7 @@ class _ShownMesh:
                     readings = self._client.get(targets)
                 self._answers.put(readings)
                 self._stream.wake()
-            if (names := self._server.subscribed_parameters) and (changed := self._parameters.changes(names)):
-                self._server.show_parameters(changed)
+            self._server.show_parameters(self._parameters)
 
 
 def _metadata(target: Target) -> dict[str, str]:
