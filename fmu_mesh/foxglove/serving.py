@@ -21,7 +21,6 @@ from ..wire.client.following import ValueStream
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Reading, Target
-from ..wire.client.waiting import appearance
 from ..wire.views import MeshInfo, MeshStatus
 from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
@@ -74,7 +73,7 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
                 is_reported = True
             try:
                 with Meshes(serving.connect, serving.timeout) as meshes:
-                    client = appearance(meshes, mesh, _START_S)
+                    client = meshes.appearance(mesh, _START_S)
                     try:
                         _show(serving, client, server, say)
                     except FmuMeshError:

@@ -97,10 +97,8 @@ class Follower(Generic[Item]):
             yield late
 
     def _next(self, deadline: float | None) -> Item | None:
-        if deadline is None:
-            return self.arrived.get()
         try:
-            return self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
+            return self.arrived.get(timeout=None if deadline is None else max(0.0, deadline - time.monotonic()))
         except queue.Empty:
             raise DeadlineExceeded(f"mesh '{self._keys.mesh}' did not end in time") from None
 

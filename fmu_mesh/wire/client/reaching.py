@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from typing import NamedTuple, Self, TypeVar
 
 import zenoh
@@ -87,28 +87,23 @@ class Meshes:
         """The keys of the meshes that were found by the last look, whether they answer or not."""
         return [found.keys.root for found in self._found]
 
-    @contextmanager
-    def changes(self) -> Iterator[Callable[[float], None]]:
-        """Within the context: a function that waits until the meshes may have changed, for at most some seconds."""
-        changed = threading.Event()
-
-        def wait(left_s: float) -> None:
-            # There is no event for a new note. There is one for a token, but a query for it may still have been empty.
-            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _NOTE_CHECK_S))
-            changed.clear()
-
+    def appearance(self, mesh: str | None, timeout_s: float) -> MeshClient:
+        """Wait until a mesh is there: the one with this name or key, or the only one."""
+        end, changed = time.monotonic() + timeout_s, threading.Event()
         with ExitStack() as stack:
             if self._endpoints:
                 liveliness = self._open(self._endpoints, _NOBODY).session().liveliness()
                 watcher = liveliness.declare_subscriber(_TOKENS, lambda _token: changed.set(), history=True)
                 stack.callback(watcher.undeclare)
-            yield wait
-
-    def appeared(self, mesh: str | None) -> MeshClient | None:
-        """The mesh with this name or key, or the only mesh; None if there is none."""
-        if mesh is None:
-            return self.named(None) if self._found else None
-        return self.named(mesh) if any(mesh in found.names for found in self._found) else None
+            while (left_s := end - time.monotonic()) > 0:
+                self.look()
+                if any(mesh is None or mesh in found.names for found in self._found):
+                    return self.named(mesh)
+                # There is no event for a new note. There is one for a token, but a query for it may still be empty.
+                changed.wait(min(left_s, _AGAIN_S if self._endpoints else _NOTE_CHECK_S))
+                changed.clear()
+        who = f"mesh '{mesh}'" if mesh is not None else "mesh"
+        raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="A larger `timeout=...` waits longer.")
 
     def all(self) -> list[MeshClient]:
         """All meshes that answer, at least one."""
