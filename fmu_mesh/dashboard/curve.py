@@ -103,11 +103,6 @@ class BoundedCurve:
         with self._lock:
             return self._recent[span].since(version) if span in self._recent else self._whole.since(version)
 
-    @property
-    def size(self) -> int:
-        """Memory of its values in bytes."""
-        return self._whole.size + sum(recent.size for recent in self._recent.values())
-
 
 class Looks:
     """Which values were looked at in the look before, so that none that could be had is missing between them."""
@@ -151,11 +146,6 @@ class _Intervals:
         self._joined = np.zeros(count, bool)  # whether a line leads from its last value to the next interval
         self._changed = np.zeros(count, np.int64)
         self._version = self._whole_since = next(_first_versions)
-
-    @property
-    def size(self) -> int:
-        """Memory in bytes."""
-        return sum(part.nbytes for part in vars(self).values() if isinstance(part, np.ndarray))
 
     def since(self, version: int) -> CurveChange:
         """As `BoundedCurve.since`."""

@@ -82,7 +82,6 @@ class HostMemory:
 
     def __init__(self, memory: mmap.mmap, map_: MemoryMap, process: str, descriptor: int | None = None) -> None:
         self.map = map_
-        self.process = process
         self._memory = memory
         self._descriptor = descriptor
         self._view = memoryview(memory)
