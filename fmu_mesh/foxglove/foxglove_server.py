@@ -16,7 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, Final, Self
+from typing import Final, Self
 from urllib.parse import urlencode
 
 import foxglove
@@ -27,9 +27,10 @@ from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
 from ..errors import ConfigurationError
 from ..web_server import listening, shown_host
+from ..wire.client.readings import Target
 from ..wire.views import LogLine
 from .mesh_parameters import MeshParameters
-from .mesh_topics import STATUS_SCHEMA
+from .mesh_topics import STATUS_SCHEMA, metadata_of, schema_of
 from .relay import Relay, let_in
 
 __all__ = ["FoxgloveServer"]
@@ -100,16 +101,10 @@ class FoxgloveServer:
 
     # --- one run
 
-    def begin(
-        self,
-        schemas: Mapping[str, tuple[dict[str, Any], dict[str, str]]],
-        parameters: MeshParameters,
-        changed: Callable[[], None],
-    ) -> None:
-        """Offer the topics and parameters of a run; clients forget the one before.
+    def begin(self, targets: Mapping[str, Target], parameters: MeshParameters, changed: Callable[[], None]) -> None:
+        """Offer variables by topic, and parameters of a run; clients forget the one before.
 
-        ``schemas`` has for every topic the JSON Schema of its messages, and its metadata. ``changed`` is called on a
-        thread of the SDK when a client subscribes to a topic or unsubscribes.
+        ``changed`` is called on a thread of the SDK when a client subscribes to a topic or unsubscribes.
         """
         for channel in self._variables.values():
             channel.close()
@@ -120,8 +115,8 @@ class FoxgloveServer:
         self._listener.serve((parameters, changed))
         self._server.clear_session()  # whereupon clients ask for parameters again
         self._variables = {
-            topic: Channel(topic, schema=schema, metadata=metadata, context=self._context)
-            for topic, (schema, metadata) in schemas.items()
+            topic: Channel(topic, schema=schema_of(target), metadata=metadata_of(target), context=self._context)
+            for topic, target in targets.items()
         }
 
     def end(self) -> None:

@@ -24,7 +24,7 @@ from ..wire.client.readings import Reading, Target
 from ..wire.views import MeshInfo, MeshStatus
 from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
-from .mesh_topics import message_of, schema_of, status_message, topic_of, topics_by_instance
+from .mesh_topics import message_of, status_message, topic_of, topics_by_instance
 
 __all__ = ["Serving", "serve"]
 
@@ -147,8 +147,7 @@ class _ShownMesh:
     def show(self) -> MeshStatus | None:
         """Show it until it ends; returns its last status, if one has come."""
         with self._stream, self._client.until_end(self._stream.wake) as ended:
-            schemas = {topic: (schema_of(target), _metadata(target)) for topic, target in self._targets.items()}
-            self._server.begin(schemas, self._parameters, self._stream.wake)
+            self._server.begin(self._targets, self._parameters, self._stream.wake)
             self._server.show_graph(topics_by_instance(self._infos, list(self._targets.values())))
             threads = [
                 threading.Thread(target=work, name=work.__name__, daemon=True)
@@ -243,9 +242,3 @@ class _ShownMesh:
                 self._answers.put(readings)
                 self._stream.wake()
             self._server.show_parameters(self._parameters)
-
-
-def _metadata(target: Target) -> dict[str, str]:
-    """What Foxglove shows about a topic."""
-    names = ("unit", "description", "type", "causality", "variability")
-    return {name: fact for name in names if (fact := getattr(target.variable, name))}
