@@ -94,11 +94,7 @@ class ResultSource:
 
 
 class _Reader:
-    """Feeds curves with the rows of one tail.
-
-    Attributes:
-        after: the time of the row that was read last in s; None at the start, and after rows that were left out.
-    """
+    """Feeds curves with the rows of one tail; ``after`` is the time of the last one in s, None if some are left out."""
 
     def __init__(self, tail: Tail) -> None:
         self.tail = tail

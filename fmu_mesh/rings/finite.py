@@ -27,11 +27,7 @@ _MANY = 32
 
 
 class FiniteRows:
-    """Checks the output rows of one instance, and says what was not finite.
-
-    Attributes:
-        spans: where these outputs are in a row, for the burst.
-    """
+    """Checks the output rows of one instance, and says what was not finite; ``spans`` are for the burst."""
 
     def __init__(self, plan: InstancePlan, outputs: Ring, inputs: Ring) -> None:
         self._plan = plan

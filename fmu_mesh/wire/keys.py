@@ -37,11 +37,7 @@ def unescape(chunk: str) -> str:
 
 
 class Keys(msgspec.Struct, frozen=True):
-    """The public keys of one mesh, and the beginning of its internal keys.
-
-    Attributes:
-        prefix: first part of every key, `fmu_mesh` by default.
-    """
+    """The public keys of one mesh, and the beginning of its internal keys; all begin with ``prefix``."""
 
     prefix: str
     mesh: str

@@ -100,11 +100,7 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node reports when its links work.
-
-    Attributes:
-        opened: what its seal was made from.
-    """
+    """What a node reports when its links work; ``opened`` is what its seal was made from."""
 
     shared: bool = False
     opened: str = ""

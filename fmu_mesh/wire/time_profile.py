@@ -94,11 +94,7 @@ class NodeProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeshProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The profile of one run.
-
-    Attributes:
-        held_s: how long each node limited the grant.
-    """
+    """The profile of one run; ``held_s`` says how long each node limited the grant."""
 
     nodes: tuple[NodeProfile, ...]
     held_s: dict[str, float]

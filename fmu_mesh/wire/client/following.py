@@ -112,11 +112,7 @@ class Follower(Generic[Item]):
 
 
 class ValueStream:
-    """Values as they come, as long as the `with` block lasts; from any thread.
-
-    Args:
-        limit: number of values that wait at most; of more, the oldest are lost.
-    """
+    """Values as they come, as long as the `with` block lasts; from any thread. Over ``limit`` the oldest are lost."""
 
     def __init__(self, session: zenoh.Session, limit: int) -> None:
         self._session = session
