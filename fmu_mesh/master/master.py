@@ -287,10 +287,7 @@ class Master:
 
     @property
     def ended_by(self) -> TerminationRequested | NotFinite | None:
-        """Why the simulation ended before its last point, and not at once.
-
-        An FMU asked for it, an output is not finite, or there was a `stop` and no stop time.
-        """
+        """Why the simulation ended before its last point, and not at once, as `MasterStates` has it."""
         return self._states.ended_by
 
     @property

@@ -18,12 +18,7 @@ GRANT = ""
 
 
 class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Steps that a node took in a row.
-
-    Attributes:
-        unit: index of the unit that stepped, in `NodeProfile.units`.
-        steps: own steps of its first instance.
-    """
+    """Steps that a node took in a row: own steps of the first instance of a unit, which is an index of its `units`."""
 
     start: float
     end: float

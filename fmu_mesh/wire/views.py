@@ -154,11 +154,9 @@ class LogLine(msgspec.Struct, frozen=True):
 
 
 class SetAnswer(msgspec.Struct, frozen=True):
-    """Answer to a query that sets an input or a parameter: the point from which on the value holds.
+    """Answer to a query that sets an input or a parameter: the point from which on the value holds, and its time in s.
 
-    Attributes:
-        time: of this point, in s.
-        late: whether the time that the query asked for was past.
+    It is ``late`` if the time that the query asked for was past.
     """
 
     key: str
