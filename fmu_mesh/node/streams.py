@@ -112,10 +112,8 @@ class InstanceStreams:
     """The streams of one instance.
 
     One publisher for all variables tells whether somebody may listen. Only then `look` finds out to what, so that
-    nothing is declared for a variable (an FMU may have 60,000).
-
-    Args:
-        changed: called on a thread of Zenoh when the instance gets its first or loses its last subscriber.
+    nothing is declared for a variable (an FMU may have 60,000). ``changed`` is called on a thread of Zenoh when the
+    instance gets its first or loses its last subscriber.
     """
 
     def __init__(

@@ -36,13 +36,9 @@ _WAITING_SAMPLES = 1 << 16
 
 
 class Follower(Generic[Item]):
-    """Follows a mesh as long as the `with` block lasts.
+    """Follows a mesh as long as the `with` block lasts; ``on_end`` is called on a thread of Zenoh when the mesh ends.
 
-    Args:
-        on_end: called on a thread of Zenoh when the mesh ends.
-
-    Attributes:
-        arrived: what subscribers have received, in order; None marks the end of the mesh.
+    The queue ``arrived`` has what subscribers have received, in order, and None at the end of the mesh.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, on_end: Callable[[], None] = lambda: None) -> None:
