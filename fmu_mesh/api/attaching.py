@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from ..config.call_options import checked
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
-from ..wire.client.waiting import appearance
 from ..wire.views import MeshStatus
 from .run_handle import TIMEOUT_S, Run
 
@@ -48,7 +47,7 @@ def attach(
     """
     with ExitStack() as stack:
         found = stack.enter_context(Meshes(_endpoints(connect), timeout))
-        client = found.named(name) if wait is None else appearance(found, name, wait)
+        client = found.named(name) if wait is None else found.appearance(name, wait)
         stack.enter_context(client.noticing())
         return Run(client.keys.mesh, attached=(client, stack.pop_all()))
 

@@ -79,12 +79,8 @@ class BoundedCurve:
         """Add values of one source; those that are not finite are left out.
 
         A line leads from a value to the next one where none is missing between them: where both are finite, and as near
-        to each other as others are.
-
-        Args:
-            times: in s, shape `(n,)`.
-            values: of the same shape.
-            after: the time of the value of the source before them; None: there was none, or some may be missing.
+        to each other as others are. ``after`` is the time of the value of the source before them in s; None: there was
+        none, or some may be missing.
         """
         finite = np.isfinite(values) & np.isfinite(times)
         ends, known = (times, finite) if after is None else (np.append(after, times), np.append(True, finite))
@@ -103,19 +99,9 @@ class BoundedCurve:
                 part.join(*lines)
 
     def since(self, version: int, span: int = 0) -> CurveChange:
-        """What has changed since a version; 0 stands for a page that has nothing yet.
-
-        Args:
-            version: that of the newest change that the page has.
-            span: one of `SPANS`; 0: from the start on.
-        """
+        """What has changed since the version that a page has, 0 for nothing yet; ``span``: see `CurveQuestion`."""
         with self._lock:
             return self._recent[span].since(version) if span in self._recent else self._whole.since(version)
-
-    @property
-    def size(self) -> int:
-        """Memory of its values in bytes."""
-        return self._whole.size + sum(recent.size for recent in self._recent.values())
 
 
 class Looks:
@@ -136,11 +122,8 @@ class Looks:
     def after(self, name: str, now: float, time: float, step: float) -> float | None:
         """Take the time of a value, and give that of the value before; None if values may be missing between them.
 
-        Args:
-            name: of the variable.
-            now: when the value came. It may be as old as its question, so the time since the look before began counts.
-            time: in s.
-            step: the time from one value to the next one in s: within it, none is missing.
+        Within ``step`` seconds none is missing. A value that came ``now`` may be as old as its question, so the time
+        since the look before began counts.
         """
         number, began, before = self._last.get(name, (-1, -math.inf, -math.inf))
         self._last[name] = self._number, self._began, time
@@ -163,11 +146,6 @@ class _Intervals:
         self._joined = np.zeros(count, bool)  # whether a line leads from its last value to the next interval
         self._changed = np.zeros(count, np.int64)
         self._version = self._whole_since = next(_first_versions)
-
-    @property
-    def size(self) -> int:
-        """Memory in bytes."""
-        return sum(part.nbytes for part in vars(self).values() if isinstance(part, np.ndarray))
 
     def since(self, version: int) -> CurveChange:
         """As `BoundedCurve.since`."""

@@ -71,8 +71,13 @@ def _server(options: ServedMesh, port: int, token: str, directory: MeshDirectory
     application = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     async def curves(request: Request) -> Response:
+        body = bytearray()
+        async for piece in request.stream():
+            body += piece
+            if len(body) > _QUESTION_BYTES:
+                return Response(status_code=HTTPStatus.BAD_REQUEST)
         try:
-            question = msgspec.json.decode(await _body(request), type=CurveQuestion)
+            question = msgspec.json.decode(body, type=CurveQuestion)
         except (msgspec.MsgspecError, ValueError):
             return Response(status_code=HTTPStatus.BAD_REQUEST)
         follower = directory.followers.get(question.mesh)
@@ -105,17 +110,3 @@ def _server(options: ServedMesh, port: int, token: str, directory: MeshDirectory
         timeout_graceful_shutdown=_CLOSING_S,
     )
     return uvicorn.Server(config)
-
-
-async def _body(request: Request) -> bytes:
-    """The body of a request.
-
-    Raises:
-        ValueError: it is too long.
-    """
-    body = bytearray()
-    async for piece in request.stream():
-        body += piece
-        if len(body) > _QUESTION_BYTES:
-            raise ValueError
-    return bytes(body)

@@ -81,13 +81,10 @@ class MeshView(msgspec.Struct, frozen=True):
     """What is known of a mesh at one moment.
 
     Attributes:
-        key: its key, by which it is known here.
         info: None before it was reached.
         status: the newest one; after the end the last one.
-        instances: the newest statuses by instance.
-        before: those of the look before, for rates.
+        before: the ``instances`` of the look before, for rates.
         infos: what the instances are, in the order of the mesh.
-        ended: whether it runs no more.
         trouble: why it is not reached.
         failure: why the run failed; None if it did not, or goes on.
         run: counts the runs of a mesh of this name that were seen.
@@ -110,7 +107,6 @@ class CurveQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a page asks.
 
     Attributes:
-        mesh: its key.
         run: that of the `MeshView` that the page shows.
         curves: of each variable the version that it has drawn.
         span: the last so many seconds; 0: from the start on.

@@ -317,11 +317,7 @@ def _row(own: InstanceStatus, before: InstanceStatus | None) -> dict[str, Any]:
 
 
 class _PlotCard:
-    """One plot: a choice of variables above their curves, which `static/plots.js` draws.
-
-    Attributes:
-        names: the variables that it shows.
-    """
+    """One plot: a choice of variables above their curves, which `static/plots.js` draws."""
 
     def __init__(
         self,

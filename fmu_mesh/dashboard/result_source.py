@@ -45,12 +45,7 @@ class ResultSource:
         return self._new.tail.names if self._new is not None else ()
 
     def read(self, held: Callable[[], Mapping[str, BoundedCurve]], forget: Callable[[], None]) -> None:
-        """Read some megabytes, so that this returns soon.
-
-        Args:
-            held: gives the curves.
-            forget: called when the file is another one than before.
-        """
+        """Read some megabytes into the curves, to return soon; ``forget`` them if the file is another one."""
         if self._new is not None and self._new.tail.replaced:
             self.close()
             forget()
@@ -99,12 +94,7 @@ class ResultSource:
 
 
 class _Reader:
-    """Feeds curves with the rows of one tail.
-
-    Attributes:
-        tail: the rows.
-        after: the time of the row that was read last in s; None at the start, and after rows that were left out.
-    """
+    """Feeds curves with the rows of one tail; ``after`` is the time of the last one in s, None if some are left out."""
 
     def __init__(self, tail: Tail) -> None:
         self.tail = tail

@@ -15,8 +15,8 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, Final, Self
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Final, Self
 from urllib.parse import urlencode
 
 import foxglove
@@ -27,9 +27,10 @@ from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
 from ..errors import ConfigurationError
 from ..web_server import listening, shown_host
+from ..wire.client.readings import Target
 from ..wire.views import LogLine
 from .mesh_parameters import MeshParameters
-from .mesh_topics import STATUS_SCHEMA
+from .mesh_topics import STATUS_SCHEMA, metadata_of, schema_of
 from .relay import Relay, let_in
 
 __all__ = ["FoxgloveServer"]
@@ -100,18 +101,10 @@ class FoxgloveServer:
 
     # --- one run
 
-    def begin(
-        self,
-        schemas: Mapping[str, tuple[dict[str, Any], dict[str, str]]],
-        parameters: MeshParameters,
-        changed: Callable[[], None],
-    ) -> None:
-        """Offer the topics and parameters of a run; clients forget the one before.
+    def begin(self, targets: Mapping[str, Target], parameters: MeshParameters, changed: Callable[[], None]) -> None:
+        """Offer variables by topic, and parameters of a run; clients forget the one before.
 
-        Args:
-            schemas: for every topic the JSON Schema of its messages, and its metadata.
-            parameters: what clients may read and set.
-            changed: called on a thread of the SDK when a client subscribes to a topic or unsubscribes.
+        ``changed`` is called on a thread of the SDK when a client subscribes to a topic or unsubscribes.
         """
         for channel in self._variables.values():
             channel.close()
@@ -122,8 +115,8 @@ class FoxgloveServer:
         self._listener.serve((parameters, changed))
         self._server.clear_session()  # whereupon clients ask for parameters again
         self._variables = {
-            topic: Channel(topic, schema=schema, metadata=metadata, context=self._context)
-            for topic, (schema, metadata) in schemas.items()
+            topic: Channel(topic, schema=schema_of(target), metadata=metadata_of(target), context=self._context)
+            for topic, target in targets.items()
         }
 
     def end(self) -> None:
@@ -176,14 +169,10 @@ class FoxgloveServer:
                 graph.set_subscribed_topic(topic, list(readers))
         self._server.publish_connection_graph(graph)
 
-    @property
-    def subscribed_parameters(self) -> tuple[str, ...]:
-        """The names of the parameters that clients follow."""
-        return self._listener.subscribed_parameters
-
-    def show_parameters(self, parameters: Sequence[Parameter]) -> None:
-        """Send parameters to the clients that follow them."""
-        self._server.publish_parameter_values(list(parameters))
+    def show_parameters(self, parameters: MeshParameters) -> None:
+        """Send the parameters that have changed to the clients that follow them."""
+        if (names := self._listener.subscribed_parameters) and (changed := parameters.changes(names)):
+            self._server.publish_parameter_values(changed)
 
     def _send_lines(self) -> None:
         """Send the log messages that wait, if there is a reader."""

@@ -10,13 +10,13 @@ point on. Called on threads of the SDK.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from foxglove import Parameter, ParameterType
 
 from ..errors import FmuMeshError
-from ..text import nearest
+from ..text import did_you_mean
 from ..variables.value_types import INTEGERS, is_float
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
@@ -43,7 +43,7 @@ class MeshParameters:
 
     def values(self, names: Sequence[str] = ()) -> list[Parameter]:
         """The current values of these parameters, of all if none is named; not of those that do not exist."""
-        found = self._read([name for name in names or self._targets if name in self._targets])
+        found = self._read(names or self._targets)
         return [_parameter(name, value, self._targets[name]) for name, value in found.items()]
 
     def set(self, parameters: Sequence[Parameter]) -> list[Parameter]:
@@ -54,7 +54,7 @@ class MeshParameters:
 
     def changes(self, names: Sequence[str]) -> list[Parameter]:
         """Those of these parameters whose values have changed since the last call."""
-        found = self._read([name for name in names if name in self._targets])
+        found = self._read(names)
         changed = {name: value for name, value in found.items() if self._shown.get(name, ...) != value}
         self._shown.update(changed)
         return [_parameter(name, value, self._targets[name]) for name, value in changed.items()]
@@ -62,9 +62,8 @@ class MeshParameters:
     def _set_one(self, name: str, value: object) -> None:
         target = self._targets.get(name)
         if target is None:
-            near = nearest(name, self._targets)
-            more = f" Did you mean '{near}'?" if near is not None else ""
-            self._tell(f"'{name}' cannot be set: it is no unconnected input and no tunable parameter.{more}")
+            hint = did_you_mean(name, self._targets, "")
+            self._tell(f"'{name}' cannot be set: it is no unconnected input and no tunable parameter. {hint}".rstrip())
         elif self._read_only:
             self._tell(f"'{name}' is not set: `fmu-mesh foxglove` was started without --steer")
         elif value is None:
@@ -79,18 +78,18 @@ class MeshParameters:
                 with self._lock:
                     self._set[name] = (plain, answer.point)
 
-    def _read(self, names: Sequence[str]) -> dict[str, Any]:
+    def _read(self, asked: Iterable[str]) -> dict[str, Any]:
         """The values that these parameters have, or have from the next point on."""
-        targets = {self._targets[name].key: name for name in names}
+        names = {self._targets[name].key: name for name in asked if name in self._targets}
         try:
-            readings = self._client.get([self._targets[name] for name in names])
+            readings = self._client.get([self._targets[name] for name in names.values()])
         except FmuMeshError as error:
             self._tell(f"the parameters cannot be read: {error}")
             return {}
         found = {}
         with self._lock:
             for reading in readings:
-                name = targets[reading.key]
+                name = names[reading.key]
                 value, point = self._set.get(name, (None, -1))
                 if reading.point >= point:
                     value = reading.value

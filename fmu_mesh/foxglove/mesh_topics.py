@@ -19,6 +19,7 @@ from ..wire.views import InstanceInfo, MeshStatus, VariableView
 __all__ = [
     "STATUS_SCHEMA",
     "message_of",
+    "metadata_of",
     "schema_of",
     "status_message",
     "topic_of",
@@ -69,6 +70,12 @@ def schema_of(target: Target) -> dict[str, Any]:
         "type": "object",
         "properties": {"value": value, "point": point},
     }
+
+
+def metadata_of(target: Target) -> dict[str, str]:
+    """What Foxglove shows about a topic."""
+    names = ("unit", "description", "type", "causality", "variability")
+    return {name: fact for name in names if (fact := getattr(target.variable, name))}
 
 
 def message_of(target: Target, reading: Reading) -> bytes:

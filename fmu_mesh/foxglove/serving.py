@@ -21,11 +21,10 @@ from ..wire.client.following import ValueStream
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Reading, Target
-from ..wire.client.waiting import appearance
 from ..wire.views import MeshInfo, MeshStatus
 from .foxglove_server import FoxgloveServer
 from .mesh_parameters import MeshParameters
-from .mesh_topics import message_of, schema_of, status_message, topic_of, topics_by_instance
+from .mesh_topics import message_of, status_message, topic_of, topics_by_instance
 
 __all__ = ["Serving", "serve"]
 
@@ -54,12 +53,9 @@ class Serving(ServedMesh, frozen=True):
 
 
 def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | None = None) -> None:
-    """Serve a mesh, and again when it starts again.
+    """Serve a mesh, and again when it starts again; ``say`` gets what happens in sentences.
 
-    Args:
-        serving: what is served, and where.
-        say: told in sentences what happens.
-        stop: ends it when it is set, within a second if no mesh runs; None: only an exception ends it.
+    ``stop`` ends it when it is set, within a second if no mesh runs; without it, only an exception does.
 
     Raises:
         ConfigurationError: the port cannot be used, there are several meshes, or no variable fits a pattern.
@@ -77,7 +73,7 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
                 is_reported = True
             try:
                 with Meshes(serving.connect, serving.timeout) as meshes:
-                    client = appearance(meshes, mesh, _START_S)
+                    client = meshes.appearance(mesh, _START_S)
                     try:
                         _show(serving, client, server, say)
                     except FmuMeshError:
@@ -151,8 +147,7 @@ class _ShownMesh:
     def show(self) -> MeshStatus | None:
         """Show it until it ends; returns its last status, if one has come."""
         with self._stream, self._client.until_end(self._stream.wake) as ended:
-            schemas = {topic: (schema_of(target), _metadata(target)) for topic, target in self._targets.items()}
-            self._server.begin(schemas, self._parameters, self._stream.wake)
+            self._server.begin(self._targets, self._parameters, self._stream.wake)
             self._server.show_graph(topics_by_instance(self._infos, list(self._targets.values())))
             threads = [
                 threading.Thread(target=work, name=work.__name__, daemon=True)
@@ -246,11 +241,4 @@ class _ShownMesh:
                     readings = self._client.get(targets)
                 self._answers.put(readings)
                 self._stream.wake()
-            if (names := self._server.subscribed_parameters) and (changed := self._parameters.changes(names)):
-                self._server.show_parameters(changed)
-
-
-def _metadata(target: Target) -> dict[str, str]:
-    """What Foxglove shows about a topic."""
-    names = ("unit", "description", "type", "causality", "variability")
-    return {name: fact for name in names if (fact := getattr(target.variable, name))}
+            self._server.show_parameters(self._parameters)

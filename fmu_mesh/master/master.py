@@ -82,10 +82,7 @@ class Master:
     """The master of one run.
 
     Args:
-        plan: the plan of the whole mesh.
         session: the session of this process; the caller closes it.
-        events: gets the status and the log messages of the run.
-        settings: how the mesh is run.
         router: the link to the router that connects the nodes, if there is one.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
@@ -290,10 +287,7 @@ class Master:
 
     @property
     def ended_by(self) -> TerminationRequested | NotFinite | None:
-        """Why the simulation ended before its last point, and not at once.
-
-        An FMU asked for it, an output is not finite, or there was a `stop` and no stop time.
-        """
+        """Why the simulation ended before its last point, and not at once, as `MasterStates` has it."""
         return self._states.ended_by
 
     @property

@@ -94,10 +94,6 @@ Action = AnswerAll | FollowClock | RaiseGrant | SendToAll | EndAll
 class MasterStates:
     """The state of one run, as its master sees it.
 
-    Args:
-        plan: the plan of the whole mesh.
-        paused: whether the run begins paused at its first point.
-
     Attributes:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
@@ -199,9 +195,7 @@ class MasterStates:
     def command(self, command: Command, claimed: int) -> CommandAnswer:
         """Handle pause, resume, step N and stop, which only change the grant.
 
-        Args:
-            command: the command; `takes_commands` is true.
-            claimed: no node of this host passes this point until the grant is raised again.
+        Only while it `takes_commands`. No node of this host passes ``claimed`` until the grant is raised again.
         """
         granting, before = self.granting, self.hold
         self.hold = point = granting.halt(claimed)
@@ -254,10 +248,8 @@ class MasterStates:
     def decide(self, now: float, paced: int, stopped: Sequence[str] = ()) -> list[Action]:
         """What to do now; nothing, if it is to wait.
 
-        Args:
-            now: seconds since the start in which this process could run.
-            paced: the point that the wall clock allows.
-            stopped: if `silent_s` exceeds its deadline, the nodes whose processes are stopped.
+        ``now`` is in seconds since the start in which this process could run, ``paced`` the point that the wall clock
+        allows, and ``stopped``, if `silent_s` exceeds its deadline, the nodes whose processes are stopped.
         """
         if self._moved_at is None:
             self._moved_at = now

@@ -18,7 +18,7 @@ from ..rings.host_memory import Offer
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
-from ..wire.messages import HEADER, decode_json, encode_abort
+from ..wire.messages import ABORT, HEADER, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import tokens, undeclare_all
@@ -31,13 +31,6 @@ log = logging.getLogger(__name__)
 
 class Members:
     """The processes of the nodes of one run.
-
-    Args:
-        nodes: who belongs to the run.
-        session: the session of this process; the caller closes it.
-        keys: the keys of the run.
-        offer: the memory that processes of this host share; None if there is none.
-        launch: the launcher that started this process; None if it was started manually.
 
     Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when all are ready; then
     `send`, and `lost` now and then. `abort` may be called at any time, `close` at the end.
@@ -81,12 +74,7 @@ class Members:
         self._waiting[node] = query
 
     def welcome(self, profile_entries: int, shared: tuple[str, ...]) -> None:
-        """Answer all nodes: who shares the memory.
-
-        Args:
-            profile_entries: how many bursts and waits each node stores for a profile; 0: nothing is measured.
-            shared: the nodes that use it, and the recorder.
-        """
+        """Answer all nodes, as `Welcome` says."""
         self._shared = shared
         for query in self._waiting.values():
             query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, shared)))
@@ -126,7 +114,7 @@ class Members:
     def abort(self, error: FmuMeshError) -> None:
         """Tell the nodes why the run ends, and wait so that they can end themselves."""
         for publisher in self._grants:
-            publisher.put(encode_abort(error.report()))
+            publisher.put(encode_json(ABORT, error.report()))
         for query in self._waiting.values():
             query.reply_err(str(error))
             query.drop()
@@ -141,10 +129,6 @@ class Followers:
 
     The master waits for them at the end, because it routes samples. A follower has a liveliness token
     until it has all samples; Zenoh itself does not report this.
-
-    Args:
-        inbox: the inbox of the master.
-        is_going_on: whether the run has not ended yet.
     """
 
     def __init__(self, inbox: Inbox, is_going_on: Callable[[], bool]) -> None:

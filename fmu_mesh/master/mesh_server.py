@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Literal, Protocol
 
 import msgspec
@@ -46,14 +47,7 @@ class Events(Protocol):
 
 
 class MasterServer:
-    """Serves the queries of one run.
-
-    Args:
-        session: the session of this process; the caller closes it.
-        inbox: the inbox of the master.
-        status: the state of the run right now.
-        instances: the names of all instances.
-    """
+    """Serves the queries of one run."""
 
     def __init__(  # noqa: PLR0913, PLR0917  the run and who learns of it
         self,
@@ -75,12 +69,9 @@ class MasterServer:
         self._log_lines = 0
         self._newest_lines: deque[msgspec.Raw] = deque()
         self._newest_bytes = 0
-        self._log_publisher = session.declare_publisher(
-            self._keys.mesh_key("log"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
-        )
-        self._status_publisher = session.declare_publisher(
-            self._keys.mesh_key("status"), encoding=json_encoding, congestion_control=zenoh.CongestionControl.DROP
-        )
+        declare, drop = partial(session.declare_publisher, encoding=json_encoding), zenoh.CongestionControl.DROP
+        self._log_publisher = declare(keys.mesh_key("log"), congestion_control=drop)
+        self._status_publisher = declare(keys.mesh_key("status"), congestion_control=drop)
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
         """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason."""

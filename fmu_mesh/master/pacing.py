@@ -48,9 +48,6 @@ class Reach:
 
     A pause takes effect at such a grant. So more than the window, and more than 1024 points, are granted only if they
     take less than 50 ms at the present speed.
-
-    Args:
-        window: of the mesh, in points.
     """
 
     def __init__(self, window: int) -> None:
@@ -74,8 +71,7 @@ class Reach:
 class Pacer:
     """Limits the grant to the points that are due by the wall clock; with a real-time factor of 0 there is no limit.
 
-    Attributes:
-        overruns: points by which the run fell behind the wall clock beyond `catch_up`.
+    The ``overruns`` are points by which the run fell behind the wall clock beyond `catch_up`.
     """
 
     def __init__(self, plan: Plan, real_time_factor: float) -> None:

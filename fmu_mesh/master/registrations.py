@@ -20,12 +20,7 @@ def spoken(*nodes: str) -> str:
 
 
 class Registrations:
-    """The nodes of one run that have registered.
-
-    Attributes:
-        admitted: what each admitted node has said of itself.
-        ready: what each node has said when its links worked.
-    """
+    """What each admitted node of one run has said of itself, and each ready one when its links worked."""
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan

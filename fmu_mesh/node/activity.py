@@ -27,12 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Activity:
-    """What one node is doing.
-
-    Attributes:
-        state: in one or two words, for `status`.
-        runners: the instances, once all are loaded.
-    """
+    """What one node is doing."""
 
     def __init__(self, plan: NodePlan, refusals: Refusals) -> None:
         self.state = "starting"

@@ -57,15 +57,12 @@ _CAPABILITIES = (
 )
 
 Job = Callable[[], None]
-Setting = tuple[str, Value, Origin]
-"""A variable, its value, and when it holds and who sent it."""
 
 
 class Answers:
     """Answers for the instances of one node.
 
     Args:
-        inbox: the inbox of the node, to let the main thread do something.
         post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
         tell: tells the recorder, if there is one, which value was set; on the main thread.
@@ -99,17 +96,19 @@ class Answers:
 
     def answer(self, name: str, query: zenoh.Query) -> None:
         """Answer for every key of the instance that the query's key expression matches."""
+        root, runner, pending = self._keys.instance(name), self._activity.runners.get(name), _Pending(name, query)
         if query.payload is not None:
-            self._answer_setting(name, query)
+            if runner is None:
+                pending.refuse(f"'{name}' is still being loaded")
+            else:
+                self._set(runner, query, pending.refuse, pending)
             return
-        root, runner = self._keys.instance(name), self._activity.runners.get(name)
         views: dict[str, Callable[[], object]] = {"status": lambda: self._activity.status(name)}
         if runner is not None:
             views["info"] = lambda: instance_info(self._plan, runner)
         for what, view in views.items():
             if query.key_expr.intersects(zenoh.KeyExpr(f"{root}/{what}")):
                 query.reply(f"{root}/{what}", msgspec.json.encode(view()), encoding=json_encoding)
-        pending = _Pending(name, query)
         self._answer_values(pending, pending.asked)
 
     def _answer_values(self, pending: _Pending, now: float) -> None:
@@ -140,7 +139,7 @@ class Answers:
             values = runner.instance.get_values([variable.name for _, variable in unknown])
             pairs = [(key, value) for (key, _), value in zip(unknown, values, strict=True)]
             reply = partial(self._reply_values, runner, query, pairs, runner.step)
-            self._post(partial(self._finish, pending, reply))
+            self._post(partial(pending.finish, reply))
 
         self._inbox.post(read)
 
@@ -150,15 +149,7 @@ class Answers:
         def refuse(reason: str) -> None:
             self._log(LogLine(runner.name, "warning", "set", reason, runner.point))
 
-        def take() -> None:
-            try:
-                new = self._checked_setting(runner, str(sample.key_expr), sample.payload, sample.attachment)
-            except ValueRefused as refused:
-                refuse(str(refused))
-            else:
-                self._set(runner, str(sample.key_expr), new, refuse, lambda _point: None)
-
-        self._post(take)
+        self._post(partial(self._set, runner, sample, refuse))
 
     def turn(self, now: float) -> None:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
@@ -166,8 +157,8 @@ class Answers:
         for pending in early:
             self._answer_values(pending, now)
         for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
-            self._pending.remove(pending)
             pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")
+        self._pending = [pending for pending in self._pending if not pending.is_answered]
 
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
         """The outputs in the rows of the newest own step, and that step; what only the FMU has is not included.
@@ -195,48 +186,24 @@ class Answers:
         for key, value in values:
             query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
 
-    def _finish(self, pending: _Pending, reply: Job) -> None:
-        """Answer a query that waited for a point, unless it was refused in the meantime."""
-        if pending in self._pending:
-            self._pending.remove(pending)
-            reply()
-            pending.query.drop()
-
-    def _answer_setting(self, name: str, query: zenoh.Query) -> None:
-        """Answer a query that sets a value: from which point on the value holds, or why it was refused."""
-        runner, pending, key = self._activity.runners.get(name), _Pending(name, query), str(query.key_expr)
-
-        def refuse(reason: str) -> None:
-            self._finish(pending, partial(query.reply_err, reason))
-
-        def confirm(point: int) -> None:
-            grid, points = self._plan.grid, self._plan.instance(name).step_points
-            time = new[2].time
-            late = time is not None and point > grid.step_at(time, points) * points
-            answer = msgspec.json.encode(SetAnswer(key, point, grid.time(point), late))
-            self._finish(pending, partial(query.reply, key, answer, encoding=json_encoding))
-
-        if runner is None:
-            pending.refuse(f"'{name}' is still being loaded")
-            return
-        try:
-            new = self._checked_setting(runner, key, query.payload, query.attachment)
-        except ValueRefused as refused:
-            pending.refuse(str(refused))
-            return
-        self._pending.append(pending)
-        self._set(runner, key, new, refuse, confirm)
-
     def _set(
         self,
         runner: Runner,
-        key: str,
-        new: Setting,
+        sent: zenoh.Query | zenoh.Sample,
         refuse: Callable[[str], None],
-        confirm: Callable[[int], None],
+        pending: _Pending | None = None,
     ) -> None:
-        """Let the main thread set a variable between two steps; confirm the point from which on the value holds."""
-        name, value, origin = new
+        """Let the main thread set a variable between two steps, if the value that was sent is allowed.
+
+        The ``pending`` query, if it was sent with one, is answered with the point from which on the value holds.
+        """
+
+        def confirm(point: int) -> None:
+            grid, points = self._plan.grid, runner.plan.step_points
+            late = origin.time is not None and point > grid.step_at(origin.time, points) * points
+            answer = msgspec.json.encode(SetAnswer(key, point, grid.time(point), late))
+            if pending is not None:
+                pending.finish(partial(pending.query.reply, key, answer, encoding=json_encoding))
 
         def take() -> None:
             if self._before is not None:
@@ -251,12 +218,24 @@ class Answers:
                 self._tell(SetValue(runner.name, name, to_plain(value), at, origin.time, key, origin.who))
                 self._post(partial(confirm, step * runner.plan.step_points))
 
+        key = str(sent.key_expr)
+        try:
+            name, value, origin = self._checked_setting(runner, key, sent.payload, sent.attachment)
+        except ValueRefused as refused:
+            refuse(str(refused))
+            return
+        if pending is not None:
+            self._pending.append(pending)
         self._inbox.post(take)
 
     def _checked_setting(
         self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
-    ) -> Setting:
-        """The setting that arrived for a variable; raises `ValueRefused` with the reason if it is not allowed."""
+    ) -> tuple[str, Value, Origin]:
+        """What arrived for a variable: its name, the value, when it holds and who sent it.
+
+        Raises:
+            ValueRefused: it is not allowed.
+        """
         parts = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
         if len(parts) != 2 or "*" in key:
             raise ValueRefused(f"'{key}' is not the key of one variable")
@@ -278,16 +257,22 @@ class Answers:
 
 
 class _Pending:
-    """A query that waits until its instance reaches a point."""
+    """A query that waits until its instance reaches a point; it is answered once."""
 
     def __init__(self, instance: str, query: zenoh.Query) -> None:
         self.instance = instance
         self.query = query
         self.asked = time.monotonic()
+        self.is_answered = False
+
+    def finish(self, reply: Job) -> None:
+        if not self.is_answered:
+            self.is_answered = True
+            reply()
+            self.query.drop()
 
     def refuse(self, reason: str) -> None:
-        self.query.reply_err(reason)
-        self.query.drop()
+        self.finish(partial(self.query.reply_err, reason))
 
 
 def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:

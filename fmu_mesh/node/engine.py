@@ -99,9 +99,7 @@ class Engine(ABC):
     def run(self, wait_s: float, *, eager: bool) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
-        Args:
-            wait_s: in s.
-            eager: whether to return instead of waiting when there was a step: its rows have to be sent.
+        If it is ``eager``, it returns instead of waiting when there was a step: its rows have to be sent.
 
         Raises:
             FmuMeshError: a step failed, or a ring has something that its writer never wrote.
@@ -327,24 +325,10 @@ class BurstEngine(Engine):
 
 
 class PlainEngine(Engine):
-    """Steps in plain Python.
+    """Steps in plain Python."""
 
-    Args:
-        slice_s: time in s after which `run` returns, once every unit had a turn.
-    """
-
-    def __init__(
-        self,
-        plan: NodePlan,
-        units: Sequence[Sequence[Runner]],
-        memory: HostMemory,
-        *,
-        shared: bool,
-        slice_s: float = _SLICE_S,
-    ) -> None:
-        super().__init__(plan, units, memory, shared=shared)
-        self._slice_s = slice_s
-        self._attention = False
+    slice_s = _SLICE_S  # every unit has a turn before it is looked at
+    _attention = False
 
     def refit(self, runner: Runner) -> None:
         """Nothing: each step asks the runner itself."""
@@ -357,7 +341,7 @@ class PlainEngine(Engine):
             advanced = [self._advance(*both, started) for both in zip(self.units, self._units, strict=False)]
             self._progress.raise_to(self.covered + 1)
             stepped = stepped or any(advanced)
-            if not any(advanced) or perf_counter() - started > self._slice_s:
+            if not any(advanced) or perf_counter() - started > self.slice_s:
                 break
         if not stepped and not self._attention:
             began = perf_counter()
@@ -390,7 +374,7 @@ class PlainEngine(Engine):
                     stepped = True
                 place.tick += 1
                 place.next = 0
-                if perf_counter() - started > self._slice_s:
+                if perf_counter() - started > self.slice_s:
                     break
             return stepped
         finally:

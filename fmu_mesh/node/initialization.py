@@ -38,11 +38,8 @@ Key = tuple[str, str]
 class Initialization:
     """Sets inputs and gets outputs while all instances of a node are in Initialization Mode.
 
-    Args:
-        wait: waits for a message for at most this time in s, and handles it.
-
-    Attributes:
-        out_links: the links that are needed only during Initialization Mode.
+    ``wait`` waits for a message for at most this time in s, and handles it. The ``out_links`` are those that are needed
+    only during Initialization Mode.
     """
 
     def __init__(self, plan: NodePlan, wait: Callable[[float], None]) -> None:

@@ -47,7 +47,6 @@ class TimedInputs(AroundNativeSteps):
 
     Args:
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
-        courses: what a scenario prescribes, by variable.
 
     Attributes:
         python_at: the next own step that `do_step` has to take, because a value may change in it.
@@ -72,7 +71,7 @@ class TimedInputs(AroundNativeSteps):
         self._linear = interpolation == "linear"
         self._trajectories: dict[str, Trajectory] = {}
         self._used: dict[str, Value] = {}
-        self._grid: TimeGrid | None = None
+        self._grid: TimeGrid  # from `start` on
         self._points = 1
         self._step = 0
 
@@ -115,7 +114,7 @@ class TimedInputs(AroundNativeSteps):
         """
         now = self._time(self._step)
         when = now if time is None else time
-        step = self._grid_here.step_at(when, self._points)
+        step = self._grid.step_at(when, self._points)
         if step >= ENDLESS:
             raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:
@@ -144,11 +143,11 @@ class TimedInputs(AroundNativeSteps):
         for name, value in changes.items():
             if name in self._trajectories:
                 self._trajectories[name].add(time, value)
-                if self._trajectories[name].after(time + self._grid_here.rounding(time)) is None:
+                if self._trajectories[name].after(time + self._grid.rounding(time)) is None:
                     del self._trajectories[name]
                     self._used.pop(name, None)
         for name, own in self._trajectories.items():
-            value = own.value(time, self._grid_here.rounding(time))
+            value = own.value(time, self._grid.rounding(time))
             if self._used.get(name) != value:
                 changes[name] = value
         for name in changes.keys() & self._in_row.keys():
@@ -183,9 +182,9 @@ class TimedInputs(AroundNativeSteps):
         steps = []
         time = self._time(step - 1)
         for own in self._trajectories.values():
-            later = own.after(time + self._grid_here.rounding(time))
+            later = own.after(time + self._grid.rounding(time))
             if later is not None:
-                steps.append(step if own.linear else max(step, self._grid_here.step_at(later, self._points)))
+                steps.append(step if own.linear else max(step, self._grid.step_at(later, self._points)))
         return min(steps, default=ENDLESS)
 
     def _keeper(self) -> KeepsState:
@@ -193,13 +192,7 @@ class TimedInputs(AroundNativeSteps):
         raise FmuError(text, instance=getattr(self._instance, "name", None))
 
     def _time(self, step: int) -> float:
-        return self._grid_here.time(step * self._points)
-
-    @property
-    def _grid_here(self) -> TimeGrid:
-        """The communication points, once the time has started."""
-        assert self._grid is not None
-        return self._grid
+        return self._grid.time(step * self._points)
 
 
 def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid) -> Instance:

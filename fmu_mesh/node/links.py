@@ -31,11 +31,8 @@ _FRAME_BYTES = 128 * 1024
 class OutLink:
     """Sends rows of one instance to one node; a frame holds all rows since the last one.
 
-    Args:
-        layout: the columns of its frames; none where the target reads the ring itself.
-
-    Attributes:
-        sent: own steps sent so far; the next frame starts at this step.
+    Its frames have the columns of ``layout``, none where the target reads the ring itself. The next frame starts at the
+    own step ``sent``.
     """
 
     def __init__(self, link: Link, layout: Layout, outputs: Ring, put: Callable[[bytes], None]) -> None:

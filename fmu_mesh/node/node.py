@@ -48,10 +48,11 @@ from ..wire.messages import (
     HEADER,
     INITIAL,
     PROGRESS,
+    SET,
     NodeReport,
     SetValue,
     decode_json,
-    encode_set,
+    encode_json,
 )
 from ..wire.session import RouterLink
 from .activity import Activity
@@ -273,7 +274,7 @@ class Node:
                 stepped = engine.run(_LONGEST_SLEEP_S if all_sent or not eager else 0.0, eager=eager)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
-                self._end_early(asked)
+                self._end_early(engine, asked)
             if self._profiler is not None:
                 self._profiler.look(engine)
             with engine.sending:
@@ -287,18 +288,17 @@ class Node:
                 self._end_without_master()
             self._membership.check_silence(self._clock() - self._heard)
 
-    def _end_early(self, asked: TerminationRequested | NotFinite) -> None:
+    def _end_early(self, engine: Engine, asked: TerminationRequested | NotFinite) -> None:
         """An FMU ends the simulation: its unit stops stepping, and the master ends the run at its point."""
-        assert self._engine is not None
         runner = self._runners[asked.instance or ""]
         # The master has to know it before the progress of this node, which is beyond the grant then.
         if isinstance(asked, TerminationRequested):
             asked.at(runner.covered, self._plan.grid.time(runner.covered))
         self._tell_end(asked, self._plan.timeouts.stop)
-        for member in next(unit for unit in self._engine.units if runner in unit):
+        for member in next(unit for unit in engine.units if runner in unit):
             member.stop()
             member.flush()
-        self._memory.progress[self._plan.node].raise_to(self._engine.covered + 1)
+        self._memory.progress[self._plan.node].raise_to(engine.covered + 1)
 
     def _send_rows(self, *, stepped: bool) -> bool:
         """Send rows that a step may wait for; those for the recorder every 50 ms, and before a wait. Are all sent?"""
@@ -436,7 +436,7 @@ class Node:
     def _tell_set(self, value: SetValue) -> None:
         """Tell the recorder which value another program has set."""
         if RECORDER in dict(self._plan.windows):
-            self._put_set(encode_set(value))
+            self._put_set(encode_json(SET, value, value.point))
 
     def _has_no_master(self) -> bool:
         return self._token_went and self._membership.master_is_gone

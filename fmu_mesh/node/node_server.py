@@ -60,7 +60,6 @@ class NodeServer:
     """Serves the instances of one node.
 
     Args:
-        session: the session of this process; stays the caller's.
         on_hang: called on the server thread if a step does not return in time.
         tell: tells the recorder, if there is one, which value was set; on the main thread.
     """

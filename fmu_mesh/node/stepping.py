@@ -30,11 +30,7 @@ __all__ = ["Runner", "Source", "connect", "sources_of"]
 
 
 class Source(NamedTuple):
-    """Where values of a runner come from.
-
-    Attributes:
-        counter: the number of its complete rows.
-    """
+    """Where values of a runner come from, and the number of complete rows there."""
 
     instance: str
     transfer: Transfer

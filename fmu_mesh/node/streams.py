@@ -112,10 +112,8 @@ class InstanceStreams:
     """The streams of one instance.
 
     One publisher for all variables tells whether somebody may listen. Only then `look` finds out to what, so that
-    nothing is declared for a variable (an FMU may have 60,000).
-
-    Args:
-        changed: called on a thread of Zenoh when the instance gets its first or loses its last subscriber.
+    nothing is declared for a variable (an FMU may have 60,000). ``changed`` is called on a thread of Zenoh when the
+    instance gets its first or loses its last subscriber.
     """
 
     def __init__(
@@ -143,12 +141,9 @@ class InstanceStreams:
         return matches(self._publisher)
 
     def look(self, seconds: float | None = None) -> bool:
-        """Find the variables that have subscribers; return whether `update` is due.
+        """On the server's thread: find the variables that have subscribers; return whether `update` is due.
 
-        On the server's thread.
-
-        Args:
-            seconds: go on with the present search for this time; None: search anew, to the end.
+        Go on with the present search for some ``seconds``; without them, search anew, to the end.
         """
         end = time.monotonic() + (seconds if seconds is not None else math.inf)
         if seconds is None or self._search is None or not self.is_followed:

@@ -88,14 +88,10 @@ class Recorder:
     """Records one run.
 
     Args:
-        plan: the recorder's part of the plan.
         session: the session of this process; the caller closes it.
         files: the result files, in the order of the plan; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
-        growth: looks at all rows.
         notes: the folder of the run, if somebody counts the rows when this process was killed (`rows_left`).
-        launch: the launcher that started this process; None if it was started manually.
-        memory: the shared memory of this host; None if nothing is shared.
 
     Use it as a context manager: the thread runs inside; afterwards the files have all complete rows.
     """
@@ -332,10 +328,7 @@ class RecordedSource:
     """Rows of one instance that wait for rows of the others.
 
     Args:
-        link: what is recorded of it.
-        last_point: of the run.
         rows: its ring, if the recorder can read it; then the mirror for what comes in frames, if something does.
-        receiver: fills the mirror.
     """
 
     def __init__(self, link: Link, last_point: int, rows: Sequence[SourceRows], receiver: FrameReceiver | None) -> None:

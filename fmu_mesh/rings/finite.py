@@ -27,11 +27,7 @@ _MANY = 32
 
 
 class FiniteRows:
-    """Checks the output rows of one instance, and says what was not finite.
-
-    Attributes:
-        spans: where these outputs are in a row, for the burst.
-    """
+    """Checks the output rows of one instance, and says what was not finite; ``spans`` are for the burst."""
 
     def __init__(self, plan: InstancePlan, outputs: Ring, inputs: Ring) -> None:
         self._plan = plan
@@ -76,9 +72,7 @@ class FiniteRows:
     def explain(self, error: FmuMeshError, get: Get | None = None) -> None:
         """Add to a failure of the instance the first input that was not finite, and its source.
 
-        Args:
-            error: the failure; nothing is added to other errors.
-            get: reads the inputs after Initialization Mode; None: they are those of the last step.
+        ``get`` reads the inputs after Initialization Mode; without it, they are those of the last step.
         """
         if not isinstance(error, FmuError):
             return

@@ -56,13 +56,7 @@ Wish = tuple["Counter", int]
 
 
 class Offer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where shared memory is.
-
-    Attributes:
-        pid: a process that has it open.
-        descriptor: its file descriptor there.
-        token: hexadecimal; the first bytes of the memory.
-    """
+    """Where shared memory is: a process that has it open, its descriptor there, and its first bytes in hexadecimal."""
 
     pid: int
     descriptor: int
@@ -82,7 +76,6 @@ class HostMemory:
 
     def __init__(self, memory: mmap.mmap, map_: MemoryMap, process: str, descriptor: int | None = None) -> None:
         self.map = map_
-        self.process = process
         self._memory = memory
         self._descriptor = descriptor
         self._view = memoryview(memory)

@@ -37,13 +37,9 @@ Index = slice | NDArray[np.intp]
 
 
 class Transfer:
-    """The columns of one feed.
+    """The columns of one feed: with ``text`` True only those with text, with False those with numbers; None is all.
 
-    Args:
-        text: True takes the columns with text only, False those with numbers; None takes all.
-
-    Attributes:
-        rule: which row of the source a step needs.
+    The ``rule`` says which row of the source a step needs.
     """
 
     def __init__(  # noqa: PLR0913  the two ends of a connection

@@ -43,11 +43,7 @@ assert sys.byteorder == "little", "numbers go over the wire as they lie in memor
 
 
 class SourceRows(NamedTuple):
-    """Rows of an instance.
-
-    Attributes:
-        text: True: only its text is taken from here, because the numbers are in another ring. False: only its numbers.
-    """
+    """Rows of an instance: with ``text`` True only its text, with False only its numbers; None is all."""
 
     ring: Ring
     counter: Counter

@@ -37,11 +37,7 @@ def unescape(chunk: str) -> str:
 
 
 class Keys(msgspec.Struct, frozen=True):
-    """The public keys of one mesh, and the beginning of its internal keys.
-
-    Attributes:
-        prefix: first part of every key, `fmu_mesh` by default.
-    """
+    """The public keys of one mesh, and the beginning of its internal keys; all begin with ``prefix``."""
 
     prefix: str
     mesh: str
@@ -79,11 +75,9 @@ class Keys(msgspec.Struct, frozen=True):
 
 
 class RunKeys(msgspec.Struct, frozen=True):
-    """The internal keys of one run of a mesh. They contain its id, so that two runs never exchange messages.
+    """The internal keys of one run of a mesh, or of any run if its id is `*`.
 
-    Attributes:
-        root: what every key of the mesh starts with.
-        run: the run's id, or `*` for any.
+    They contain the id, so that two runs never exchange messages.
     """
 
     root: str

@@ -100,11 +100,7 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node reports when its links work.
-
-    Attributes:
-        opened: what its seal was made from.
-    """
+    """What a node reports when its links work; ``opened`` is what its seal was made from."""
 
     shared: bool = False
     opened: str = ""
@@ -127,7 +123,6 @@ class Membership:
 
     Args:
         inbox: its inbox; opened by `join`.
-        launch: the launcher that started this process; None if it was started manually.
         memory: the shared memory, for a participant in the process of the master.
 
     Attributes:
@@ -168,9 +163,8 @@ class Membership:
     ) -> None:
         """Begin to register, on a separate thread: FMUs can be loaded meanwhile.
 
-        Args:
-            on_admitted: called on that thread when the master has admitted this node.
-            on_master_gone: called on a thread of Zenoh when the master's token seems to be gone; call `master_is_gone`.
+        ``on_admitted`` is called on that thread when the master has admitted this node, and ``on_master_gone`` on a
+        thread of Zenoh when the master's token seems to be gone: ask `master_is_gone`.
         """
 
         def run() -> None:

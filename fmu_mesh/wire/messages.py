@@ -33,8 +33,7 @@ __all__ = [
     "NodeReport",
     "SetValue",
     "decode_json",
-    "encode_abort",
-    "encode_set",
+    "encode_json",
     "sealed",
 ]
 
@@ -73,7 +72,6 @@ class SetValue(msgspec.Struct, frozen=True):
     """A value that another program gave to an input or a parameter while the mesh ran.
 
     Attributes:
-        value: the value, as JSON has it.
         point: the communication point at which the instance took it: the step from there is the first that may use it.
         time: simulation time in s from which on it holds; None: from `point` on.
         key: the Zenoh key under which it was sent.
@@ -94,14 +92,9 @@ def sealed(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-def encode_abort(report: ErrorReport) -> bytes:
-    """An ABORT message."""
-    return HEADER.pack(ABORT, 0, 0, 0) + msgspec.json.encode(report)
-
-
-def encode_set(value: SetValue) -> bytes:
-    """A SET message: another program has set a value."""
-    return HEADER.pack(SET, 0, 0, value.point) + msgspec.json.encode(value)
+def encode_json(kind: int, content: ErrorReport | SetValue, point: int = 0) -> bytes:
+    """An ABORT or SET message."""
+    return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
 
 
 def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:

@@ -253,8 +253,7 @@ def tokens(session: zenoh.Session, key: str, timeout_s: float = _TOKENS_S) -> li
 class RouterLink:
     """Watches the link of a process to the router that connects it to the other processes.
 
-    Args:
-        endpoints: where the process connects to; empty if everything that it needs is on this host. Also an attribute.
+    Without ``endpoints``, everything that the process needs is on this host.
     """
 
     def __init__(self, session: zenoh.Session, endpoints: Iterable[str] = ()) -> None:
@@ -305,14 +304,9 @@ def undeclare_all(*entities: Iterable[Any]) -> None:
 
 
 class Question(msgspec.Struct, frozen=True):
-    """A query that waits for its answer.
+    """A query that waits ``deadline_s`` seconds for its answer; an error names ``whom`` it was for.
 
-    Attributes:
-        whom: the receiver, for the error.
-        deadline_s: how long to wait for an answer, in s.
-        payload: JSON of the query, if there is any.
-        attachment: JSON of the attachment, if there is any.
-        priority: the query overtakes messages of lower priority, and follows earlier ones of the same priority.
+    It overtakes messages of a lower ``priority``, and follows earlier ones of the same.
     """
 
     key: str

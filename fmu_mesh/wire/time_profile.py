@@ -18,12 +18,7 @@ GRANT = ""
 
 
 class Burst(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Steps that a node took in a row.
-
-    Attributes:
-        unit: index of the unit that stepped, in `NodeProfile.units`.
-        steps: own steps of its first instance.
-    """
+    """Steps that a node took in a row: own steps of the first instance of a unit, which is an index of its `units`."""
 
     start: float
     end: float
@@ -44,7 +39,6 @@ class UnitProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         steps: own steps of its first instance.
-        bursts: number of bursts.
         compute_s: time spent in them: in the FMU, and for reading and writing rows.
     """
 
@@ -62,8 +56,7 @@ class NodeProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ended: instant of the end of its last step.
         transport_s: time spent encoding and sending frames, and decoding received ones.
         wait_s: time spent waiting for a message, by the source instance that it waited for, or `GRANT`.
-        bursts: the time line of stepping; only the first ones, if there are too many.
-        waits: likewise, the time line of waiting.
+        bursts: the time line of stepping, and ``waits`` that of waiting; only the first ones, if there are too many.
         cut: number of entries that are missing in the time lines.
     """
 
@@ -96,11 +89,7 @@ class NodeProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeshProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The profile of one run.
-
-    Attributes:
-        held_s: how long each node limited the grant.
-    """
+    """The profile of one run; ``held_s`` says how long each node limited the grant."""
 
     nodes: tuple[NodeProfile, ...]
     held_s: dict[str, float]

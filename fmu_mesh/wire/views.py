@@ -39,7 +39,6 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
 
     Attributes:
         key: the key of its value, below that of the instance.
-        shape: the sizes of an array's dimensions.
         minimum: the smallest value that its model description allows; None without one. So is ``maximum``.
         items: item names and values of an Enumeration.
         settable: whether it can be set while the mesh runs (`fmu_mesh.system.start_values`).
@@ -155,11 +154,9 @@ class LogLine(msgspec.Struct, frozen=True):
 
 
 class SetAnswer(msgspec.Struct, frozen=True):
-    """Answer to a query that sets an input or a parameter: the point from which on the value holds.
+    """Answer to a query that sets an input or a parameter: the point from which on the value holds, and its time in s.
 
-    Attributes:
-        time: of this point, in s.
-        late: whether the time that the query asked for was past.
+    It is ``late`` if the time that the query asked for was past.
     """
 
     key: str

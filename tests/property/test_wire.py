@@ -29,7 +29,7 @@ from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.variables.value_types import DTYPES, INTEGERS, TYPES, is_text, nested
 from fmu_mesh.wire.frames import FrameReceiver, decode_rows, encode_frames, encode_rows
 from fmu_mesh.wire.keys import Keys, escape, unescape
-from fmu_mesh.wire.messages import FRAME, HEADER, decode_json, encode_abort
+from fmu_mesh.wire.messages import ABORT, FRAME, HEADER, decode_json, encode_json
 from fmu_mesh.wire.values import Stamp, ValueRefused, attachment, decode_value, encode_value
 
 columns = st.tuples(st.sampled_from(TYPES), st.lists(st.integers(1, 3), max_size=2).map(tuple))
@@ -166,7 +166,7 @@ texts = st.none() | st.text(max_size=20)
     )
 )
 def test_an_error_report_comes_back(report: ErrorReport) -> None:
-    assert decode_json(encode_abort(report)[HEADER.size :], ErrorReport) == report
+    assert decode_json(encode_json(ABORT, report)[HEADER.size :], ErrorReport) == report
 
 
 deep = st.integers(1, 3_000).flatmap(lambda depth: st.sampled_from([b"[" * depth, b'{"a":' * depth]))

@@ -327,6 +327,8 @@ class _SimulatedMemory(HostMemory):
 class _SimulatedEngine(PlainEngine):
     """Lets the others go on before it steps; then it takes one tick of each unit, or some more."""
 
+    slice_s = -1.0
+
     def __init__(
         self,
         process: _Process,
@@ -337,7 +339,7 @@ class _SimulatedEngine(PlainEngine):
         shared: bool,
         spins: bool,  # noqa: ARG002 nobody spins
     ) -> None:
-        super().__init__(plan, units, memory, shared=shared, slice_s=-1.0)
+        super().__init__(plan, units, memory, shared=shared)
         self._process = process
 
     def run(self, wait_s: float, *, eager: bool) -> bool:

@@ -23,7 +23,7 @@ from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan
 from fmu_mesh.wire.frames import encode_rows
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Welcome
-from fmu_mesh.wire.messages import FINISH, FRAME, HEADER, LAST, encode_abort
+from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, HEADER, LAST, encode_json
 from fmu_mesh.wire.session import Wiring, close_session, open_session
 from tests.helpers import DEADLINE_S, wait_until
 from tests.scenarios.scenario import Scenario
@@ -120,7 +120,7 @@ def test_a_waiting_recorder_ends_with_a_failed_run_and_writes_its_rows(
         mesh.put_rows()
         wait_until(lambda: recorder.files[0][1] == ROWS, "its rows are written, and it rests")
         error = MeshLost("node 'n' was lost", instance="a, b")
-        mesh.put(encode_abort(error.report()))
+        mesh.put(encode_json(ABORT, error.report()))
         raise error
 
     assert_has_ended(recorder)

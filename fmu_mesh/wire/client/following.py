@@ -36,13 +36,9 @@ _WAITING_SAMPLES = 1 << 16
 
 
 class Follower(Generic[Item]):
-    """Follows a mesh as long as the `with` block lasts.
+    """Follows a mesh as long as the `with` block lasts; ``on_end`` is called on a thread of Zenoh when the mesh ends.
 
-    Args:
-        on_end: called on a thread of Zenoh when the mesh ends.
-
-    Attributes:
-        arrived: what subscribers have received, in order; None marks the end of the mesh.
+    The queue ``arrived`` has what subscribers have received, in order, and None at the end of the mesh.
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, on_end: Callable[[], None] = lambda: None) -> None:
@@ -97,10 +93,8 @@ class Follower(Generic[Item]):
             yield late
 
     def _next(self, deadline: float | None) -> Item | None:
-        if deadline is None:
-            return self.arrived.get()
         try:
-            return self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
+            return self.arrived.get(timeout=None if deadline is None else max(0.0, deadline - time.monotonic()))
         except queue.Empty:
             raise DeadlineExceeded(f"mesh '{self._keys.mesh}' did not end in time") from None
 
@@ -114,12 +108,7 @@ class Follower(Generic[Item]):
 
 
 class ValueStream:
-    """Values as they come, as long as the `with` block lasts; from any thread.
-
-    Args:
-        session: a session that reaches the mesh.
-        limit: number of values that wait at most; of more, the oldest are lost.
-    """
+    """Values as they come, as long as the `with` block lasts; from any thread. Over ``limit`` the oldest are lost."""
 
     def __init__(self, session: zenoh.Session, limit: int) -> None:
         self._session = session

@@ -25,7 +25,7 @@ import numpy as np
 import zenoh
 
 from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
-from ...text import is_pattern, listed, matching, nearest, shown
+from ...text import did_you_mean, is_pattern, listed, matching, shown
 from ..keys import SUBSCRIBED, Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
@@ -76,6 +76,7 @@ class MeshClient:
         self.keys = keys
         self.endpoints = tuple(endpoints)
         self.session = session
+        self._who = f"mesh '{keys.mesh}'"
         self._timeout_s = timeout_s
         self._over = over
         self._lost = threading.Event()
@@ -84,7 +85,7 @@ class MeshClient:
 
     def info(self) -> MeshInfo:
         """The description of the mesh."""
-        return self._view(self.keys.mesh_key("info"), MeshInfo, f"mesh '{self.keys.mesh}'")
+        return self._view(self.keys.mesh_key("info"), MeshInfo, self._who)
 
     def info_if_running(self) -> MeshInfo | None:
         """The description of the mesh if it runs now; None otherwise. This does not wait for a mesh, as `info` does.
@@ -93,17 +94,17 @@ class MeshClient:
         has, its answer is empty now and then although the mesh runs.
         """
         samples = self._get(self.keys.mesh_key("info"))
-        return _understood(samples[0].payload.to_bytes(), MeshInfo, f"mesh '{self.keys.mesh}'") if samples else None
+        return _understood(samples[0], MeshInfo, self._who) if samples else None
 
     def status(self) -> MeshStatus:
         """The state and the point of the mesh."""
-        return self._view(self.keys.mesh_key("status"), MeshStatus, f"mesh '{self.keys.mesh}'")
+        return self._view(self.keys.mesh_key("status"), MeshStatus, self._who)
 
     def ros(self) -> list[RosView]:
         """The links of the gateways to ROS; empty if the mesh has no gateway."""
         # This does not wait for a queryable, because a mesh without a gateway has none.
-        samples, who = self._get(f"{self.keys.mesh_key('ros')}/*"), f"the gateway of mesh '{self.keys.mesh}'"
-        return [_understood(sample.payload.to_bytes(), RosView, who) for sample in samples]
+        samples = self._get(f"{self.keys.mesh_key('ros')}/*")
+        return [_understood(sample, RosView, f"the gateway of {self._who}") for sample in samples]
 
     def instance_info(self, instance: str) -> InstanceInfo:
         """The description of an instance: variables, connections, process. Waits while its FMU is being loaded."""
@@ -118,18 +119,16 @@ class MeshClient:
     ) -> tuple[MeshStatus, dict[str, InstanceStatus]]:
         """The status of the mesh and of its instances, with one query; instances that do not answer are left out.
 
-        Args:
-            subscribed: by instance, the variables that this session has just subscribed to, so that the nodes know it;
-                None: all of the instance.
+        It tells the nodes what this session has just ``subscribed`` to: by instance, variables, or None for all.
         """
         key = f"{self.keys.root}/*/status" + (f"?{SUBSCRIBED}" if subscribed is not None else "")
         names = msgspec.json.encode(subscribed) if subscribed is not None else None
         # A querier does not notice several queryables that match its key (zenoh 1.10), so this is a get.
-        found = {str(s.key_expr): s.payload.to_bytes() for s in self._get(key, names)}
-        mesh, who = found.pop(self.keys.mesh_key("status"), None), f"mesh '{self.keys.mesh}'"
+        found = {str(sample.key_expr): sample for sample in self._get(key, names)}
+        mesh = found.pop(self.keys.mesh_key("status"), None)
         # Without an answer of the mesh, this session does not know it yet, or it is gone.
-        status = _understood(mesh, MeshStatus, who) if mesh is not None else self.status()
-        views = [_understood(data, InstanceStatus, who) for data in found.values()]
+        status = _understood(mesh, MeshStatus, self._who) if mesh is not None else self.status()
+        views = [_understood(sample, InstanceStatus, self._who) for sample in found.values()]
         return status, {view.instance: view for view in views}
 
     @contextmanager
@@ -208,23 +207,19 @@ class MeshClient:
     def set(self, target: Target, value: object, at: float | None = None) -> SetAnswer:
         """Set an unconnected input or a tunable parameter; the answer says from which point on the value holds.
 
-        Args:
-            target: the variable.
-            value: a Python or numpy value.
-            at: simulation time in s from which on it holds; None: from the next point on.
+        That is the next one, or the one ``at`` a simulation time in s.
         """
         plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         try:
             payload = encode_value(cast("Any", plain))
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
-        who = f"'{target.instance}.{target.variable.name}'"
-        return self._view(target.key, SetAnswer, who, payload, encode_origin(at, _this_program()))
+        return self._view(target.key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
 
     def command(self, command: Command) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
         payload = msgspec.json.encode(command)
-        return self._view(self.keys.mesh_key("command"), CommandAnswer, f"mesh '{self.keys.mesh}'", payload)
+        return self._view(self.keys.mesh_key("command"), CommandAnswer, self._who, payload)
 
     @contextmanager
     def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
@@ -268,7 +263,7 @@ class MeshClient:
         with Follower[LogLine](self.session, self.keys) as follower:
             if follow:  # from before the question, so that no message is missing between the two
                 follower.subscribe({self.keys.mesh_key("log")}, partial(_decoded, kind=LogLine))
-            kept = self._view(self.keys.mesh_key("log"), list[LogLine], f"mesh '{self.keys.mesh}'")
+            kept = self._view(self.keys.mesh_key("log"), list[LogLine], self._who)
             last = kept[-1].number if kept else 0
             there = follow and self._is_there(follower, self._timeout_s)
             new = follower.to_the_last() if there else iter(())
@@ -277,7 +272,7 @@ class MeshClient:
     def _is_over(self) -> bool:
         """Raise `MeshLost` if the mesh has ended, in the words of who knows it; otherwise False."""
         if self._lost.is_set() and self.info_if_running() is None:  # a token that was lost may be there again
-            raise MeshLost(f"mesh '{self.keys.mesh}' has ended")
+            raise MeshLost(f"{self._who} has ended")
         return self._over()
 
     def _is_there(self, follower: Follower[Any], timeout_s: float) -> bool:
@@ -318,7 +313,7 @@ class MeshClient:
                     raise ConfigurationError(f"{clock.refusal}.")
             raise _unknown(f"instance '{instance}' has no variable '{name}'", name, own)
         if not meant:
-            raise _unknown(f"mesh '{self.keys.mesh}' has no variable '{reference}'", reference, [*found])
+            raise _unknown(f"{self._who} has no variable '{reference}'", reference, [*found])
         return meant
 
     def _variables(self, instance: str, run: str) -> dict[str, Target]:
@@ -338,14 +333,14 @@ class MeshClient:
 
     def _unknown_instance(self, name: str, names: Sequence[str] | None = None) -> ConfigurationError:
         there = names if names is not None else self.info().instances
-        return _unknown(f"mesh '{self.keys.mesh}' has no instance '{name}'", name, there)
+        return _unknown(f"{self._who} has no instance '{name}'", name, there)
 
     # --- questions
 
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> View:
-        return _understood(self._ask(key, who, payload, attachment)[0].payload.to_bytes(), kind, who)
+        return _understood(self._ask(key, who, payload, attachment)[0], kind, who)
 
     def _ask(
         self, key: str, who: str, payload: bytes | None = None, attachment: bytes | None = None
@@ -405,15 +400,13 @@ def _decoded(sample: zenoh.Sample, kind: type[View]) -> View:
     return decode_json(sample.payload.to_bytes(), kind)
 
 
-def _understood(answer: bytes, kind: type[View], who: str) -> View:
+def _understood(answer: zenoh.Sample, kind: type[View], who: str) -> View:
     try:
-        return decode_json(answer, kind)
+        return _decoded(answer, kind)
     except MessageRefused as error:
         text = f"the answer of {who} is not understood: {error}."
         raise ConfigurationError(text, hint="Is it another version of fmu_mesh?") from error
 
 
 def _unknown(message: str, name: str, names: Sequence[str]) -> ConfigurationError:
-    suggestion = nearest(name, names)
-    hint = f"Did you mean '{suggestion}'?" if suggestion is not None else f"There are: {listed(names)}."
-    return ConfigurationError(f"{message}.", hint=hint)
+    return ConfigurationError(f"{message}.", hint=did_you_mean(name, names, f"There are: {listed(names)}."))

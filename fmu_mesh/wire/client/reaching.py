@@ -10,13 +10,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from typing import NamedTuple, Self, TypeVar
 
 import zenoh
 
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
-from ...text import listed, nearest
+from ...text import did_you_mean, listed
 from ..keys import Keys
 from ..runtime import meshes
 from ..session import Wiring, close_session, open_session, tokens
@@ -30,6 +30,7 @@ __all__ = ["Meshes"]
 # so each look reads them anew, and a note is no proof: its mesh may be killed, or be stopped (ADR 4 says who can
 # reach which socket).
 
+Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
 
 _GRACE_S = 1.0
@@ -86,57 +87,42 @@ class Meshes:
         """The keys of the meshes that were found by the last look, whether they answer or not."""
         return [found.keys.root for found in self._found]
 
-    @contextmanager
-    def changes(self) -> Iterator[Callable[[float], None]]:
-        """Within the context: a function that waits until the meshes may have changed, for at most some seconds."""
-        changed = threading.Event()
-
-        def wait(left_s: float) -> None:
-            # There is no event for a new note. There is one for a token, but a query for it may still have been empty.
-            changed.wait(min(left_s, _AGAIN_S if self._endpoints else _NOTE_CHECK_S))
-            changed.clear()
-
+    def appearance(self, mesh: str | None, timeout_s: float) -> MeshClient:
+        """Wait until a mesh is there: the one with this name or key, or the only one."""
+        end, changed = time.monotonic() + timeout_s, threading.Event()
         with ExitStack() as stack:
             if self._endpoints:
                 liveliness = self._open(self._endpoints, _NOBODY).session().liveliness()
                 watcher = liveliness.declare_subscriber(_TOKENS, lambda _token: changed.set(), history=True)
                 stack.callback(watcher.undeclare)
-            yield wait
-
-    def appeared(self, mesh: str | None) -> MeshClient | None:
-        """The mesh with this name or key, or the only mesh; None if there is none."""
-        if mesh is None:
-            return self.named(None) if self._found else None
-        return self.named(mesh) if any(found.is_called(mesh) for found in self._found) else None
+            while (left_s := end - time.monotonic()) > 0:
+                self.look()
+                if any(mesh is None or mesh in found.names for found in self._found):
+                    return self.named(mesh)
+                # There is no event for a new note. There is one for a token, but a query for it may still be empty.
+                changed.wait(min(left_s, _AGAIN_S if self._endpoints else _NOTE_CHECK_S))
+                changed.clear()
+        who = f"mesh '{mesh}'" if mesh is not None else "mesh"
+        raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="A larger `timeout=...` waits longer.")
 
     def all(self) -> list[MeshClient]:
         """All meshes that answer, at least one."""
-        clients: list[MeshClient] = []
         self.silent = []
         running = self._running()
         for found in running:
             found.opening.start()
-        for found in running:
-            try:
-                clients.append(self._client(found))
-            except FmuMeshError as error:
-                self.silent.append(error)
-        if not clients:
-            raise self.silent[0]
-        return clients
+        return [client for _, client in self.answers(running, self._client)]
 
-    def answers(
-        self, clients: Sequence[MeshClient], question: Callable[[MeshClient], Answer]
-    ) -> list[tuple[MeshClient, Answer]]:
+    def answers(self, asked: Sequence[Asked], question: Callable[[Asked], Answer]) -> list[tuple[Asked, Answer]]:
         """The answers of the meshes that answer, at least one; the others are added to `silent`."""
-        answers: list[tuple[MeshClient, Answer]] = []
-        for client in clients:
+        answers: list[tuple[Asked, Answer]] = []
+        for one in asked:
             try:
-                answers.append((client, question(client)))
+                answers.append((one, question(one)))
             except FmuMeshError as error:
                 self.silent.append(error)
         if not answers:
-            raise self.silent.pop()
+            raise self.silent[-len(asked)]
         return answers
 
     def one(self, reference: str | None) -> MeshClient:
@@ -150,29 +136,17 @@ class Meshes:
                 raise _not_running(reference, running)
         if len(running) == 1:
             return self._client(running[0])
-        if len({found.keys.root for found in running}) < len(running):
-            raise _same_name(running, listed([found.keys.mesh for found in running]))
-        raise ConfigurationError(
-            f"{len(running)} meshes are running: {listed([found.keys.mesh for found in running])}.",
-            hint=f"Say which one, as in '{running[0].keys.mesh}/INSTANCE.VARIABLE'.",
-        )
+        raise _several(running, f"Say which one, as in '{running[0].keys.mesh}/INSTANCE.VARIABLE'.")
 
     def named(self, mesh: str | None) -> MeshClient:
         """The mesh with this name, or with this key; None for the only one."""
         running = self._running()
-        named = [found for found in running if mesh is None or found.is_called(mesh)]
+        named = [found for found in running if mesh is None or mesh in found.names]
         if len(named) == 1:
             return self._client(named[0])
-        if named:
-            roots = listed([found.keys.root for found in named])
-            if len({found.keys.root for found in named}) < len(named):
-                raise _same_name(named, roots)
-            if mesh is None:
-                names = listed([found.keys.mesh for found in named])
-                raise ConfigurationError(f"{len(named)} meshes are running: {names}.", hint="Give the name of one.")
-            raise ConfigurationError(f"{len(named)} meshes are named '{mesh}': {roots}.", hint="Give the key.")
-        assert mesh is not None  # otherwise all that are running would be meant, at least one
-        raise _not_running(mesh, running)
+        if mesh is None:
+            raise _several(named, "Give the name of one.")
+        raise _several(named, "Give the key.", mesh) if named else _not_running(mesh, running)
 
     def _running(self) -> list[_Found]:
         """The meshes that were found, at least one, or `absence` as an error."""
@@ -275,9 +249,10 @@ class _Found(NamedTuple):
     endpoints: tuple[str, ...]
     opening: _Opening
 
-    def is_called(self, mesh: str) -> bool:
-        """Whether this is the name or the key of the mesh."""
-        return mesh in (self.keys.mesh, self.keys.root)
+    @property
+    def names(self) -> tuple[str, str]:
+        """What the mesh may be called: its name and its key."""
+        return self.keys.mesh, self.keys.root
 
 
 def _means(keys: Keys, reference: str) -> bool:
@@ -287,19 +262,22 @@ def _means(keys: Keys, reference: str) -> bool:
     return is_key(reference, keys) and key_expression(reference).intersects(zenoh.KeyExpr(f"{keys.root}/**"))
 
 
-def _same_name(found: Sequence[_Found], names: str) -> ConfigurationError:
-    """Meshes with the same name and key, such as one that was launched twice."""
-    where = ", ".join(endpoint for one in found for endpoint in one.endpoints[:1])
-    return ConfigurationError(
-        f"{len(found)} meshes are running: {names}.", hint=f"Say which one by `connect=...` and its endpoint: {where}."
-    )
+def _several(found: Sequence[_Found], hint: str, name: str | None = None) -> ConfigurationError:
+    """The error for more than one mesh, all of them with this name if there is one."""
+    roots = [one.keys.root for one in found]
+    if len({*roots}) < len(found):  # such as a mesh that was launched twice: only an endpoint distinguishes the two
+        where = ", ".join(endpoint for one in found for endpoint in one.endpoints[:1])
+        hint = f"Say which one by `connect=...` and its endpoint: {where}."
+    elif name is not None:
+        return ConfigurationError(f"{len(found)} meshes are named '{name}': {listed(roots)}.", hint=hint)
+    names = listed(roots if name is not None else [one.keys.mesh for one in found])
+    return ConfigurationError(f"{len(found)} meshes are running: {names}.", hint=hint)
 
 
 def _not_running(reference: str, running: Sequence[_Found]) -> ConfigurationError:
-    names = [name for found in running for name in (found.keys.mesh, found.keys.root)]
+    names = [name for found in running for name in found.names]
     first = reference.partition("/")[0]
     if "/" in reference and not any(reference.startswith(f"{found.keys.prefix}/") for found in running):
         names = [found.keys.mesh + reference.removeprefix(first) for found in running]
-    near = nearest(reference, names)
-    hint = f"Did you mean '{near}'?" if near else f"Running: {listed([found.keys.mesh for found in running])}."
-    return ConfigurationError(f"no mesh '{reference}' is running.", hint=hint)
+    there = f"Running: {listed([found.keys.mesh for found in running])}."
+    return ConfigurationError(f"no mesh '{reference}' is running.", hint=did_you_mean(reference, names, there))

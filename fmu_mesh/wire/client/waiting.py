@@ -1,4 +1,4 @@
-"""Waits until a mesh has paused, is at a point, or is in a state; the mesh may start later."""
+"""Waits until a mesh has paused, is at a point, or is in a state."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from ...errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuMesh
 from ..messages import SetValue
 from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
-from .reaching import Meshes
 from .readings import Target
 
-__all__ = ["appearance", "go_on", "paused_at", "replay", "rest", "wait_for", "wait_for_start", "wait_until_at"]
+__all__ = ["go_on", "paused_at", "replay", "rest", "wait_for", "wait_for_start", "wait_until_at"]
 
 _START_S: Final = 120.0
 
@@ -107,24 +106,6 @@ def wait_until_at(client: MeshClient, instance: str, point: int, timeout_s: floa
             )
         never.wait(look)
         look = min(2 * look, _LONGEST_ASK_S)
-
-
-def appearance(meshes: Meshes, mesh: str | None, timeout_s: float) -> MeshClient:
-    """Wait until a mesh is there: the one with this name or key, or the only one.
-
-    Raises:
-        ConfigurationError: there are several.
-        DeadlineExceeded: it did not start in time.
-    """
-    end = time.monotonic() + timeout_s
-    with meshes.changes() as wait:
-        while (left_s := end - time.monotonic()) > 0:
-            meshes.look()
-            if (client := meshes.appeared(mesh)) is not None:
-                return client
-            wait(left_s)
-    who = f"mesh '{mesh}'" if mesh is not None else "mesh"
-    raise DeadlineExceeded(f"there is no {who} after {timeout_s:g} s.", hint="A larger `timeout=...` waits longer.")
 
 
 def wait_for_start(client: MeshClient) -> None:
