@@ -153,7 +153,6 @@ class Comparison(msgspec.Struct, frozen=True):
         """Draw both results and their difference; without names, the variables that differ most.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> one = mesh.run(record="memory", stop_time=1.0)
             >>> other = mesh.run(record="memory", stop_time=1.0, start_values={"delay.d": 0.5})

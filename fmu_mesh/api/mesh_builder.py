@@ -142,7 +142,6 @@ class Mesh:
         """A mesh of one FMU, as `fmu-mesh run` makes it; nothing is recorded, unless an option says so.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.Mesh.from_fmu("fmus/DampedPendulum.fmu", simulation={"stop_time": 1.0})
             >>> mesh.run(record="memory")["DampedPendulum.a"].shape
             (501,)
@@ -235,7 +234,6 @@ class Mesh:
         """Add an instance.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.Mesh("gain", step_size=0.01, stop_time=1.0)
             >>> mesh.add("gain", fmu="fmus/Gain.fmu", start_values={"k": 2.0}, step_size=0.02)
             >>> mesh.instances
@@ -278,7 +276,6 @@ class Mesh:
         """Remove an instance, its connections, what the scenario sets of it, and what was chosen of it to be recorded.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.disconnect(target="delay.x")
             >>> mesh.remove("delay")
@@ -337,7 +334,6 @@ class Mesh:
         """Choose what is recorded, and into which file.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.record("pendulum.a", "in:delay.*", file="results/all.csv")
             >>> mesh.record("pendulum.a", file="results/slow.csv", every=100, also=True)
@@ -366,7 +362,6 @@ class Mesh:
         """Say what inputs and tunable parameters get while the mesh runs; adds to what was said before.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.Mesh("gain", step_size=0.5, stop_time=2.0)
             >>> mesh.add("gain", fmu="fmus/Gain.fmu")
             >>> mesh.scenario({"gain.u": {"times": [0, 1], "values": [1, 3], "interpolation": "linear"}})
@@ -395,7 +390,6 @@ class Mesh:
         """Set keys of other sections of the configuration, or of the top level.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.configure(group="auto", timeouts={"step": 5.0}, simulation={"window": 64})
 
@@ -441,7 +435,6 @@ class Mesh:
         was loaded from a package, and whose instances and connections are still the same, keeps everything else in it.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.to_ssp("pendulum_delay.ssp")
             ()
@@ -469,7 +462,6 @@ class Mesh:
         """Check the configuration, its models, and that this host can run them; nothing is started.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.add("gain", fmu="../fmus/Gian.fmu")
             >>> for finding in mesh.check().findings:
@@ -486,7 +478,6 @@ class Mesh:
         """Read all models and plan a run, which `Run.start` starts; nothing is started here.
 
         Example:
-            >>> import fmu_mesh
             >>> plan = fmu_mesh.load("configs/pendulum_delay.yaml").plan(stop_time=1.0, record="memory")
             >>> plan.plan.grid.last_point
             500
@@ -514,7 +505,6 @@ class Mesh:
         """The graph of the mesh: instances, connections, processes and cycles, as a picture or as text.
 
         Example:
-            >>> import fmu_mesh
             >>> print(fmu_mesh.load("configs/pendulum_delay.yaml").graph().text())
             pendulum_delay: 2 instances in 2 processes, 1 connection
             <BLANKLINE>
@@ -539,7 +529,6 @@ class Mesh:
         Ctrl-C ends the run, and raises `KeyboardInterrupted`.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> apart = mesh.run(record="memory", stop_time=1.0)
             >>> here = mesh.run(record="memory", stop_time=1.0, processes=False)
@@ -590,7 +579,6 @@ class Mesh:
         Nothing is recorded into a file, and no other process is started.
 
         Example:
-            >>> import fmu_mesh
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
             ...     system.step(100)
             ...     system.time, system.get("pendulum.a") < 0.5

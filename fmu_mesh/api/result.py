@@ -97,7 +97,6 @@ class Result(Mapping[str, NDArray[Any]]):
         Of a Parquet file whose run goes on or was killed, the rows are read that are complete in its stream.
 
         Example:
-            >>> import fmu_mesh
             >>> run = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=0.1, output="results/short.csv")
             >>> fmu_mesh.Result.read("results/short.csv")["delay.y"].tolist() == run["delay.y"].tolist()
             True
@@ -129,7 +128,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """What the result file says about its run; empty if it says nothing.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.run(stop_time=0.1, record="memory").metadata
             {}
@@ -141,7 +139,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """The results of all files that the run wrote, in the order of the configuration; this one is among them.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.configure(record=[{"file": "fast.csv"}, {"file": "slow.csv", "every": 100}])
             >>> fast, slow = mesh.run(stop_time=1.0).all
@@ -158,7 +155,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """What is wrong although nothing failed, such as a value that grows without a limit; empty for a file.
 
         Example:
-            >>> import fmu_mesh
             >>> fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory").warnings
             ()
         """
@@ -190,7 +186,6 @@ class Result(Mapping[str, NDArray[Any]]):
         Every float has the digits that give the same bits again.
 
         Example:
-            >>> import fmu_mesh
             >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=0.1, record="memory")
             >>> result.to_csv("results/angles.csv")
             >>> fmu_mesh.Result.read("results/angles.csv").compare(result).equal
@@ -225,7 +220,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """Draw variables over time, with one axes for each unit; all of them if none is named.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> result = mesh.run(stop_time=1.0, record="memory")
             >>> result.plot("pendulum.a", "delay.y").savefig("angles.png")
@@ -276,7 +270,6 @@ class Result(Mapping[str, NDArray[Any]]):
         at the times of this one. Values in other units are converted, if both units are known.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> one = mesh.run(record="memory", stop_time=1.0)
             >>> print(one.compare(mesh.run(record="memory", stop_time=1.0, processes=False)))

@@ -155,7 +155,6 @@ class Run:
         """The status of the mesh and of its instances, with one question; instances that do not answer are left out.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     point = run.wait_for("paused").point
@@ -171,7 +170,6 @@ class Run:
         `SystemGraph.with_status` renews these without another question for what does not change.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     point = run.wait_for("paused").point
@@ -248,7 +246,6 @@ class Run:
         A reader that falls far behind loses the newest values; the points tell which.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", stop_time=0.01, paused=True) as run:
             ...     samples = run.watch("delay.y")
@@ -267,7 +264,6 @@ class Run:
         lost, because the mesh is faster than this program can follow, there is no line.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
             ...     view = run.view("delay.y", "pendulum.a")
@@ -294,7 +290,6 @@ class Run:
         """The log messages of FMUs that the mesh has kept, the oldest first.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     [line.message for line in run.logs()]
@@ -398,7 +393,6 @@ class Run:
         """Wait until the mesh is in a state, such as "paused".
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     run.wait_for("paused").point
@@ -424,7 +418,6 @@ class Run:
         """An event that is set when the mesh ends or is gone; then ``tell`` is called, on another thread.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run, run.until_end() as ended:
             ...     answer = run.stop()
@@ -459,7 +452,7 @@ class Run:
         """As `wait`, without blocking the event loop of asyncio; a cancelled wait leaves the run as it is.
 
         Example:
-            >>> import asyncio, fmu_mesh
+            >>> import asyncio
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> async def both():
             ...     with mesh.start(stop_time=1.0, output=None, record="memory") as run:

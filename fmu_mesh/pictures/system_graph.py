@@ -84,7 +84,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
         """The same graph with the state of each instance, as `Run.all_status` has it.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     _ = run.wait_for("paused")
@@ -103,7 +102,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
         """The picture as the text of an SVG file; needs no library.
 
         Example:
-            >>> import fmu_mesh
             >>> picture = fmu_mesh.load("configs/cycle2.yaml").graph().svg()
             >>> picture[:4], 'data-instance="velocity"' in picture
             ('<svg', True)
@@ -117,7 +115,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
         """The picture as a figure of matplotlib.
 
         Example:
-            >>> import fmu_mesh
             >>> fmu_mesh.load("configs/cycle2.yaml").graph().figure().savefig("cycle2.pdf")
 
         Raises:

@@ -93,7 +93,6 @@ class SweepResult(Sequence[SweepRow]):
         """Read the folder of a sweep, which may still go on.
 
         Example:
-            >>> import fmu_mesh
             >>> options = {"stop_time": 1.0, "folder": "results/to_read"}
             >>> with fmu_mesh.sweep("configs/pendulum_delay.yaml", {"pendulum.d": [0.1, 0.2]}, **options) as running:
             ...     result = running.wait()
@@ -177,7 +176,6 @@ class SweepResult(Sequence[SweepRow]):
         """The curves of all runs as one data frame, with `variant` and `time` as its index; not of those that failed.
 
         Example:
-            >>> import fmu_mesh
             >>> options = {"stop_time": 1.0, "folder": "results/frame"}
             >>> with fmu_mesh.sweep("configs/pendulum_delay.yaml", {"pendulum.d": [0.1, 0.2]}, **options) as running:
             ...     frame = running.wait().curves_to_pandas("pendulum.a")
