@@ -23,25 +23,15 @@ _ROUNDING = 1e-6
 
 
 class Side(NamedTuple):
-    """One of the two results.
+    """One of the two results."""
 
-    Attributes:
-        title: what messages call it.
-        columns: the names of its variables; of thousands a collection that finds one at once.
-        pieces: its rows, piece by piece; times do not decrease.
-        all: all of its rows.
-        unit: the unit of a variable by its name; None if it is not known.
-        base_unit: the same in SI base units; None if it is not known.
-        point: the number of the communication point of a row, by its number and time.
-    """
-
-    title: str
-    columns: Collection[str]
-    pieces: Callable[[], Iterator[Columns]]
+    title: str  # what messages call it
+    columns: Collection[str]  # the names of its variables; of thousands a collection that finds one at once
+    pieces: Callable[[], Iterator[Columns]]  # its rows, piece by piece; times do not decrease
     all: Callable[[], Columns]
-    unit: Callable[[str], str | None]
-    base_unit: Callable[[str], BaseUnit | None]
-    point: Callable[[int, float], int]
+    unit: Callable[[str], str | None]  # the unit of a variable by its name; None if it is not known
+    base_unit: Callable[[str], BaseUnit | None]  # the same in SI base units; None if it is not known
+    point: Callable[[int, float], int]  # the number of the communication point of a row, by its number and time
 
 
 class _Matching(NamedTuple):

@@ -38,19 +38,12 @@ _ALONE: Mapping[str, Any] = {"zenoh": {"mode": "peer", "listen": [], "connect": 
 
 
 class PlannedRerun(NamedTuple):
-    """A rerun before it is started.
-
-    Attributes:
-        plan: the plan of the run.
-        values: what is set in it, in the order of the points.
-        last_point: the point at which it is stopped; None: it runs to its end.
-        first: the result of the first run.
-    """
+    """A rerun before it is started."""
 
     plan: RunPlan
-    values: Sequence[SetValue]
-    last_point: int | None
-    first: Result
+    values: Sequence[SetValue]  # what is set in it, in the order of the points
+    last_point: int | None  # the point at which it is stopped; None: it runs to its end
+    first: Result  # that of the first run
 
     @takes(StartOptions)
     def run(self, options: StartOptions) -> Result:

@@ -52,19 +52,12 @@ _PARAMETERS: Final = 8
 
 
 class Model(msgspec.Struct, frozen=True):
-    """One FMU.
+    """One FMU."""
 
-    Attributes:
-        name: of its instance.
-        path: as the configuration names it.
-        description: None if it cannot run here.
-        problem: why not.
-    """
-
-    name: str
-    path: str
-    description: ModelDescription | None
-    problem: str = ""
+    name: str  # of its instance
+    path: str  # as the configuration names it
+    description: ModelDescription | None  # None if it cannot run here
+    problem: str = ""  # why not
 
 
 def _new(arguments: argparse.Namespace) -> int:

@@ -37,31 +37,18 @@ _OF_FOLDER = {"allow_code", "on_notice", "resume", "workers"}
 
 
 class SweepReport(msgspec.Struct, frozen=True):
-    """The output of `sweep --json`.
+    """The output of `sweep --json`."""
 
-    Attributes:
-        mesh: name of the mesh; None if the sweep could not be planned.
-        state: whether every variant has a row, and none has failed.
-        exit_code: that of the command.
-        variants: how many there are.
-        runs: how many have a row.
-        failed: how many of these have failed.
-        seconds: wall-clock time in s.
-        folder: the folder of the sweep.
-        table: the CSV file with all rows.
-        error: why the sweep ended early; not why a run has failed, which its row says.
-    """
-
-    mesh: str | None
-    state: Literal["done", "failed"]
+    mesh: str | None  # name of the mesh; None if the sweep could not be planned
+    state: Literal["done", "failed"]  # whether every variant has a row, and none has failed
     exit_code: int
-    variants: int = 0
-    runs: int = 0
-    failed: int = 0
-    seconds: float = 0.0
+    variants: int = 0  # how many there are
+    runs: int = 0  # how many have a row
+    failed: int = 0  # how many of these have failed
+    seconds: float = 0.0  # wall-clock time in s
     folder: str | None = None
-    table: str | None = None
-    error: Failure | None = None
+    table: str | None = None  # the CSV file with all rows
+    error: Failure | None = None  # why the sweep ended early; not why a run has failed, which its row says
 
 
 def _sweep(arguments: argparse.Namespace) -> int:

@@ -160,23 +160,15 @@ class DrawnWire(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """All shapes of a picture.
-
-    Attributes:
-        groups: the box of each process with several instances, and its title.
-        instances: the boxes of instances.
-        wires: the wires, those of cycles last, so that they are on top.
-        labels: the title and the legend.
-        edges: source and target of each edge.
-    """
+    """All shapes of a picture."""
 
     width: float
     height: float
-    groups: tuple[tuple[Box, Label], ...]
+    groups: tuple[tuple[Box, Label], ...]  # the box of each process with several instances, and its title
     instances: tuple[DrawnInstance, ...]
-    wires: tuple[DrawnWire, ...]
-    labels: tuple[Label, ...]
-    edges: tuple[tuple[str, str], ...]
+    wires: tuple[DrawnWire, ...]  # the wires, those of cycles last, so that they are on top
+    labels: tuple[Label, ...]  # the title and the legend
+    edges: tuple[tuple[str, str], ...]  # source and target of each edge
 
 
 class _Ports(NamedTuple):

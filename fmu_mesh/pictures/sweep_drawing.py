@@ -58,17 +58,12 @@ _Path = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class VariantCurve(msgspec.Struct, frozen=True):
-    """One variable of one variant over time.
+    """One variable of one variant over time."""
 
-    Attributes:
-        times: the simulation times in s, shape `(rows,)`.
-        values: one for each time. Values that are no floats hold until the next one. A variant that failed has no rows.
-        colour: the value of the parameter that colours the curve.
-    """
-
-    times: NDArray[np.float64]
+    times: NDArray[np.float64]  # the simulation times in s, shape `(rows,)`
+    # one for each time. Values that are no floats hold until the next one. A variant that failed has no rows
     values: NDArray[Any]
-    colour: PlainValue
+    colour: PlainValue  # the value of the parameter that colours the curve
 
 
 def curves_figure(title: str, y_label: str, colour_label: str, curves: Iterable[VariantCurve]) -> Figure:
@@ -246,19 +241,12 @@ def _draw_points(
 
 
 class _Scale(NamedTuple):
-    """Where the values of a parameter lie: numbers where they are, all other values side by side.
+    """Where the values of a parameter lie: numbers where they are, all other values side by side."""
 
-    Attributes:
-        title: name and unit of the parameter.
-        marks: the different places, in increasing order.
-        texts: the value at each place; empty for numbers.
-        logarithmic: whether the numbers are spread by ratio.
-    """
-
-    title: str
-    marks: list[float]
-    texts: list[str]
-    logarithmic: bool
+    title: str  # name and unit of the parameter
+    marks: list[float]  # the different places, in increasing order
+    texts: list[str]  # the value at each place; empty for numbers
+    logarithmic: bool  # whether the numbers are spread by ratio
 
     @classmethod
     def of(cls, title: str, values: Sequence[PlainValue]) -> _Scale:

@@ -46,27 +46,16 @@ _OF_EACH_RUN = [name for name in VariantOptions.__struct_fields__ if name != "on
 
 
 class PlannedSweep(NamedTuple):
-    """A sweep that can run.
+    """A sweep that can run."""
 
-    Attributes:
-        wanted: what was asked.
-        folder: where everything goes.
-        plan: the plan of a variant, for what all have in common.
-        columns: what is calculated from the curves of each run.
-        functions: the columns that functions of the user calculate.
-        task: what every worker gets.
-        at_once: how many variants may be under way, because of `max_instances`; None: any number.
-        found: the rows that are in the folder already, by their id.
-    """
-
-    wanted: Wanted
-    folder: SweepFolder
-    plan: RunPlan
-    columns: tuple[str, ...]
-    functions: OwnReductions
-    task: bytes
-    at_once: int | None
-    found: dict[str, Row]
+    wanted: Wanted  # what was asked
+    folder: SweepFolder  # where everything goes
+    plan: RunPlan  # the plan of a variant, for what all have in common
+    columns: tuple[str, ...]  # what is calculated from the curves of each run
+    functions: OwnReductions  # the columns that functions of the user calculate
+    task: bytes  # what every worker gets
+    at_once: int | None  # how many variants may be under way, because of `max_instances`; None: any number
+    found: dict[str, Row]  # the rows that are in the folder already, by their id
 
 
 @takes(SweepOptions)

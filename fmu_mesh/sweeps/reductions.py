@@ -30,20 +30,12 @@ _ULPS = 4
 
 
 class Reduction(msgspec.Struct, frozen=True):
-    """One value of one recorded variable.
+    """One value of one recorded variable."""
 
-    Attributes:
-        text: as it was written; also the name of the column.
-        function: one of `first`, `last`, `min`, `max`, `mean`, `std`, `rms`, `span`, `integral`, `time_of_min`,
-            `time_of_max`, `at`.
-        variable: the variable, as `instance.variable`.
-        time: the simulation time of `at` in s.
-    """
-
-    text: str
-    function: str
+    text: str  # as it was written; also the name of the column
+    function: str  # one of `FUNCTIONS`
     variable: str
-    time: float | None = None
+    time: float | None = None  # the simulation time of `at` in s
 
 
 def read_reduction(text: str) -> Reduction:

@@ -77,18 +77,12 @@ class SlurmJob(msgspec.Struct, frozen=True):
     Example:
         >>> SlurmJob("4711", Path("damping/sweep.sbatch"), tasks=8).log(3)
         PosixPath('damping/slurm-3.log')
-
-    Attributes:
-        id: number of the job, as `squeue --jobs` and `scancel` take it.
-        script: its batch script, in the folder that also has the logs.
-        tasks: how many tasks it has; they are numbered from 1.
-        cluster: name of the cluster, if `sbatch` has named one.
     """
 
-    id: str
-    script: Path
-    tasks: int
-    cluster: str | None = None
+    id: str  # number of the job, as `squeue --jobs` and `scancel` take it
+    script: Path  # its batch script, in the folder that also has the logs
+    tasks: int  # they are numbered from 1
+    cluster: str | None = None  # name of the cluster, if `sbatch` has named one
 
     def log(self, task: int) -> Path:
         """The file with what a task has printed."""
@@ -101,18 +95,13 @@ class EndedTask(NamedTuple):
     Example:
         >>> print(EndedTask(3, "TIMEOUT", Path("damping/slurm-3.log"), "error: *** CANCELLED DUE TO TIME LIMIT ***"))
         task 3: TIMEOUT; the last line of 'damping/slurm-3.log': error: *** CANCELLED DUE TO TIME LIMIT ***
-
-    Attributes:
-        task: its number.
-        state: the state of Slurm, such as FAILED, TIMEOUT, NODE_FAIL or OUT_OF_MEMORY; None if it is not known.
-        log: the file with what it has printed.
-        last_line: the last line there; None if there is no such file.
     """
 
     task: int
+    # the state of Slurm, such as FAILED, TIMEOUT, NODE_FAIL or OUT_OF_MEMORY; None if it is not known
     state: str | None
-    log: Path
-    last_line: str | None
+    log: Path  # the file with what it has printed
+    last_line: str | None  # the last line there; None if there is no such file
 
     def __str__(self) -> str:
         if self.last_line is None:

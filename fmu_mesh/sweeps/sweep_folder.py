@@ -39,26 +39,17 @@ _CURVES: Final = "runs"
 
 
 class Wanted(Common, frozen=True, kw_only=True):
-    """What was asked: `sweep.json`.
-
-    Attributes:
-        mesh: name of the mesh.
-        names: names of the parameters.
-        variants: for each variant the values of the parameters, in this order.
-        recorded: names of the recorded variables.
-        identities: the id of each variant.
-        units: unit of each recorded variable and of each parameter; None without one.
-        curves: whether the curves of each run are kept.
-        most_instances: by the name of a model file, how many instances there may be at a time.
-    """
+    """What was asked: `sweep.json`."""
 
     mesh: str
     names: tuple[str, ...]
-    variants: tuple[tuple[Any, ...], ...]
+    variants: tuple[tuple[Any, ...], ...]  # for each variant the values of the parameters, in this order
     recorded: tuple[str, ...] = ()
+    # unit of each recorded variable and of each parameter; None without one
     units: dict[str, str | None] = msgspec.field(default_factory=dict)
-    identities: tuple[str, ...] = ()
-    curves: bool = True
+    identities: tuple[str, ...] = ()  # the id of each variant
+    curves: bool = True  # whether the curves of each run are kept
+    # by the name of a model file, how many instances there may be at a time
     most_instances: dict[str, int] = msgspec.field(default_factory=dict)
 
     def parameters(self, number: int) -> Parameters:

@@ -44,62 +44,38 @@ OwnReductions = Mapping[str, Callable[[Result], object]]
 
 
 class Common(msgspec.Struct, frozen=True, kw_only=True):
-    """What all variants of a sweep have in common.
+    """What all variants of a sweep have in common."""
 
-    Attributes:
-        version: that of fmu_mesh, which all workers must have.
-        file: the file of the configuration, absolute.
-        data: the values of the configuration.
-        options: the options of each run that have another value than their default.
-        reductions: columns that are calculated from the curves of each run.
-        processes: whether each run starts processes, as `launch` does.
-        reset: whether instances are reset between two runs, and not made anew.
-    """
-
-    version: str
-    file: str
-    data: Any
-    options: dict[str, Any]
-    reductions: tuple[str, ...] = ()
-    processes: bool = False
-    reset: bool = False
+    version: str  # that of fmu_mesh, which all workers must have
+    file: str  # the file of the configuration, absolute
+    data: Any  # the values of the configuration
+    options: dict[str, Any]  # the options of each run that have another value than their default
+    reductions: tuple[str, ...] = ()  # columns that are calculated from the curves of each run
+    processes: bool = False  # whether each run starts processes, as `launch` does
+    reset: bool = False  # whether instances are reset between two runs, and not made anew
 
 
 class SweepTask(Common, frozen=True, kw_only=True):
-    """What every worker gets.
+    """What every worker gets."""
 
-    Attributes:
-        folder: for the curves of each run; None: they are not kept.
-        foreign: as in `PlainConfig`.
-    """
-
-    folder: Path | None = None
-    foreign: str = ""
+    folder: Path | None = None  # for the curves of each run; None: they are not kept
+    foreign: str = ""  # as in `PlainConfig`
 
 
 class Row(msgspec.Struct, frozen=True):
-    """How one variant ended: a row of the table.
+    """How one variant ended: a row of the table."""
 
-    Attributes:
-        id: SHA-256 of the configuration, the parameters, and the files of all models.
-        exit_code: 0, or that of `launch` for the same error.
-        message: why it failed, or what its result warns of; empty if there is nothing to say.
-        values: by the name of the column, what was calculated from its curves; None where there is nothing.
-        seconds: wall-clock time of the run in s, with its planning.
-        worker: host and process id of the worker.
-        spent: whether the worker is to be replaced: an FMU has not returned, or has crashed while it was closed, or
-            the process has grown, because an FMU does not free its memory.
-        machine: what the last digits of results depend on, on the host of the worker.
-    """
-
-    id: str
-    exit_code: int
-    message: str
+    id: str  # SHA-256 of the configuration, the parameters, and the files of all models
+    exit_code: int  # 0, or that of `launch` for the same error
+    message: str  # why it failed, or what its result warns of; empty if there is nothing to say
+    # by the name of the column, what was calculated from its curves; None where there is nothing
     values: dict[str, Cell]
-    seconds: float
-    worker: str
+    seconds: float  # wall-clock time of the run in s, with its planning
+    worker: str  # host and process id of the worker
+    # whether the worker is to be replaced: an FMU has not returned, or has crashed while it was closed, or the
+    # process has grown, because an FMU does not free its memory
     spent: bool = False
-    machine: str = ""
+    machine: str = ""  # what the last digits of results depend on, on the host of the worker
 
 
 def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:
