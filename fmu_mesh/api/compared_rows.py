@@ -51,14 +51,9 @@ class _Matching(NamedTuple):
 
 
 def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0, atol: float = 0.0) -> Comparison:
-    """Compare two results; rows that belong together in their order are read piece by piece.
+    """Compare two results, as `Result.compare`; rows that belong together in their order are read piece by piece.
 
-    Args:
-        here: the one result, whose times and units hold.
-        there: the other one.
-        names: the variables; one that only one of them has is told.
-        rtol: relative tolerance; two numbers are equal if `|a - b| <= atol + rtol * max(|a|, |b|)`.
-        atol: absolute tolerance.
+    Times and units are those of the first one; a variable that only one of them has is told.
     """
     both = [name for name in names if name in here.columns and name in there.columns]
     tallies = {name: _Tally(here, there, name, (rtol, atol)) for name in both}

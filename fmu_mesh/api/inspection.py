@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from base64 import b64encode
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +18,7 @@ from ..config.loading import LoadedConfig
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.configuration import examine_data
 from ..instances.registry import KINDS, describe
-from ..pictures.tables import html_table, pairs
+from ..pictures.tables import html_table, pairs, titled
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package, read_configuration
 from ..text import counted, did_you_mean, listed, matching, nearest_file, short_number, shown
@@ -199,16 +200,18 @@ def _page(inspection: Inspection, width: int, patterns: Sequence[str], *, everyt
     names = [variable.name for variable in description.variables]
     wanted = {name for pattern in patterns for name in matching(pattern, names)}
     chosen = [variable for variable in description.variables if not patterns or variable.name in wanted]
-    lines = [] if patterns else [*_facts(inspection, width), *_problems(inspection, width)]
+    limit = None if everything or patterns else SHOWN_VARIABLES
+    sections = []
+    if not patterns:
+        problems = [_wrapped("  " + " ".join(problem.split()), width, "    ") for problem in inspection.problems]
+        sections = [("", _facts(inspection, width)), (f"Problems ({len(problems)})", [*chain(*problems)])]
     for causality, title in _CAUSALITIES:
         members = [variable for variable in chosen if variable.causality == causality]
-        if members:
-            lines += ([""] if lines else []) + [f"{title} ({len(members)})"]
-            limit = None if everything or patterns else SHOWN_VARIABLES
-            lines += _variables(members[:limit], width)
-            if limit is not None and len(members) > limit:
-                lines.append(f"  ... and {len(members) - limit} more: --all lists them, a name such as 'x*' some")
-    return lines
+        lines = _variables(members[:limit], width) if members else []
+        if limit is not None and len(members) > limit:
+            lines.append(f"  ... and {len(members) - limit} more: --all lists them, a name such as 'x*' some")
+        sections.append((f"{title} ({len(members)})", lines))
+    return titled(sections)
 
 
 def _facts(inspection: Inspection, width: int) -> list[str]:
@@ -262,25 +265,10 @@ _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 
-def _problems(inspection: Inspection, width: int) -> list[str]:
-    if not inspection.problems:
-        return []
-    lines = ["", f"Problems ({len(inspection.problems)})"]
-    for problem in inspection.problems:
-        lines += _wrapped("  " + " ".join(problem.split()), width, "    ")
-    return lines
-
-
 def _wrapped(line: str, width: int, indent: str) -> list[str]:
     """Wrap a line without breaking paths and hashes, so that they can be copied."""
     return textwrap.wrap(
-        line,
-        width,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-        drop_whitespace=True,
-        replace_whitespace=False,
+        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False, replace_whitespace=False
     )
 
 
@@ -297,13 +285,11 @@ def _variables(variables: Sequence[Variable], width: int) -> list[str]:
     for row in rows:
         cells = "  ".join(cell.ljust(size) for cell, size in zip(row, widest, strict=False) if size)
         line = f"  {cells.rstrip()}" if not row[4] else f"  {cells}  {row[4]}"
-        lines.append(line if len(line) <= width or not row[4] else _cut(line, width, 2 + len(cells)))
+        if row[4] and len(line) > width:  # with a shortened description, or without it on a narrow page
+            least = 2 + len(cells)
+            line = f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
+        lines.append(line)
     return lines
-
-
-def _cut(line: str, width: int, least: int) -> str:
-    """The line with a shortened description, or without it on a narrow page."""
-    return f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
 
 
 def _start(variable: Variable) -> str:

@@ -105,9 +105,7 @@ class Mesh:
         Raises:
             ConfigurationError: the text is no YAML. What it means is checked by `check`, and before a run.
         """
-        mesh = cls.__new__(cls)
-        mesh._take(read_text(text, Path(folder).absolute() / "<text>"))  # noqa: SLF001  its own method
-        return mesh
+        return cls.from_configuration(read_text(text, Path(folder).absolute() / "<text>"))
 
     @classmethod
     def from_configuration(cls, configuration: PlainConfig, *, keeps_code: bool = False) -> Self:
@@ -169,16 +167,10 @@ class Mesh:
         given = simulation(description) if callable(simulation) else simulation
         times = {"step_size": description.step_size, "stop_time": None, **given}
         if times["step_size"] is None:
-            raise CallRefused(
-                f"'{path}' has no default step size.", hint='Give one, as `simulation={"step_size": ...}`.'
-            )
-        instance = plain({"fmu": file.absolute(), **section})
-        data = {
-            "mesh": own_name,
-            "simulation": plain(times),
-            "instances": {own_name: instance},
-            "record": {"file": None},
-        }
+            hint = 'Give one, as `simulation={"step_size": ...}`.'
+            raise CallRefused(f"'{path}' has no default step size.", hint=hint)
+        instances = {own_name: {"fmu": file.absolute(), **section}}
+        data = plain({"mesh": own_name, "simulation": times, "instances": instances, "record": {"file": None}})
         mesh = cls.__new__(cls)
         mesh._take(PlainConfig(data, file), known)  # noqa: SLF001  its own method
         return mesh

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -87,7 +88,7 @@ class Result(Mapping[str, NDArray[Any]]):
         self._step_size = system.grid.step_size if system is not None else 0.0
         self._given = columns
         self._record = record
-        self._variables = _recorded(self._system, record)
+        self._variables = _recorded(system, record)
 
     @classmethod
     @checked
@@ -240,11 +241,10 @@ class Result(Mapping[str, NDArray[Any]]):
             ConfigurationError: there is no such variable, or matplotlib is not installed.
             CallRefused: there is no other result to show the difference to; or ``x`` has texts.
         """
-        if difference and (not others or x is not None):
-            raise CallRefused(
-                "a difference needs another result" if not others else "a difference is drawn over time only",
-                hint="Name two results." if not others else "Leave the horizontal axis out.",
-            )
+        if difference and not others:
+            raise CallRefused("a difference needs another result", hint="Name two results.")
+        if difference and x is not None:
+            raise CallRefused("a difference is drawn over time only", hint="Leave the horizontal axis out.")
         results = (self, *others)
         there = [*dict.fromkeys(name for result in results for name in result)]
         chosen = [*chosen_names(self.title, there, names)]
@@ -254,7 +254,7 @@ class Result(Mapping[str, NDArray[Any]]):
         curves: dict[str, Curve] = {}
         for label, result in zip(_titles(results), results, strict=True):
             drawn.append(self._drawn(result, label, chosen, x, difference=difference))
-            curves = self._curves_of(result, drawn[-1].values) | curves
+            curves = {name: result._curve(name) for name in drawn[-1].values} | curves  # noqa: SLF001  its own method
         meshes = dict.fromkeys(str(result.metadata.get("mesh", result.title)) for result in results)
         title = title if title is not None else " and ".join(meshes)
         return figure_of(drawn, PictureOptions(title, curves, x, difference, annotate))
@@ -359,7 +359,7 @@ class Result(Mapping[str, NDArray[Any]]):
 
     def _pieces(self) -> Iterator[Columns]:
         """The rows, piece by piece; those of a file that was not read yet are not kept."""
-        if self._given is not None or "_columns" in self.__dict__:
+        if self._is_here:
             return iter([self._columns])
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
             return iter([Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})])
@@ -376,12 +376,10 @@ class Result(Mapping[str, NDArray[Any]]):
         noted = metadata.pop("set", ())
         file = opened(types, self._columns._replace(units=units, metadata=metadata))
         try:
-            try:
+            with closing(file):
                 file.write(self.times, [*self.values()])
                 for entry in noted:
                     file.note(entry)
-            finally:
-                file.close()
         except OSError as error:
             raise unwritable(file.path, error) from error
 
@@ -398,9 +396,6 @@ class Result(Mapping[str, NDArray[Any]]):
         values = {name: values_in_unit_of(here, there, name, rows.values[name]) for name in wanted}
         has_difference = difference and other is not self
         return Curves(label, rows.times, values, differences_of(here, there, names) if has_difference else {})
-
-    def _curves_of(self, other: Result, names: Iterable[str]) -> dict[str, Curve]:
-        return {name: other._curve(name) for name in names}
 
     @property
     def _side(self) -> Side:

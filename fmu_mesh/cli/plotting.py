@@ -155,8 +155,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    rows = recover(arguments.results)
-    print(f"{arguments.results}: {rows} rows")
+    print(f"{arguments.results}: {recover(arguments.results)} rows")
     return 0
 
 

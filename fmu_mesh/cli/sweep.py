@@ -13,7 +13,7 @@ import msgspec
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..sweeps.dask_cluster import dask_executor
 from ..sweeps.planned_sweep import PlannedSweep, continued_sweep, planned_sweep
-from ..sweeps.slurm_sweep import SlurmOptions, SlurmSweep
+from ..sweeps.slurm_sweep import SlurmSweep
 from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_options import SweepOptions
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
@@ -97,8 +97,8 @@ def _started(planned: PlannedSweep, arguments: argparse.Namespace) -> Iterator[S
     if arguments.slurm and arguments.dask is not None:
         raise ConfigurationError("--slurm and --dask do not go together", hint="Leave one of them out.")
     if arguments.slurm:
-        options = SlurmOptions(arguments.tasks, arguments.workers or 1, tuple(arguments.slurm_option))
-        with SlurmSweep(planned, options) as sweep:
+        tasks, workers, options = arguments.tasks, arguments.workers or 1, arguments.slurm_option
+        with SlurmSweep(planned, tasks=tasks, workers=workers, options=options) as sweep:
             yield sweep
         return
     part = SweepPart(*arguments.part) if arguments.part is not None else None

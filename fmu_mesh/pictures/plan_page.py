@@ -17,7 +17,7 @@ from ..system.value_map import map_text
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
-from .tables import pairs, table
+from .tables import pairs, table, titled
 
 __all__ = ["plan_page", "slower_than_it_could_be", "start_value_origin"]
 
@@ -39,11 +39,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Recorded", _recorded(plan)),
         ("Warnings", _warnings(plan)),
     ]
-    lines: list[str] = []
-    for title, content in sections:
-        if content:
-            lines += ([""] if lines else []) + ([title] if title else []) + content
-    return lines
+    return titled(sections)
 
 
 def slower_than_it_could_be() -> str | None:
@@ -57,7 +53,6 @@ def _head(plan: Plan) -> list[str]:
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
     end = f"{short_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
     times = f"{short_number(grid.start_time)} s to {end} steps of"
-    without = why_no_library()
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),
@@ -65,7 +60,7 @@ def _head(plan: Plan) -> list[str]:
             ("Algorithm", simulation.algorithm),
             ("Window", window),
             ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
-            *([("Library", without)] if without is not None else []),
+            ("Library", why_no_library() or ""),
         ]
     )
 

@@ -58,13 +58,7 @@ class Wanted(Common, frozen=True, kw_only=True):
 
 
 class SweepFolder:
-    """One folder, which may not exist yet; see above.
-
-    Attributes:
-        table: the file of the table.
-        curves: the folder of the curves.
-        wanted_file: the file that says what was asked.
-    """
+    """One folder, which may not exist yet; see above."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

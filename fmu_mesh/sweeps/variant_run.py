@@ -15,9 +15,10 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -38,6 +39,9 @@ _GROWTH_BYTES = 256 * 2**20
 
 Cell = float | int | bool | str | None
 """One value of the table."""
+
+_Jobs = SimpleQueue[tuple[dict[str, Any], Future[Result]] | None]
+"""Options of a run, and who waits for its result; None at the end."""
 
 OwnReductions = Mapping[str, Callable[[Result], object]]
 """Functions of the user by the name of their column."""
@@ -87,12 +91,10 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
 
 
 def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
-    """Run one variant. Called in a worker, by whichever executor.
-
-    Returns:
-        The row; also of a run that failed.
-    """
-    own = _mine.loaded_for(task)
+    """Run one variant. Called in a worker, by whichever executor; a run that failed has a row, too."""
+    own: _Loaded | None = getattr(_mine, "loaded", None)
+    if own is None or own.task != task or own.hung.stuck:
+        own = _mine.loaded = _Loaded(task)
     started = time.perf_counter()
     values: dict[str, Cell] = {}
     error: ErrorReport | None = None
@@ -111,24 +113,13 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
         values=values,
         seconds=time.perf_counter() - started,
         worker=f"{socket.gethostname()}:{os.getpid()}",
-        spent=own.stuck or own.has_grown(),
+        spent=own.hung.stuck or own.has_grown(),
         machine=", ".join(machine().values()),
     )
 
 
-class _Mine(threading.local):
-    """What the thread that asks for runs has loaded; it is let go with the thread."""
-
-    def __init__(self) -> None:
-        self._loaded: _Loaded | None = None
-
-    def loaded_for(self, task: bytes) -> _Loaded:
-        if self._loaded is None or self._loaded.task != task or self._loaded.stuck:
-            self._loaded = _Loaded(task)
-        return self._loaded
-
-
-_mine = _Mine()
+_mine = threading.local()
+"""What the thread that asks for runs has loaded; it is let go with the thread."""
 
 
 class _Loaded:
@@ -142,19 +133,12 @@ class _Loaded:
         if isinstance(data, dict) and isinstance(records := data.get("record"), list):
             data = {**data, "record": records[:1]}  # variants must not write into the same files
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
-        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
+        self._jobs: _Jobs = SimpleQueue()
         self.hung = _Hung()
         self._bytes = 0
-        arguments = self._mesh, self._jobs, self.hung
-        threading.Thread(
-            target=_work, args=arguments, kwargs={"reset": self._task.reset}, name="variants", daemon=True
-        ).start()
+        work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset)
+        threading.Thread(target=work, name="variants", daemon=True).start()
         weakref.finalize(self, self._jobs.put, None)
-
-    @property
-    def stuck(self) -> bool:
-        """Whether its thread is inside an FMU that does not return."""
-        return self.hung.stuck
 
     def has_grown(self) -> bool:
         """Whether this process has more than twice the memory that it had after its first run."""
@@ -173,7 +157,7 @@ class _Loaded:
             options["record"] = "memory"
         if not task.processes:
             ended: Future[Result] = Future()
-            self._jobs.put(_Job(options, ended))
+            self._jobs.put((options, ended))
             with suppress(NotInOneProcess):  # a parameter may be the path of a model
                 return ended.result()
         return self._mesh.run(**options)
@@ -190,24 +174,13 @@ class _Loaded:
         return values
 
 
-class _Job(NamedTuple):
-    options: dict[str, Any]
-    ended: Future[Result]
-
-
 class _Hung:
-    """Tells whoever waits for a run that an FMU does not return.
-
-    Attributes:
-        ended: the run under way.
-        stuck: whether it has not returned.
-        warning: why, if the run was over before.
-    """
+    """Tells whoever waits for a run that an FMU does not return."""
 
     def __init__(self) -> None:
-        self.ended: Future[Result] = Future()
-        self.stuck = False
-        self.warning = ""
+        self.ended: Future[Result] = Future()  # the run under way
+        self.stuck = False  # whether it has not returned
+        self.warning = ""  # why, if the run was over before
         self._end: Result | BaseException | None = None
 
     def begin(self, ended: Future[Result]) -> None:
@@ -228,17 +201,18 @@ class _Hung:
             self.ended.set_result(end)
 
 
-def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: bool) -> None:
+def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
     own = mesh.from_configuration(mesh.configuration, keeps_code=True)
     with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
-            hung.begin(job.ended)
+            options, ended = job
+            hung.begin(ended)
             try:
-                job.ended.set_result(runs.run(**job.options))
+                ended.set_result(runs.run(**options))
             except BaseException as error:  # noqa: BLE001  whoever waits gets it
                 if not hung.stuck:
-                    job.ended.set_exception(error)
+                    ended.set_exception(error)
 
 
 def curves_of(folder: Path, identity: str) -> Path:
