@@ -71,8 +71,7 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 
 def did_you_mean(name: str, names: Iterable[str], otherwise: str | None = None) -> str | None:
     """The hint for a name that is not there: the most similar one, or something else if none is similar."""
-    near = nearest(name, names)
-    return f"Did you mean '{near}'?" if near is not None else otherwise
+    return meant(nearest(name, names), otherwise)
 
 
 def nearest_file(path: Path) -> str | None:

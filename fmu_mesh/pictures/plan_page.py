@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from ..config.findings import ValueOrigin
@@ -11,6 +12,7 @@ from ..run.one_process import apart, claims_in
 from ..system.plan import Plan
 from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
+from ..system.schedule import Course, Schedule
 from ..system.series_files import course_of
 from ..system.system import Connection, SystemInstance
 from ..system.value_map import map_text
@@ -19,7 +21,7 @@ from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from .tables import pairs, table, titled
 
-__all__ = ["plan_page", "slower_than_it_could_be", "start_value_origin"]
+__all__ = ["plan_page", "scheduled", "slower_than_it_could_be", "start_value_origin"]
 
 _PROBLEM_CHARACTERS = 200
 
@@ -137,27 +139,28 @@ def _free_inputs(plan: Plan) -> list[str]:
 
 def _scenario(plan: Plan) -> list[str]:
     rows = []
+    for name, own, course, (first, last) in scheduled(plan):
+        if course.changes == 1:
+            since = "" if own.initial and not course.first_step else f" from {short_number(first)} s on"
+            unit = _unit(plan.system.instances[name].description.variable(own.variable))
+            what, shape = f"= {shown(to_plain(course.end))}{unit}{since}", ""
+        else:
+            what = f"{course.changes} values from {short_number(first)} s to {short_number(last)} s"
+            shape = "linear" if own.linear else "hold"
+        source = f"column '{own.file.column}' of {short_path(own.file.path)}" if own.file is not None else ""
+        rows.append([f"{name}.{own.variable}", what, shape, source])
+    return table(rows, indent=2)
+
+
+def scheduled(plan: Plan) -> Iterator[tuple[str, Schedule, Course, tuple[float, float]]]:
+    """What the scenario sets: the instance, how, and the times in s of the first and the last value."""
     for name, instance in plan.system.instances.items():
         for own in instance.scenario:
             variable = instance.description.variable(own.variable)
             assert variable is not None  # the plan is valid
             course = course_of(own, variable, plan.grid, instance.step_points)
-            first, last = (
-                short_number(plan.grid.time(step * instance.step_points))
-                for step in (course.first_step, course.last_step)
-            )
-            shape = "linear" if own.linear else "hold"
-            if course.changes == 1:
-                value = f"{shown(to_plain(course.end))}{_unit(variable)}"
-                what, shape = (
-                    f"= {value}" if own.initial and not course.first_step else f"= {value} from {first} s on",
-                    "",
-                )
-            else:
-                what = f"{course.changes} values from {first} s to {last} s"
-            source = f"column '{own.file.column}' of {short_path(own.file.path)}" if own.file is not None else ""
-            rows.append([f"{name}.{own.variable}", what, shape, source])
-    return table(rows, indent=2)
+            first, last = (plan.grid.time(n * instance.step_points) for n in (course.first_step, course.last_step))
+            yield name, own, course, (first, last)
 
 
 def _arithmetic(c: Connection) -> str:

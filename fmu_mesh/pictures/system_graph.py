@@ -6,7 +6,6 @@ Owns what the graph says; `graph_layout` has where things lie, and `graph_drawin
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -124,10 +123,11 @@ class SystemGraph(msgspec.Struct, frozen=True):
 
     def text(self) -> str:
         """The graph as text of at most 80 columns: below each instance, what its outputs are connected to."""
-        members = sorted(self.nodes, key=lambda node: self._first_of_group[node.group])
+        groups: dict[str, list[GraphNode]] = {}
+        for node in self.nodes:
+            groups.setdefault(node.group, []).append(node)
         lines = [shortened(self.title, _COLUMNS), ""]
-        for group, of_group in groupby(members, key=lambda node: node.group):
-            nodes = list(of_group)
+        for group, nodes in groups.items():
             indent = 2 if len(nodes) > 1 else 0
             if indent:
                 lines.append(f"group {shortened(group, _COLUMNS - 30)}, one process")
@@ -146,13 +146,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
             return f'<div style="overflow-x: auto">{self.svg()}</div>'
         rows = ((node.instance, node.model, node.group, node.live) for node in self.nodes)
         return html_table(self.title, ["instance", "model", "process", "state"], rows, len(self.nodes))
-
-    @property
-    def _first_of_group(self) -> dict[str, int]:
-        first: dict[str, int] = {}
-        for number, node in enumerate(self.nodes):
-            first.setdefault(node.group, number)
-        return first
 
     def _lines_of(self, node: GraphNode, indent: int) -> list[str]:
         heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), node.live]

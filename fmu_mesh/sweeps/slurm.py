@@ -211,7 +211,7 @@ def cancel(job: SlurmJob) -> None:
 
 
 def _check_option(option: str) -> None:
-    """Check that an option can be a line of the script, and does not belong to the sweep."""
+    """Refuse an option that cannot be a line of the script, or belongs to the sweep."""
     if not option.startswith("-") or not option.isprintable():
         hint = "Write it as `sbatch` takes it, such as --slurm-option=--partition=short."
         raise ConfigurationError(f"{option!r} is no option of `sbatch`", hint=hint)

@@ -267,9 +267,8 @@ class SweepResult(Sequence[SweepRow]):
             ConfigurationError: matplotlib is not installed.
         """
         if len(self.names) < 2 and (x is None or y is None):
-            raise CallRefused(
-                "a heat map needs two parameters, and this sweep has one", hint="`plot` draws its curves."
-            )
+            text = "a heat map needs two parameters, and this sweep has one"
+            raise CallRefused(text, hint="`plot` draws its curves.")
         axes = [(self._axis(name), self.values(name)) for name in (x or self.names[0], y or self.names[1])]
         values = [None if value is None or isinstance(value, str) else float(value) for value in self.values(column)]
         return heat_map_figure(title or self._wanted.mesh, axes[0], axes[1], (column, values))
@@ -283,8 +282,7 @@ class SweepResult(Sequence[SweepRow]):
         return VariantCurve(result.times, result[name], colour)
 
     def _axis(self, name: str) -> str:
-        unit = self._wanted.units.get(name)
-        return in_unit(name, unit or "")
+        return in_unit(name, self._wanted.units.get(name) or "")
 
     def _row(self, number: int, row: Row) -> SweepRow:
         return SweepRow(
