@@ -114,7 +114,6 @@ class _Span:
         self.rises = True
 
     def add(self, times: NDArray[np.float64]) -> None:
-        """Add the times of the next rows."""
         self.first = self.first if self.rows else float(times[0])
         distances = np.diff(times, prepend=self.last if self.rows else times[0])
         self.step = min(self.step, float(distances.min(initial=np.inf, where=distances > 0.0)))
@@ -239,7 +238,6 @@ class _Tally:
         self._largest = self._steepest = (-1.0, 0.0)
 
     def add(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> None:
-        """Add rows: their times in s, and both values."""
         if (own.dtype == object) != (other.dtype == object):
             here, there = self._titles
             self._note = self._note or f"{_kind(own)} in {here}, {_kind(other)} in {there}"
@@ -252,7 +250,6 @@ class _Tally:
         self._rows += len(times)
 
     def _beyond(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which values differ beyond the tolerance."""
         are_floats = own.dtype.kind == "f" or other.dtype.kind == "f"
         unequal: NDArray[np.bool_] = own != other
         if are_floats:
@@ -295,7 +292,6 @@ class _Tally:
 def _values_there(
     matching: _Matching, times: NDArray[np.float64], other: Columns, values: NDArray[Any]
 ) -> NDArray[Any]:
-    """The values of the other result at the compared times."""
     if matching.there is not None:
         return values[matching.there]
     times = times[matching.here]

@@ -21,7 +21,7 @@ from ..instances.registry import KINDS, describe
 from ..pictures.tables import html_table, pairs, titled
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package, read_configuration
-from ..text import counted, did_you_mean, listed, matching, nearest_file, short_number, shown
+from ..text import counted, did_you_mean, listed, matching, meant, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 
 __all__ = [
@@ -181,18 +181,16 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
 
 def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
     """The error for a path that should be a model and is something else, or nothing."""
+    hint = None
     if path.suffix.partition(":")[0] == ".py":
         hint = "A component is not read without running it: `check` of a configuration imports it, `info` shows it."
-        return error.instead_of_hint(hint)
-    if not files.exists(path):
-        near = nearest_file(path)
-        return error.instead_of_hint(f"Did you mean '{near}'?") if near is not None else error
-    if names_package(path):
+    elif not files.exists(path):
+        hint = meant(nearest_file(path))
+    elif names_package(path):
         hint = f"It is a package of SSP: `fmu-mesh launch {path}` runs it, and `fmu-mesh inspect {path}` shows it."
-        return error.instead_of_hint(hint)
-    if path.suffix in (".yaml", ".yml"):
-        return error.instead_of_hint(f"A configuration is run by `fmu-mesh launch {path}`.")
-    return error
+    elif path.suffix in (".yaml", ".yml"):
+        hint = f"A configuration is run by `fmu-mesh launch {path}`."
+    return error.instead_of_hint(hint) if hint is not None else error
 
 
 def _page(inspection: Inspection, width: int, patterns: Sequence[str], *, everything: bool) -> list[str]:

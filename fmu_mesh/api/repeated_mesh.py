@@ -51,10 +51,8 @@ class RepeatedMesh:
         True
 
     Args:
-        mesh: the mesh in words.
-        plan: plans a run of it, as `Mesh.plan`.
-        reset: reset the instances of FMUs between two runs, and do not make new ones.
-        on_hang: called on another thread if an FMU does not return in time.
+        mesh: the mesh in words; ``plan`` plans a run of it, as `Mesh.plan`.
+        reset: as in `Mesh.repeated`, and so is ``on_hang``.
         before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
             ``on_hang`` is also called if an FMU crashes then; the thread of the runs never goes on.
     """

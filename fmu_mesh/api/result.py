@@ -64,11 +64,7 @@ class Result(Mapping[str, NDArray[Any]]):
     Attributes:
         title: name of the mesh, or of the file.
         file: the result file; None if the rows are only in memory, or if nothing was recorded.
-        all: this result and those of the other files of the run, in the order of the configuration.
         outcome: how the run ended; None for a file that was read.
-        warnings: what is wrong although nothing failed, such as a value that grows without a limit.
-        names: the recorded variables, in order.
-        units: the unit of each, as FMI writes it; None without one.
     """
 
     def __init__(  # noqa: PLR0913  what a result is made of
@@ -121,7 +117,7 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @property
     def units(self) -> dict[str, str | None]:
-        """The unit of each variable; None without one, or if a file that was read does not say it."""
+        """The unit of each variable, as FMI writes it; None without one, or if a file that was read does not say it."""
         return {name: self._unit(name) for name in self}
 
     @property

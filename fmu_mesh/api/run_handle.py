@@ -521,7 +521,6 @@ class Run:
 
 
 def _follow(client: MeshClient, future: Future[Result]) -> None:
-    """Follow a mesh that somebody else has started to its end."""
     from .result import Result  # noqa: PLC0415  not for those who only look
 
     try:

@@ -180,7 +180,6 @@ class RunThread:
         _active.discard(self)
 
     def _run(self) -> Result:
-        """Run it, and again if it may be restarted."""
         plan, most = self.plan, self._settings.restarts
         while True:
             try:
@@ -274,7 +273,6 @@ _active: set[RunThread] = set()
 
 @atexit.register
 def _end_all() -> None:
-    """At the end of the program, end what still runs."""
     threads = list(_active)
     for thread in threads:
         thread.interrupt()

@@ -124,7 +124,6 @@ def interrupted_by_signals() -> Iterator[list[Run | Sweep]]:
 
 
 def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
-    """Show what the options of the command ask for, and print the summary."""
     outcome = result.outcome
     assert outcome is not None  # it has run
     if outcome.profile is not None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Literal
 
 import msgspec
@@ -96,20 +95,16 @@ def _started(planned: PlannedSweep, arguments: argparse.Namespace) -> Iterator[S
     """The sweep, where the arguments want it; it ends with the block."""
     if arguments.slurm and arguments.dask is not None:
         raise ConfigurationError("--slurm and --dask do not go together", hint="Leave one of them out.")
-    if arguments.slurm:
-        tasks, workers, options = arguments.tasks, arguments.workers or 1, arguments.slurm_option
-        with SlurmSweep(planned, tasks=tasks, workers=workers, options=options) as sweep:
-            yield sweep
-        return
     part = SweepPart(*arguments.part) if arguments.part is not None else None
-    dask: AbstractContextManager[Executor | None] = nullcontext()
-    if arguments.dask is not None:
-        dask = dask_executor(None if arguments.dask == HERE else arguments.dask, arguments.workers)
-    with (
-        dask as executor,
-        ExecutorSweep(planned, executor=executor, workers=arguments.workers, part=part) as sweep,
-    ):
-        yield sweep
+    workers, executor = arguments.workers, None
+    with ExitStack() as stack:
+        if arguments.dask is not None:
+            executor = stack.enter_context(dask_executor(None if arguments.dask == HERE else arguments.dask, workers))
+        yield stack.enter_context(
+            SlurmSweep(planned, tasks=arguments.tasks, workers=workers or 1, options=arguments.slurm_option)
+            if arguments.slurm
+            else ExecutorSweep(planned, executor=executor, workers=workers, part=part)
+        )
 
 
 def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:

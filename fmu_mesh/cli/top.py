@@ -85,7 +85,6 @@ class _Courses:
             self._thread.join()
 
     def lines(self, width: int | None) -> list[str]:
-        """The lines below the table; none without variables."""
         with self._lock:
             lines = self._histories.lines(width, sparkline_signs(sys.stdout.encoding))
         return ["", *lines] if lines else []

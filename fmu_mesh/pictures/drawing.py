@@ -150,7 +150,6 @@ def empty_figure() -> Figure:
 
 
 def _legend_columns(count: int) -> int:
-    """Number of columns of a legend with this number of names."""
     return math.ceil(min(count, _NAMES + 1) / _ROWS) or 1
 
 

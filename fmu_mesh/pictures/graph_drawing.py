@@ -363,7 +363,6 @@ def _moved(path: Sequence[Dot], group: Box) -> list[Dot]:
 
 
 def _without_repeats(path: Sequence[Dot]) -> list[Dot]:
-    """A path without corners that are none."""
     kept: list[Dot] = []
     for dot, after in zip(path, [*path[1:], None], strict=True):
         if dot == after or (kept and after and kept[-1][1] == dot[1] == after[1] and kept[-1][0] <= dot[0] <= after[0]):

@@ -257,7 +257,6 @@ class _Drawer:
         return limited(result.values[x][::stride].astype(np.float64)), limited(values[::stride])
 
     def _legend(self, panel: _Panel, lines: Sequence[Line2D]) -> tuple[list[Line2D], list[str]]:
-        """The lines and texts of a legend: the variables, and of several results these as well."""
         from matplotlib.lines import Line2D as Line  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
         texts = [short(name) + self._curve(name).note for name in panel.names]

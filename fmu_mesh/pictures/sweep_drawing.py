@@ -276,7 +276,6 @@ class _Scale(NamedTuple):
         return np.exp(edges) if self.logarithmic else edges
 
     def label(self, axis: Axis) -> None:
-        """Give an axis its title, its scale and its ticks."""
         axis.set_label_text(short(self.title), parse_math=False)
         if self.texts:
             axis.set_ticks(self.marks, [short(text) for text in self.texts])
@@ -335,7 +334,6 @@ def _unevenness(numbers: NDArray[np.float64]) -> float:
 
 
 def _norm(numbers: NDArray[np.float64], *, logarithmic: bool) -> Normalize:
-    """From numbers to shares of a colour map."""
     from matplotlib.colors import LogNorm, Normalize  # noqa: PLC0415  as above
 
     if not len(numbers):

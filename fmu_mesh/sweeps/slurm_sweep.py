@@ -37,13 +37,8 @@ _SHOWN: Final = 3
 class SlurmSweep(Sweep):
     """A sweep whose variants run in the tasks of an array of jobs; all hosts share its folder.
 
-    To leave it, or to interrupt it, leaves the tasks as they are.
-
-    Args:
-        planned: what runs.
-        tasks: number of tasks of the array, at most.
-        workers: processes of each task, which asks for so many processors.
-        options: more options of `sbatch`, such as `--partition=short`.
+    To leave it, or to interrupt it, leaves the tasks as they are. There are at most so many ``tasks``; each asks for
+    one processor for each of its ``workers``. ``options`` are more options of `sbatch`, such as `--partition=short`.
 
     Raises:
         ConfigurationError: Slurm refuses it, or is not installed.
@@ -100,7 +95,6 @@ class SlurmSweep(Sweep):
                 self._follow(self.job)
 
     def _follow(self, job: SlurmJob) -> None:
-        """Read the rows until no task is left."""
         left: int | None = job.tasks
         answered = asked = time.monotonic()
         while self._left and left != 0 and not self._cancelled.wait(_FOLDER_CHECK_S):

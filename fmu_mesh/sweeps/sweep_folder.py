@@ -19,7 +19,7 @@ import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
@@ -109,19 +109,14 @@ class SweepFolder:
             rows |= {row.id: row for row in _lines(file)}
         return rows
 
-    @contextmanager
-    def writing(self, part: int | None = None) -> Iterator[RowFile]:
-        """In the block, rows can be added; one process at a time may do so for each part."""
+    def writing(self, part: int | None = None) -> closing[RowFile]:
+        """For a block in which rows can be added; one process at a time may do so for each part."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise self._unwritable(error) from error
         name = _ROWS if part is None else f"{_ROWS}-{part}"
-        file = RowFile(self.path / f"{name}.jsonl")
-        try:
-            yield file
-        finally:
-            file.close()
+        return closing(RowFile(self.path / f"{name}.jsonl"))
 
     def _unwritable(self, error: OSError) -> ConfigurationError:
         return ConfigurationError(f"the folder '{self.path}' cannot be written: {error.strerror}")

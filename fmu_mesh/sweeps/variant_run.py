@@ -163,7 +163,6 @@ class _Loaded:
         return self._mesh.run(**options)
 
     def values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
-        """What the row of a variant has of its result."""
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
         for name, function in functions.items():
             try:

@@ -120,7 +120,6 @@ class _Worker:
 
     @property
     def pid(self) -> int | None:
-        """The process id; None if it has not started."""
         started = self._context.started
         return started[-1].pid if started else None
 
