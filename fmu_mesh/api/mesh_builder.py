@@ -256,9 +256,8 @@ class Mesh:
         keys = {"fmu": fmu, **own, **section, "start_values": start_values, "step_size": step_size, "group": group}
         given = {key: value for key, value in keys.items() if value is not None}
         if not given.keys() & {*KINDS.names()}:
-            raise CallRefused(
-                f"nothing says what '{name}' is", hint=f"Give it one of the keys {listed(KINDS.names())}."
-            )
+            hint = f"Give it one of the keys {listed(KINDS.names())}."
+            raise CallRefused(f"nothing says what '{name}' is", hint=hint)
         call, path, own = f"mesh.add({name!r})", f"instances.{name}", plain(given)
         check_part(call, {"instances": {name: own}}, [path], path)
         self._plain = said_by(self._plain, call, [path], new=name not in self.instances)
@@ -312,10 +311,11 @@ class Mesh:
         Raises:
             UnknownName: there is no such connection; suggests the nearest one.
         """
-        left = with_connections(
-            self._plain, lambda one, other: source not in (None, one) or target not in (None, other)
-        )
-        there = connections_of(self._plain)
+
+        def keeps(one: object, other: object) -> bool:
+            return source not in (None, one) or target not in (None, other)
+
+        left, there = with_connections(self._plain, keeps), connections_of(self._plain)
         if source is target is None or len(connections_of(left)) == len(there):
             wanted = f"{source or '*'} -> {target or '*'}"
             names = [" -> ".join(map(str, ends_of(one))) for one in there]

@@ -68,22 +68,13 @@ def _head(plan: Plan) -> list[str]:
 
 
 def _instances(plan: Plan) -> list[str]:
-    rows = [
-        [
-            instance.name,
-            _model(plan, instance),
-            f"step {short_number(instance.step_points * plan.grid.step_size)} s",
-            "a process of its own" if instance.node == instance.name else f"group {instance.node}",
-        ]
-        for instance in plan.system.instances.values()
-    ]
+    rows = []
+    for name, own in plan.system.instances.items():
+        summary = plan.system.config.instances[name].summary(own.description)
+        model = f"{Path(own.fmu).name or own.description.model_name} ({summary})"
+        step = f"step {short_number(own.step_points * plan.grid.step_size)} s"
+        rows.append([name, model, step, "a process of its own" if own.node == name else f"group {own.node}"])
     return table(rows, indent=2)
-
-
-def _model(plan: Plan, instance: SystemInstance) -> str:
-    """The file of an instance, and what computes it."""
-    summary = plan.system.config.instances[instance.name].summary(instance.description)
-    return f"{Path(instance.fmu).name or instance.description.model_name} ({summary})"
 
 
 def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
@@ -176,9 +167,9 @@ def _arithmetic(c: Connection) -> str:
 
 
 def _order(plan: Plan) -> list[str]:
-    instant = {(c.source_instance, c.target_instance) for c in plan.connections if c.delay == 0}
-    arrow = " -> " if instant else ", "
-    lines = [f"  {arrow.join(plan.order)}" + ("" if instant else "  (at the same time)" if len(plan.order) > 1 else "")]
+    is_chain = any(c.delay == 0 for c in plan.connections)
+    together = "  (at the same time)" if len(plan.order) > 1 and not is_chain else ""
+    lines = [f"  {(' -> ' if is_chain else ', ').join(plan.order)}{together}"]
     lines += [f"  cycle: {', '.join(cycle)}" for cycle in plan.cycles]
     return lines
 

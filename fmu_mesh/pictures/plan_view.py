@@ -9,7 +9,6 @@ from ..config.mesh import SimulationConfig
 from ..errors import Finding
 from ..rings.library import why_no_library
 from ..system.plan import Plan
-from ..system.system import SystemInstance
 from ..system.value_map import map_words
 from ..text import counted
 from ..variables.value_conversion import to_plain
@@ -130,7 +129,11 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
             own.step_points * grid.step_size,
             own.node,
             {name: to_plain(value) for name, value in own.start_values.items()},
-            {name: _origin(loaded, own, name) for name in own.start_values},
+            {
+                name: PlannedOrigin(origin.file or None, origin.line, origin.text)
+                for name in own.start_values
+                for origin in [start_value_origin(loaded, own, name)]
+            },
         )
         for own in system.instances.values()
     ]
@@ -185,8 +188,3 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
         warnings=system.warnings,
         library=why_no_library(),
     )
-
-
-def _origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> PlannedOrigin:
-    origin = start_value_origin(loaded, instance, variable)
-    return PlannedOrigin(origin.file or None, origin.line, origin.text)
