@@ -301,10 +301,8 @@ def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None
 
 def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:
     takes = f"take {size} bytes of memory" if size is not None else "do not fit into memory"
-    return CallRefused(
-        f"the results of '{mesh}' {takes}; the limit is {limit} bytes",
-        hint="Raise `memory_limit`, record fewer variables, or record into a file with `output=...`.",
-    )
+    hint = "Raise `memory_limit`, record fewer variables, or record into a file with `output=...`."
+    return CallRefused(f"the results of '{mesh}' {takes}; the limit is {limit} bytes", hint=hint)
 
 
 def _log(event: Event) -> None:

@@ -167,11 +167,9 @@ def _show(sweep: Sweep) -> None:
     if table.is_file():
         print(f"table: {short_path(table)}")
     rate = f": {sweep.ran / progress.seconds:.3g} runs/s" if sweep.ran and progress.seconds > 0.0 else ""
-    kept = progress.done - sweep.ran
-    before = f", {kept} of them before" if kept else ""
-    print(
-        f"{progress.done} of {progress.total} runs{before}, {progress.failed} failed, in {progress.seconds:.3f} s{rate}"
-    )
+    before = f", {kept} of them before" if (kept := progress.done - sweep.ran) else ""
+    runs = f"{progress.done} of {progress.total} runs{before}, {progress.failed} failed"
+    print(f"{runs}, in {progress.seconds:.3f} s{rate}")
 
 
 RUNS: Runs = {"sweep": _sweep}
