@@ -320,8 +320,7 @@ def _conversion(here: Side, there: Side, name: str) -> tuple[str, Linear | None]
     base, other_base = here.base_unit(name), there.base_unit(name)
     if base is None or other_base is None:
         return f"not converted: {other} in {there.title}", Linear()
-    change = conversion(other_base, base)
-    if change is None:
+    if (change := conversion(other_base, base)) is None:
         return f"{unit} in {here.title}, {other} in {there.title}", None
     return f"converted from {other}", change
 

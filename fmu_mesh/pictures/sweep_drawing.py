@@ -284,14 +284,11 @@ class _Scale(NamedTuple):
             return
         if self.logarithmic:
             _set_logarithmic(axis)
-        if len(self.marks) <= _FEW and self._are_apart():
+        marks = np.log(self.marks) if self.logarithmic else np.array(self.marks)
+        least = (marks[-1] - marks[0]) / (2.0 * _FEW)  # so that there is room for the number at each place
+        if len(marks) <= _FEW and (np.diff(marks) >= least).all():
             axis.set_ticks(self.marks, [f"{mark:.4g}" for mark in self.marks])
             axis.set_ticks([], minor=True)
-
-    def _are_apart(self) -> bool:
-        """Whether there is room for the number at each place."""
-        marks = np.log(self.marks) if self.logarithmic else np.array(self.marks)
-        return len(marks) < 2 or float(np.diff(marks).min()) >= (marks[-1] - marks[0]) / (2.0 * _FEW)
 
 
 def _set_logarithmic(axis: Axis) -> None:

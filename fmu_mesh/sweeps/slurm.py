@@ -256,13 +256,12 @@ def _accounted(job: SlurmJob) -> dict[int, str]:
     except FmuMeshError:
         return {}
     found = re.finditer(rf"^{job.id}_(\d+)\|([A-Z_]+)[^|]*\|(\d+):(\d+)$", printed if not code else "", re.MULTILINE)
-    return {int(match[1]): f"{match[2]}{_how(match[3], match[4])}" for match in found if match[2] in _ENDED}
-
-
-def _how(code: str, number: str) -> str:
-    if number != "0":
-        return f" by signal {number}"
-    return f" with exit code {code}" if code != "0" else ""
+    states = {}
+    for task, state, exit_code, number in (match.groups() for match in found):
+        how = f" by signal {number}" if number != "0" else f" with exit code {exit_code}" if exit_code != "0" else ""
+        if state in _ENDED:
+            states[int(task)] = f"{state}{how}"
+    return states
 
 
 def _last_line(log: Path) -> str | None:
