@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
 from pathlib import Path
@@ -250,7 +250,7 @@ class Result(Mapping[str, NDArray[Any]]):
         curves: dict[str, Curve] = {}
         for label, result in zip(_titles(results), results, strict=True):
             drawn.append(self._drawn(result, label, chosen, x, difference=difference))
-            curves = {name: result._curve(name) for name in drawn[-1].values} | curves  # noqa: SLF001  its own method
+            curves = self._curves_of(result, drawn[-1].values) | curves
         meshes = dict.fromkeys(str(result.metadata.get("mesh", result.title)) for result in results)
         title = title if title is not None else " and ".join(meshes)
         return figure_of(drawn, PictureOptions(title, curves, x, difference, annotate))
@@ -392,6 +392,9 @@ class Result(Mapping[str, NDArray[Any]]):
         values = {name: values_in_unit_of(here, there, name, rows.values[name]) for name in wanted}
         has_difference = difference and other is not self
         return Curves(label, rows.times, values, differences_of(here, there, names) if has_difference else {})
+
+    def _curves_of(self, other: Result, names: Iterable[str]) -> dict[str, Curve]:
+        return {name: other._curve(name) for name in names}
 
     @property
     def _side(self) -> Side:

@@ -92,9 +92,7 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
 
 def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
     """Run one variant. Called in a worker, by whichever executor; a run that failed has a row, too."""
-    own: _Loaded | None = getattr(_mine, "loaded", None)
-    if own is None or own.task != task or own.hung.stuck:
-        own = _mine.loaded = _Loaded(task)
+    own = _mine.loaded_for(task)
     started = time.perf_counter()
     values: dict[str, Cell] = {}
     error: ErrorReport | None = None
@@ -118,8 +116,19 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
     )
 
 
-_mine = threading.local()
-"""What the thread that asks for runs has loaded; it is let go with the thread."""
+class _Mine(threading.local):
+    """What the thread that asks for runs has loaded; it is let go with the thread."""
+
+    def __init__(self) -> None:
+        self._loaded: _Loaded | None = None
+
+    def loaded_for(self, task: bytes) -> _Loaded:
+        if self._loaded is None or self._loaded.task != task or self._loaded.hung.stuck:
+            self._loaded = _Loaded(task)
+        return self._loaded
+
+
+_mine = _Mine()
 
 
 class _Loaded:

@@ -20,7 +20,7 @@ from ..config.plain_values import plain
 from ..config.yaml_text import read
 from ..errors import CallRefused, ConfigurationError
 from ..installing import importing
-from ..text import listed, nearest, shown
+from ..text import listed, meant, nearest, shown
 from ..variables.value_types import PlainValue
 
 __all__ = ["MAX_VARIANTS", "SAMPLERS", "Parameters", "Range", "Values", "grid", "read_values", "sampled", "variants_of"]
@@ -255,7 +255,7 @@ def _shares(sampler: str, dimensions: int, seed: object) -> NDArray[np.float64]:
     name, count = (found[1], int(found[2])) if found is not None else (sampler.partition(":")[0], 0)
     if name not in SAMPLERS:
         near = nearest(name, SAMPLERS)
-        hint = f"Did you mean '{near}:{count or 64}'?" if near else f"There are {listed([*SAMPLERS])}, as in lhs:64."
+        hint = meant(near and f"{near}:{count or 64}", f"There are {listed([*SAMPLERS])}, as in lhs:64.")
         raise ConfigurationError(f"there is no sampler '{sampler}'.", hint=hint)
     if not 0 < count <= MAX_VARIANTS:
         raise ConfigurationError(f"the sampler '{sampler}' has no count from 1 to {MAX_VARIANTS}, as in {name}:64.")

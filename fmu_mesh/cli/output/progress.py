@@ -78,8 +78,16 @@ class ProgressLine(Generic[T]):
         name = shortened(self._name, min(_MOST_NAME, width // 4))
         room = width - len(name) - len(_GAP) - _LEAST_BAR - len(_GAP)
         parts = self._parts(self._status, room) if self._status is not None else ["starting"]
-        line = Table.grid(padding=(0, len(_GAP), 0, 0), collapse_padding=True, pad_edge=False)
-        line.width = width
+        padding = (0, len(_GAP), 0, 0)
+        line = Table(
+            width=width,
+            padding=padding,
+            box=None,
+            collapse_padding=True,
+            show_header=False,
+            show_edge=False,
+            pad_edge=False,
+        )
         line.add_column(no_wrap=True)
         line.add_column(ratio=1, no_wrap=True)
         line.add_column(no_wrap=True)
