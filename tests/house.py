@@ -381,7 +381,6 @@ ALLOWED: dict[str, dict[str, str]] = {
         "ros/node/node_topics.py: setattr(owner)": _ROS,
     },
     "private_names_of_others": {
-        'api/mesh_builder.py: mesh._take(read_text(text, Path(folder).absolute() / "<text>"))': "its own class",
         "api/mesh_builder.py: mesh._take(configuration, KnownModels(keeps_code=keeps_code))": "its own class",
         "api/mesh_builder.py: mesh._take(PlainConfig(data, file), known)": "its own class",
         "instances/call_guard.py: frame = sys._current_frames().get(thread)": "documented; nothing else tells the line",

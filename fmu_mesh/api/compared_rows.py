@@ -23,25 +23,15 @@ _ROUNDING = 1e-6
 
 
 class Side(NamedTuple):
-    """One of the two results.
+    """One of the two results."""
 
-    Attributes:
-        title: what messages call it.
-        columns: the names of its variables; of thousands a collection that finds one at once.
-        pieces: its rows, piece by piece; times do not decrease.
-        all: all of its rows.
-        unit: the unit of a variable by its name; None if it is not known.
-        base_unit: the same in SI base units; None if it is not known.
-        point: the number of the communication point of a row, by its number and time.
-    """
-
-    title: str
-    columns: Collection[str]
-    pieces: Callable[[], Iterator[Columns]]
+    title: str  # what messages call it
+    columns: Collection[str]  # the names of its variables; of thousands a collection that finds one at once
+    pieces: Callable[[], Iterator[Columns]]  # its rows, piece by piece; times do not decrease
     all: Callable[[], Columns]
-    unit: Callable[[str], str | None]
-    base_unit: Callable[[str], BaseUnit | None]
-    point: Callable[[int, float], int]
+    unit: Callable[[str], str | None]  # the unit of a variable by its name; None if it is not known
+    base_unit: Callable[[str], BaseUnit | None]  # the same in SI base units; None if it is not known
+    point: Callable[[int, float], int]  # the number of the communication point of a row, by its number and time
 
 
 class _Matching(NamedTuple):
@@ -61,14 +51,9 @@ class _Matching(NamedTuple):
 
 
 def compared(here: Side, there: Side, names: Sequence[str], *, rtol: float = 0.0, atol: float = 0.0) -> Comparison:
-    """Compare two results; rows that belong together in their order are read piece by piece.
+    """Compare two results, as `Result.compare`; rows that belong together in their order are read piece by piece.
 
-    Args:
-        here: the one result, whose times and units hold.
-        there: the other one.
-        names: the variables; one that only one of them has is told.
-        rtol: relative tolerance; two numbers are equal if `|a - b| <= atol + rtol * max(|a|, |b|)`.
-        atol: absolute tolerance.
+    Times and units are those of the first one; a variable that only one of them has is told.
     """
     both = [name for name in names if name in here.columns and name in there.columns]
     tallies = {name: _Tally(here, there, name, (rtol, atol)) for name in both}
@@ -129,7 +114,6 @@ class _Span:
         self.rises = True
 
     def add(self, times: NDArray[np.float64]) -> None:
-        """Add the times of the next rows."""
         self.first = self.first if self.rows else float(times[0])
         distances = np.diff(times, prepend=self.last if self.rows else times[0])
         self.step = min(self.step, float(distances.min(initial=np.inf, where=distances > 0.0)))
@@ -254,7 +238,6 @@ class _Tally:
         self._largest = self._steepest = (-1.0, 0.0)
 
     def add(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> None:
-        """Add rows: their times in s, and both values."""
         if (own.dtype == object) != (other.dtype == object):
             here, there = self._titles
             self._note = self._note or f"{_kind(own)} in {here}, {_kind(other)} in {there}"
@@ -267,7 +250,6 @@ class _Tally:
         self._rows += len(times)
 
     def _beyond(self, times: NDArray[np.float64], own: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which values differ beyond the tolerance."""
         are_floats = own.dtype.kind == "f" or other.dtype.kind == "f"
         unequal: NDArray[np.bool_] = own != other
         if are_floats:
@@ -310,7 +292,6 @@ class _Tally:
 def _values_there(
     matching: _Matching, times: NDArray[np.float64], other: Columns, values: NDArray[Any]
 ) -> NDArray[Any]:
-    """The values of the other result at the compared times."""
     if matching.there is not None:
         return values[matching.there]
     times = times[matching.here]
@@ -339,8 +320,7 @@ def _conversion(here: Side, there: Side, name: str) -> tuple[str, Linear | None]
     base, other_base = here.base_unit(name), there.base_unit(name)
     if base is None or other_base is None:
         return f"not converted: {other} in {there.title}", Linear()
-    change = conversion(other_base, base)
-    if change is None:
+    if (change := conversion(other_base, base)) is None:
         return f"{unit} in {here.title}, {other} in {there.title}", None
     return f"converted from {other}", change
 

@@ -112,13 +112,8 @@ class Comparison(msgspec.Struct, frozen=True):
     @property
     def equal(self) -> bool:
         """Whether both have the same variables, the same span of time, and no difference beyond the tolerance."""
-        return not (
-            any(difference.rows for difference in self.differences.values())
-            or self.only_here
-            or self.only_there
-            or self.rows_only_here
-            or self.rows_only_there
-        )
+        alone = self.only_here or self.only_there or self.rows_only_here or self.rows_only_there
+        return not (alone or any(difference.rows for difference in self.differences.values()))
 
     def __bool__(self) -> bool:
         return self.equal
@@ -153,7 +148,6 @@ class Comparison(msgspec.Struct, frozen=True):
         """Draw both results and their difference; without names, the variables that differ most.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> one = mesh.run(record="memory", stop_time=1.0)
             >>> other = mesh.run(record="memory", stop_time=1.0, start_values={"delay.d": 0.5})
@@ -177,29 +171,26 @@ class Comparison(msgspec.Struct, frozen=True):
         return [f"first at t = {short_number(first.time)} s, point {first.point}: {first.variable}: {values}"]
 
     def _head(self) -> str:
-        limits = [f"{name} {value:g}" for name, value in (("rtol", self.rtol), ("atol", self.atol)) if value]
-        within = f" within {', '.join(limits)}" if limits else ""
-        what = f"{counted(len(self.compared), 'variable')}, {counted(self.rows, 'row')}"
+        limits = ", ".join(f"{name} {own:g}" for name, own in (("rtol", self.rtol), ("atol", self.atol)) if own)
+        variables = counted(len(self.compared), "variable")
         if self.equal:
-            return f"{self.here} and {self.there} are equal{within}: {what}"
+            within = f" within {limits}" if limits else ""
+            return f"{self.here} and {self.there} are equal{within}: {variables}, {counted(self.rows, 'row')}"
         differing = sum(difference.rows > 0 for difference in self.differences.values())
-        parts = [f"{differing} of {counted(len(self.compared), 'variable')}"] if differing else []
-        parts += [f"{counted(len(self.only_here) + len(self.only_there), 'variable')} only in one"] * bool(
-            self.only_here or self.only_there
-        )
-        parts += ["the span of time"] * bool(self.rows_only_here or self.rows_only_there)
-        beyond = f" beyond {', '.join(limits)}" if limits else ""
+        alone = len(self.only_here) + len(self.only_there)
+        parts = [f"{differing} of {variables}"] if differing else []
+        parts += [f"{counted(alone, 'variable')} only in one"] if alone else []
+        parts += ["the span of time"] if self.rows_only_here or self.rows_only_there else []
+        beyond = f" beyond {limits}" if limits else ""
         return f"{self.here} and {self.there} differ{beyond}: {', '.join(parts)}"
 
     def _rows_text(self) -> list[str]:
-        lines = []
-        if self.matching == "common":
-            lines.append(f"compared at the {counted(self.rows, 'time')} that both have")
-        if self.matching == "interpolated":
-            how = "floats linearly, others held"
-            lines.append(
-                f"compared at {counted(self.rows, 'time')} of {self.here}; {self.there} is interpolated: {how}"
-            )
+        how = f"of {self.here}; {self.there} is interpolated: floats linearly, others held"
+        lines = {
+            "same": [],
+            "common": [f"compared at the {counted(self.rows, 'time')} that both have"],
+            "interpolated": [f"compared at {counted(self.rows, 'time')} {how}"],
+        }[self.matching]
         for count, where in ((self.rows_only_here, self.here), (self.rows_only_there, self.there)):
             lines += [f"{counted(count, 'row')} of {where} before or after all of the other"] if count else []
         return lines

@@ -78,10 +78,8 @@ def convert(  # noqa: PLR0913  keywords, each of which stands alone
         del given.data["record"]  # the result file of the new configuration is beside that
     told: list[str] = []
     check_code(examine_data(given)[0], Findings(""), told.append, "which this file may name, as it is your own")
-    text = "".join(f"# {line}\n" if line else "#\n" for line in _comment(source, ssd, given)) + mesh.to_yaml(
-        target.parent
-    )
-    write_whole(target, text)
+    comment = "".join(f"# {line}".rstrip() + "\n" for line in _comment(source, ssd, given))
+    write_whole(target, comment + mesh.to_yaml(target.parent))
     return *given.warnings, *(Finding(str(target), "", text, "") for text in told)
 
 
@@ -91,19 +89,15 @@ def _comment(source: Path, ssd: str | None, given: PlainConfig) -> Iterator[str]
     if named_package(source, ssd) is None:
         return
     elements = inspect_package(source, ssd=ssd).elements
-    instances = [
-        (own.instance, own.path) for own in elements if own.instance is not None and own.path != (own.instance,)
-    ]
-    if instances:
+    renamed = [own for own in elements if own.instance is not None and own.path != (own.instance,)]
+    if renamed:
         yield ""
         yield "Instances, and the elements of the package that they are:"
-        for name, path in instances:
-            yield f"  {name}: {_one_line(' / '.join(path))}"
+        yield from (f"  {own.instance}: {_one_line(' / '.join(own.path))}" for own in renamed)
     if given.warnings:
         yield ""
         yield "What the package says and this file does not, or what may be wrong with it:"
-        for warning in given.warnings:
-            yield f"  {_one_line(str(warning))}"
+        yield from (f"  {_one_line(str(warning))}" for warning in given.warnings)
 
 
 def _one_line(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from base64 import b64encode
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -17,10 +18,10 @@ from ..config.loading import LoadedConfig
 from ..errors import CallRefused, LoadFailed, UnknownName
 from ..instances.configuration import examine_data
 from ..instances.registry import KINDS, describe
-from ..pictures.tables import html_table, pairs
+from ..pictures.tables import html_table, pairs, titled
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package, read_configuration
-from ..text import counted, did_you_mean, listed, matching, nearest_file, short_number, shown
+from ..text import counted, did_you_mean, listed, matching, meant, nearest_file, short_number, shown
 from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 
 __all__ = [
@@ -180,18 +181,16 @@ def inspect(path: str | Path, *, kind: str | None = None) -> Inspection:
 
 def with_way_out(error: LoadFailed, path: Path) -> LoadFailed:
     """The error for a path that should be a model and is something else, or nothing."""
+    hint = None
     if path.suffix.partition(":")[0] == ".py":
         hint = "A component is not read without running it: `check` of a configuration imports it, `info` shows it."
-        return error.instead_of_hint(hint)
-    if not files.exists(path):
-        near = nearest_file(path)
-        return error.instead_of_hint(f"Did you mean '{near}'?") if near is not None else error
-    if names_package(path):
+    elif not files.exists(path):
+        hint = meant(nearest_file(path))
+    elif names_package(path):
         hint = f"It is a package of SSP: `fmu-mesh launch {path}` runs it, and `fmu-mesh inspect {path}` shows it."
-        return error.instead_of_hint(hint)
-    if path.suffix in (".yaml", ".yml"):
-        return error.instead_of_hint(f"A configuration is run by `fmu-mesh launch {path}`.")
-    return error
+    elif path.suffix in (".yaml", ".yml"):
+        hint = f"A configuration is run by `fmu-mesh launch {path}`."
+    return error.instead_of_hint(hint) if hint is not None else error
 
 
 def _page(inspection: Inspection, width: int, patterns: Sequence[str], *, everything: bool) -> list[str]:
@@ -199,16 +198,18 @@ def _page(inspection: Inspection, width: int, patterns: Sequence[str], *, everyt
     names = [variable.name for variable in description.variables]
     wanted = {name for pattern in patterns for name in matching(pattern, names)}
     chosen = [variable for variable in description.variables if not patterns or variable.name in wanted]
-    lines = [] if patterns else [*_facts(inspection, width), *_problems(inspection, width)]
+    limit = None if everything or patterns else SHOWN_VARIABLES
+    sections = []
+    if not patterns:
+        problems = [_wrapped("  " + " ".join(problem.split()), width, "    ") for problem in inspection.problems]
+        sections = [("", _facts(inspection, width)), (f"Problems ({len(problems)})", [*chain(*problems)])]
     for causality, title in _CAUSALITIES:
         members = [variable for variable in chosen if variable.causality == causality]
-        if members:
-            lines += ([""] if lines else []) + [f"{title} ({len(members)})"]
-            limit = None if everything or patterns else SHOWN_VARIABLES
-            lines += _variables(members[:limit], width)
-            if limit is not None and len(members) > limit:
-                lines.append(f"  ... and {len(members) - limit} more: --all lists them, a name such as 'x*' some")
-    return lines
+        lines = _variables(members[:limit], width) if members else []
+        if limit is not None and len(members) > limit:
+            lines.append(f"  ... and {len(members) - limit} more: --all lists them, a name such as 'x*' some")
+        sections.append((f"{title} ({len(members)})", lines))
+    return titled(sections)
 
 
 def _facts(inspection: Inspection, width: int) -> list[str]:
@@ -262,25 +263,10 @@ _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 
-def _problems(inspection: Inspection, width: int) -> list[str]:
-    if not inspection.problems:
-        return []
-    lines = ["", f"Problems ({len(inspection.problems)})"]
-    for problem in inspection.problems:
-        lines += _wrapped("  " + " ".join(problem.split()), width, "    ")
-    return lines
-
-
 def _wrapped(line: str, width: int, indent: str) -> list[str]:
     """Wrap a line without breaking paths and hashes, so that they can be copied."""
     return textwrap.wrap(
-        line,
-        width,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-        drop_whitespace=True,
-        replace_whitespace=False,
+        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False, replace_whitespace=False
     )
 
 
@@ -297,13 +283,11 @@ def _variables(variables: Sequence[Variable], width: int) -> list[str]:
     for row in rows:
         cells = "  ".join(cell.ljust(size) for cell, size in zip(row, widest, strict=False) if size)
         line = f"  {cells.rstrip()}" if not row[4] else f"  {cells}  {row[4]}"
-        lines.append(line if len(line) <= width or not row[4] else _cut(line, width, 2 + len(cells)))
+        if row[4] and len(line) > width:  # with a shortened description, or without it on a narrow page
+            least = 2 + len(cells)
+            line = f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
+        lines.append(line)
     return lines
-
-
-def _cut(line: str, width: int, least: int) -> str:
-    """The line with a shortened description, or without it on a narrow page."""
-    return f"{line[: width - 3].rstrip()}..." if width - 3 > least + 10 else line[:least].rstrip()
 
 
 def _start(variable: Variable) -> str:

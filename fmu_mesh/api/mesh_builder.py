@@ -105,9 +105,7 @@ class Mesh:
         Raises:
             ConfigurationError: the text is no YAML. What it means is checked by `check`, and before a run.
         """
-        mesh = cls.__new__(cls)
-        mesh._take(read_text(text, Path(folder).absolute() / "<text>"))  # noqa: SLF001  its own method
-        return mesh
+        return cls.from_configuration(read_text(text, Path(folder).absolute() / "<text>"))
 
     @classmethod
     def from_configuration(cls, configuration: PlainConfig, *, keeps_code: bool = False) -> Self:
@@ -142,7 +140,6 @@ class Mesh:
         """A mesh of one FMU, as `fmu-mesh run` makes it; nothing is recorded, unless an option says so.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.Mesh.from_fmu("fmus/DampedPendulum.fmu", simulation={"stop_time": 1.0})
             >>> mesh.run(record="memory")["DampedPendulum.a"].shape
             (501,)
@@ -170,16 +167,10 @@ class Mesh:
         given = simulation(description) if callable(simulation) else simulation
         times = {"step_size": description.step_size, "stop_time": None, **given}
         if times["step_size"] is None:
-            raise CallRefused(
-                f"'{path}' has no default step size.", hint='Give one, as `simulation={"step_size": ...}`.'
-            )
-        instance = plain({"fmu": file.absolute(), **section})
-        data = {
-            "mesh": own_name,
-            "simulation": plain(times),
-            "instances": {own_name: instance},
-            "record": {"file": None},
-        }
+            hint = 'Give one, as `simulation={"step_size": ...}`.'
+            raise CallRefused(f"'{path}' has no default step size.", hint=hint)
+        instances = {own_name: {"fmu": file.absolute(), **section}}
+        data = plain({"mesh": own_name, "simulation": times, "instances": instances, "record": {"file": None}})
         mesh = cls.__new__(cls)
         mesh._take(PlainConfig(data, file), known)  # noqa: SLF001  its own method
         return mesh
@@ -235,7 +226,6 @@ class Mesh:
         """Add an instance.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.Mesh("gain", step_size=0.01, stop_time=1.0)
             >>> mesh.add("gain", fmu="fmus/Gain.fmu", start_values={"k": 2.0}, step_size=0.02)
             >>> mesh.instances
@@ -266,9 +256,8 @@ class Mesh:
         keys = {"fmu": fmu, **own, **section, "start_values": start_values, "step_size": step_size, "group": group}
         given = {key: value for key, value in keys.items() if value is not None}
         if not given.keys() & {*KINDS.names()}:
-            raise CallRefused(
-                f"nothing says what '{name}' is", hint=f"Give it one of the keys {listed(KINDS.names())}."
-            )
+            hint = f"Give it one of the keys {listed(KINDS.names())}."
+            raise CallRefused(f"nothing says what '{name}' is", hint=hint)
         call, path, own = f"mesh.add({name!r})", f"instances.{name}", plain(given)
         check_part(call, {"instances": {name: own}}, [path], path)
         self._plain = said_by(self._plain, call, [path], new=name not in self.instances)
@@ -278,7 +267,6 @@ class Mesh:
         """Remove an instance, its connections, what the scenario sets of it, and what was chosen of it to be recorded.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.disconnect(target="delay.x")
             >>> mesh.remove("delay")
@@ -323,10 +311,11 @@ class Mesh:
         Raises:
             UnknownName: there is no such connection; suggests the nearest one.
         """
-        left = with_connections(
-            self._plain, lambda one, other: source not in (None, one) or target not in (None, other)
-        )
-        there = connections_of(self._plain)
+
+        def keeps(one: object, other: object) -> bool:
+            return source not in (None, one) or target not in (None, other)
+
+        left, there = with_connections(self._plain, keeps), connections_of(self._plain)
         if source is target is None or len(connections_of(left)) == len(there):
             wanted = f"{source or '*'} -> {target or '*'}"
             names = [" -> ".join(map(str, ends_of(one))) for one in there]
@@ -337,7 +326,6 @@ class Mesh:
         """Choose what is recorded, and into which file.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.record("pendulum.a", "in:delay.*", file="results/all.csv")
             >>> mesh.record("pendulum.a", file="results/slow.csv", every=100, also=True)
@@ -366,7 +354,6 @@ class Mesh:
         """Say what inputs and tunable parameters get while the mesh runs; adds to what was said before.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.Mesh("gain", step_size=0.5, stop_time=2.0)
             >>> mesh.add("gain", fmu="fmus/Gain.fmu")
             >>> mesh.scenario({"gain.u": {"times": [0, 1], "values": [1, 3], "interpolation": "linear"}})
@@ -395,7 +382,6 @@ class Mesh:
         """Set keys of other sections of the configuration, or of the top level.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.configure(group="auto", timeouts={"step": 5.0}, simulation={"window": 64})
 
@@ -441,7 +427,6 @@ class Mesh:
         was loaded from a package, and whose instances and connections are still the same, keeps everything else in it.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.to_ssp("pendulum_delay.ssp")
             ()
@@ -469,7 +454,6 @@ class Mesh:
         """Check the configuration, its models, and that this host can run them; nothing is started.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.add("gain", fmu="../fmus/Gian.fmu")
             >>> for finding in mesh.check().findings:
@@ -486,7 +470,6 @@ class Mesh:
         """Read all models and plan a run, which `Run.start` starts; nothing is started here.
 
         Example:
-            >>> import fmu_mesh
             >>> plan = fmu_mesh.load("configs/pendulum_delay.yaml").plan(stop_time=1.0, record="memory")
             >>> plan.plan.grid.last_point
             500
@@ -514,7 +497,6 @@ class Mesh:
         """The graph of the mesh: instances, connections, processes and cycles, as a picture or as text.
 
         Example:
-            >>> import fmu_mesh
             >>> print(fmu_mesh.load("configs/pendulum_delay.yaml").graph().text())
             pendulum_delay: 2 instances in 2 processes, 1 connection
             <BLANKLINE>
@@ -539,7 +521,6 @@ class Mesh:
         Ctrl-C ends the run, and raises `KeyboardInterrupted`.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> apart = mesh.run(record="memory", stop_time=1.0)
             >>> here = mesh.run(record="memory", stop_time=1.0, processes=False)
@@ -590,7 +571,6 @@ class Mesh:
         Nothing is recorded into a file, and no other process is started.
 
         Example:
-            >>> import fmu_mesh
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
             ...     system.step(100)
             ...     system.time, system.get("pendulum.a") < 0.5

@@ -200,7 +200,7 @@ def rebased(configuration: PlainConfig, folder: Path) -> dict[str, Any]:
     for name, section in examine_data(configuration)[0].config.instances.items():
         _move_files(data["instances"][name], section, moved, Path(old))
     for mapping, key in _places(data):
-        if _is_relative(mapping.get(key)):
+        if isinstance(mapping, dict) and _is_relative(mapping.get(key)):
             mapping[key] = moved(mapping[key])
     return data
 
@@ -217,25 +217,18 @@ def _move_files(written: dict[str, Any], section: InstanceSection, moved: Callab
             written[other] = moved(value)
 
 
-def _places(data: dict[str, Any]) -> Iterator[tuple[dict[str, Any], str]]:
-    """Where other sections may have paths: a mapping, and the key in it whose value is a path."""
-    records = data.get("record", {})
+def _places(data: dict[str, Any]) -> Iterator[tuple[Any, str]]:
+    """Where other sections may have paths: what may be a mapping, and the key in it whose value is a path."""
+    records, scenario, ros = data.get("record"), data.get("scenario"), data.get("ros")
     for record in records if isinstance(records, list) else [records]:
-        yield from _in(record, "file")
+        yield record, "file"
     yield data, "scenario"
-    scenario = data.get("scenario")
     for values in (scenario.get("values") or {}).values() if isinstance(scenario, dict) else ():
-        yield from _in(values, "file")
-    yield from _in(data.get("zenoh"), "config")
-    ros = data.get("ros")
+        yield values, "file"
+    yield data.get("zenoh"), "config"
     messages = ros.get("messages") if isinstance(ros, dict) else None
-    if isinstance(messages, dict):
-        yield from ((messages, name) for name in messages)
-
-
-def _in(section: object, key: str) -> Iterator[tuple[dict[str, Any], str]]:
-    if isinstance(section, dict):
-        yield section, key
+    for name in messages if isinstance(messages, dict) else ():
+        yield messages, name
 
 
 def _is_relative(path: object) -> TypeGuard[str]:

@@ -30,7 +30,7 @@ from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..system.start_values import why_not_settable
-from ..text import did_you_mean, listed, nearest, option_text, shown
+from ..text import did_you_mean, listed, meant, nearest, option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value
 from ..variables.value_types import DTYPES
@@ -148,8 +148,11 @@ class System:
         if not hasattr(points, "__index__"):
             raise CallRefused(f"{option_text('points', points)}: expected a whole number")
         count, local = operator.index(points), self._local
-        if count < 1 or local.point + count > self._grid.last_point:
-            raise self._too_many(count)
+        if count < 1:
+            raise CallRefused(f"step was given {count} points; expected 1 or more.")
+        if count > (left := self._grid.last_point - local.point):
+            text = f"step was given {count} points, and {left} are left until the stop time {self._grid.stop_time:g} s."
+            raise CallRefused(text, hint="Raise `stop_time`; null has no end.")
         self._mode = "interrupted"
         try:
             for _ in range(count):
@@ -260,9 +263,8 @@ class System:
         instances = self._run.plan.system.instances
         without = [name for name, own in instances.items() if not own.description.can_get_and_set_state]
         if without:
-            text = (
-                f"the state of {listed(without)} cannot be saved, as the model description says (canGetAndSetFMUstate)."
-            )
+            why = "as the model description says (canGetAndSetFMUstate)"
+            text = f"the state of {listed(without)} cannot be saved, {why}."
             raise CallRefused(text, instance=without[0], hint="Open the mesh again to start from its first point.")
         self._free_lost()
         with self._changing():
@@ -333,13 +335,6 @@ class System:
             raise
         self._mode = "ready"
 
-    def _too_many(self, count: int) -> CallRefused:
-        left = self._grid.last_point - self.point
-        if count < 1:
-            return CallRefused(f"step was given {count} points; expected 1 or more.")
-        text = f"step was given {count} points, and {left} are left until the stop time {self._grid.stop_time:g} s."
-        return CallRefused(text, hint="Raise `stop_time`; null has no end.")
-
     def _getter(self, name: str) -> Callable[[int], Any]:
         instance, variable = self._found(name, elements=True)
         plain = self._local.getter(instance, name.removeprefix(f"{instance}."))
@@ -361,10 +356,10 @@ class System:
             sources = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance).sources
             free = [one.name for one in description.variables if not why_not_settable(one, sources.get(one.name))]
             names = [one.name for one in description.variables] if elements else free
-            near = nearest(rest, names)
-            hint = f"Did you mean '{instance}.{near}'?" if near else f"There are {listed(names)}."
             if (clock := description.clock(rest)) is not None:
                 raise UnknownName(f"{clock}.", instance=instance)
+            near = nearest(rest, names)
+            hint = meant(near and f"{instance}.{near}", f"There are {listed(names)}.")
             raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
         return instance, variable
 

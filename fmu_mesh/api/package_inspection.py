@@ -11,7 +11,7 @@ import msgspec
 from .. import files
 from ..config.call_options import checked
 from ..errors import ConfigurationError
-from ..pictures.tables import pairs, table
+from ..pictures.tables import pairs, table, titled
 from ..printing import page
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
@@ -22,7 +22,6 @@ from ..ssp.system_structure import (
     Binding,
     Element,
     StructureComponent,
-    StructureSystem,
     components_of,
     elements_of,
 )
@@ -219,17 +218,12 @@ def inspect_package(path: str | Path, *, ssd: str | None = None) -> PackageInspe
 
 
 def _element(path: tuple[str, ...], element: Element, instance: str | None) -> PackageElement:
-    component = element if isinstance(element, StructureComponent) else None
-    return PackageElement(
-        path=path,
-        kind="component" if component is not None else "system",
-        source=component.source if component is not None else None,
-        instance=instance,
-        implementation=component.implementation if component is not None else None,
-        connectors=dict(Counter(one.kind or "unspecified" for one in element.connectors)),
-        connections=len(element.connections) if isinstance(element, StructureSystem) else 0,
-        description=element.description,
-    )
+    connectors: dict[str, int] = dict(Counter(one.kind or "unspecified" for one in element.connectors))
+    if isinstance(element, StructureComponent):
+        source, how = element.source, element.implementation
+        return PackageElement(path, "component", source, instance, how, connectors, 0, element.description)
+    inside = len(element.connections)
+    return PackageElement(path, "system", None, instance, None, connectors, inside, element.description)
 
 
 def _source(package: Package, path: tuple[str, ...], binding: Binding) -> PackageParameters:
@@ -273,10 +267,7 @@ def _page(found: PackageInspection) -> list[str]:
         (f"Problems ({len(found.problems)})", [f"  {_line(one)}" for one in found.problems]),
         (f"Warnings ({len(found.warnings)})", [f"  {_line(one)}" for one in found.warnings]),
     ]
-    for title, content in sections:
-        if content:
-            lines += ["", title, *content]
-    return lines
+    return titled([("", lines), *sections])
 
 
 def _counts(found: PackageInspection) -> str:

@@ -18,7 +18,7 @@ from ..config.call_options import takes
 from ..errors import CallRefused, FmuError, FmuMeshError
 from ..files import Kept, remove_tree
 from ..results.record_files import open_result
-from ..results.recording import Columns, ResultFile
+from ..results.recording import Columns, ResultFile, joined
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
@@ -51,10 +51,8 @@ class RepeatedMesh:
         True
 
     Args:
-        mesh: the mesh in words.
-        plan: plans a run of it, as `Mesh.plan`.
-        reset: reset the instances of FMUs between two runs, and do not make new ones.
-        on_hang: called on another thread if an FMU does not return in time.
+        mesh: the mesh in words; ``plan`` plans a run of it, as `Mesh.plan`.
+        reset: as in `Mesh.repeated`, and so is ``on_hang``.
         before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
             ``on_hang`` is also called if an FMU crashes then; the thread of the runs never goes on.
     """
@@ -144,8 +142,8 @@ class _CollectedRows:
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
         self._file: ResultFile | None = None
-        self._times: list[NDArray[np.float64]] = []
-        self._blocks: list[list[NDArray[Any]]] = []
+        nothing = {name: np.zeros(0, DTYPES[type_]) for name, type_ in (types_of(plan.plan.system) or {}).items()}
+        self._pieces = [Columns(np.zeros(0), nothing)]
         self.rows = 0
 
     def open(self) -> list[ResultFile]:
@@ -163,8 +161,8 @@ class _CollectedRows:
         return self._file.kept if self._file is not None else Kept()
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        self._times.append(np.array(times))
-        self._blocks.append([np.array(column) for column in columns])
+        values = {name: np.array(column) for name, column in zip(self._pieces[0].values, columns, strict=True)}
+        self._pieces.append(Columns(np.array(times), values))
         self.rows += len(times)
         if self._file is not None:
             self._file.write(times, columns)
@@ -183,13 +181,9 @@ class _CollectedRows:
 
     def result(self, outcome: Outcome) -> Result:
         system, file = self._plan.plan.system, self._file.path if self._file is not None else None
-        types = types_of(system) or {}
-        parts = zip(*self._blocks, strict=True) if self._blocks else [[np.zeros(0, DTYPES[t])] for t in types.values()]
-        columns = {name: np.concatenate(part) for name, part in zip(types, parts, strict=True)}
-        times = np.concatenate(self._times) if self._times else np.zeros(0)
         files = ((str(file), outcome.rows),) if file is not None else ()
         outcome = replace(outcome, file=str(file) if file is not None else None, files=files)
-        return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=Columns(times, columns))
+        return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=joined(self._pieces))
 
 
 def _release(loaded: list[tuple[RepeatedRuns, Path]], thread: int) -> None:

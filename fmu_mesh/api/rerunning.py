@@ -38,30 +38,16 @@ _ALONE: Mapping[str, Any] = {"zenoh": {"mode": "peer", "listen": [], "connect": 
 
 
 class PlannedRerun(NamedTuple):
-    """A rerun before it is started.
-
-    Attributes:
-        plan: the plan of the run.
-        values: what is set in it, in the order of the points.
-        last_point: the point at which it is stopped; None: it runs to its end.
-        first: the result of the first run.
-    """
+    """A rerun before it is started."""
 
     plan: RunPlan
-    values: Sequence[SetValue]
-    last_point: int | None
-    first: Result
+    values: Sequence[SetValue]  # what is set in it, in the order of the points
+    last_point: int | None  # the point at which it is stopped; None: it runs to its end
+    first: Result  # that of the first run
 
     @takes(StartOptions)
     def run(self, options: StartOptions) -> Result:
-        """Run it.
-
-        Args:
-            options: see `StartOptions`.
-
-        Raises:
-            FmuMeshError: it ended early; its `result` has what was recorded up to then.
-        """
+        """Run it; the error of a run that ended early has the `result` up to then."""
         with Run.start(self.plan, **options.given()) as run:
             self.drive(run)
             return run.wait()
@@ -114,12 +100,7 @@ def rerun(result: str | Path, options: RerunOptions) -> Result:
 
 @takes(RerunOptions)
 def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
-    """Plan a rerun; the errors are those of `rerun`.
-
-    Args:
-        result: the result file.
-        options: see `RerunOptions`.
-    """
+    """Plan a rerun; arguments and errors are those of `rerun`."""
     allow_code, on_notice = options.allow_code, options.on_notice or log.info
     path = Path(result)
     first = Result.read(path)

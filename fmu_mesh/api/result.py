@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -63,11 +64,7 @@ class Result(Mapping[str, NDArray[Any]]):
     Attributes:
         title: name of the mesh, or of the file.
         file: the result file; None if the rows are only in memory, or if nothing was recorded.
-        all: this result and those of the other files of the run, in the order of the configuration.
         outcome: how the run ended; None for a file that was read.
-        warnings: what is wrong although nothing failed, such as a value that grows without a limit.
-        names: the recorded variables, in order.
-        units: the unit of each, as FMI writes it; None without one.
     """
 
     def __init__(  # noqa: PLR0913  what a result is made of
@@ -87,7 +84,7 @@ class Result(Mapping[str, NDArray[Any]]):
         self._step_size = system.grid.step_size if system is not None else 0.0
         self._given = columns
         self._record = record
-        self._variables = _recorded(self._system, record)
+        self._variables = _recorded(system, record)
 
     @classmethod
     @checked
@@ -97,7 +94,6 @@ class Result(Mapping[str, NDArray[Any]]):
         Of a Parquet file whose run goes on or was killed, the rows are read that are complete in its stream.
 
         Example:
-            >>> import fmu_mesh
             >>> run = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=0.1, output="results/short.csv")
             >>> fmu_mesh.Result.read("results/short.csv")["delay.y"].tolist() == run["delay.y"].tolist()
             True
@@ -121,7 +117,7 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @property
     def units(self) -> dict[str, str | None]:
-        """The unit of each variable; None without one, or if a file that was read does not say it."""
+        """The unit of each variable, as FMI writes it; None without one, or if a file that was read does not say it."""
         return {name: self._unit(name) for name in self}
 
     @property
@@ -129,7 +125,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """What the result file says about its run; empty if it says nothing.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.run(stop_time=0.1, record="memory").metadata
             {}
@@ -141,7 +136,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """The results of all files that the run wrote, in the order of the configuration; this one is among them.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> mesh.configure(record=[{"file": "fast.csv"}, {"file": "slow.csv", "every": 100}])
             >>> fast, slow = mesh.run(stop_time=1.0).all
@@ -158,7 +152,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """What is wrong although nothing failed, such as a value that grows without a limit; empty for a file.
 
         Example:
-            >>> import fmu_mesh
             >>> fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=1.0, record="memory").warnings
             ()
         """
@@ -190,7 +183,6 @@ class Result(Mapping[str, NDArray[Any]]):
         Every float has the digits that give the same bits again.
 
         Example:
-            >>> import fmu_mesh
             >>> result = fmu_mesh.load("configs/pendulum_delay.yaml").run(stop_time=0.1, record="memory")
             >>> result.to_csv("results/angles.csv")
             >>> fmu_mesh.Result.read("results/angles.csv").compare(result).equal
@@ -225,7 +217,6 @@ class Result(Mapping[str, NDArray[Any]]):
         """Draw variables over time, with one axes for each unit; all of them if none is named.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> result = mesh.run(stop_time=1.0, record="memory")
             >>> result.plot("pendulum.a", "delay.y").savefig("angles.png")
@@ -246,11 +237,10 @@ class Result(Mapping[str, NDArray[Any]]):
             ConfigurationError: there is no such variable, or matplotlib is not installed.
             CallRefused: there is no other result to show the difference to; or ``x`` has texts.
         """
-        if difference and (not others or x is not None):
-            raise CallRefused(
-                "a difference needs another result" if not others else "a difference is drawn over time only",
-                hint="Name two results." if not others else "Leave the horizontal axis out.",
-            )
+        if difference and not others:
+            raise CallRefused("a difference needs another result", hint="Name two results.")
+        if difference and x is not None:
+            raise CallRefused("a difference is drawn over time only", hint="Leave the horizontal axis out.")
         results = (self, *others)
         there = [*dict.fromkeys(name for result in results for name in result)]
         chosen = [*chosen_names(self.title, there, names)]
@@ -276,7 +266,6 @@ class Result(Mapping[str, NDArray[Any]]):
         at the times of this one. Values in other units are converted, if both units are known.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> one = mesh.run(record="memory", stop_time=1.0)
             >>> print(one.compare(mesh.run(record="memory", stop_time=1.0, processes=False)))
@@ -366,7 +355,7 @@ class Result(Mapping[str, NDArray[Any]]):
 
     def _pieces(self) -> Iterator[Columns]:
         """The rows, piece by piece; those of a file that was not read yet are not kept."""
-        if self._given is not None or "_columns" in self.__dict__:
+        if self._is_here:
             return iter([self._columns])
         if self.file is None or (self.outcome is not None and not self.outcome.rows):
             return iter([Columns(np.zeros(0), {name: np.zeros(0) for name in self._variables})])
@@ -383,12 +372,10 @@ class Result(Mapping[str, NDArray[Any]]):
         noted = metadata.pop("set", ())
         file = opened(types, self._columns._replace(units=units, metadata=metadata))
         try:
-            try:
+            with closing(file):
                 file.write(self.times, [*self.values()])
                 for entry in noted:
                     file.note(entry)
-            finally:
-                file.close()
         except OSError as error:
             raise unwritable(file.path, error) from error
 

@@ -159,7 +159,6 @@ class Run:
         """The status of the mesh and of its instances, with one question; instances that do not answer are left out.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     point = run.wait_for("paused").point
@@ -175,7 +174,6 @@ class Run:
         `SystemGraph.with_status` renews these without another question for what does not change.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     point = run.wait_for("paused").point
@@ -252,7 +250,6 @@ class Run:
         A reader that falls far behind loses the newest values; the points tell which.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", stop_time=0.01, paused=True) as run:
             ...     samples = run.watch("delay.y")
@@ -271,7 +268,6 @@ class Run:
         lost, because the mesh is faster than this program can follow, there is no line.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
             ...     view = run.view("delay.y", "pendulum.a")
@@ -298,7 +294,6 @@ class Run:
         """The log messages of FMUs that the mesh has kept, the oldest first.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     [line.message for line in run.logs()]
@@ -402,7 +397,6 @@ class Run:
         """Wait until the mesh is in a state, such as "paused".
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     run.wait_for("paused").point
@@ -428,7 +422,6 @@ class Run:
         """An event that is set when the mesh ends or is gone; then ``tell`` is called, on another thread.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run, run.until_end() as ended:
             ...     answer = run.stop()
@@ -463,7 +456,7 @@ class Run:
         """As `wait`, without blocking the event loop of asyncio; a cancelled wait leaves the run as it is.
 
         Example:
-            >>> import asyncio, fmu_mesh
+            >>> import asyncio
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> async def both():
             ...     with mesh.start(stop_time=1.0, output=None, record="memory") as run:
@@ -532,7 +525,6 @@ class Run:
 
 
 def _follow(client: MeshClient, future: Future[Result]) -> None:
-    """Follow a mesh that somebody else has started to its end."""
     from .result import Result  # noqa: PLC0415  not for those who only look
 
     try:

@@ -16,7 +16,6 @@ import sys
 import threading
 from concurrent.futures import Future
 from contextlib import ExitStack
-from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING
 
@@ -61,24 +60,16 @@ _LEVELS = {"ok": logging.DEBUG, "warning": logging.WARNING, "discard": logging.W
 
 
 class RunThread:
-    """Runs a plan, as its settings say, on a thread of its own, which starts at once.
-
-    Attributes:
-        plan: the plan of the run.
-        future: gets the result, or the error with which the run ended.
-        status: the last status; None before the first.
-        reached: set when `endpoints` are known, or the run is over.
-        endpoints: the Zenoh endpoints of the mesh; empty in this process.
-    """
+    """Runs a plan, as its settings say, on a thread of its own, which starts at once."""
 
     def __init__(self, plan: RunPlan, settings: StartOptions) -> None:
         if not sys.platform.startswith("linux"):
             raise ConfigurationError(f"a mesh runs on Linux, and this system is '{sys.platform}'")
         self.plan = plan
-        self.future: Future[Result] = Future()
-        self.status: MeshStatus | None = None
-        self.reached = threading.Event()
-        self.endpoints: tuple[str, ...] = ()
+        self.future: Future[Result] = Future()  # gets the result, or the error with which the run ended
+        self.status: MeshStatus | None = None  # the last one
+        self.reached = threading.Event()  # `endpoints` are known, or the run is over
+        self.endpoints: tuple[str, ...] = ()  # of Zenoh; empty in this process
         self._settings = settings
         self._runner: Launcher | InProcessRun | None = None
         self._stopped = False
@@ -88,7 +79,11 @@ class RunThread:
         self._memory = memory_of(plan)
         if self._memory is not None:
             check_memory(plan, settings.memory_limit)
-            _make_folder(self._memory.parent, plan)
+            try:
+                self._memory.parent.mkdir(mode=0o700)
+            except FileExistsError as error:
+                text = f"this plan of '{plan.mesh}' runs already"
+                raise CallRefused(text, hint="Make another one for another run.") from error
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
         self._thread.start()
@@ -100,7 +95,7 @@ class RunThread:
 
     def stop(self) -> None:
         """End the run where it is: an orderly end, and `future` gets the result."""
-        self._stopped = True
+        self.expect_stop()
         self.interrupt()
 
     def expect_stop(self) -> None:
@@ -124,11 +119,7 @@ class RunThread:
         raise MeshLost(f"the run of mesh '{self.plan.mesh}' has ended", hint=hint)
 
     def reach(self, way: ExitStack, timeout_s: float) -> MeshClient:
-        """The mesh of this run, once it can be reached.
-
-        Args:
-            way: closes what this opens.
-            timeout_s: deadline of every question of the client.
+        """The mesh of this run, once it can be reached; ``way`` closes what this opens.
 
         Raises:
             CallRefused: the run is in this process.
@@ -194,7 +185,6 @@ class RunThread:
         _active.discard(self)
 
     def _run(self) -> Result:
-        """Run it, and again if it may be restarted."""
         plan, most = self.plan, self._settings.restarts
         while True:
             try:
@@ -288,21 +278,11 @@ _active: set[RunThread] = set()
 
 @atexit.register
 def _end_all() -> None:
-    """At the end of the program, end what still runs."""
     threads = list(_active)
     for thread in threads:
         thread.interrupt()
     for thread in threads:
         thread.join()
-
-
-def _make_folder(folder: Path, plan: RunPlan) -> None:
-    try:
-        folder.mkdir(mode=0o700)
-    except FileExistsError as error:
-        raise CallRefused(
-            f"this plan of '{plan.mesh}' runs already", hint="Make another one for another run."
-        ) from error
 
 
 def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None:
@@ -326,10 +306,8 @@ def check_memory(plan: RunPlan, limit: int, *, to_its_end: bool = False) -> None
 
 def _too_large(mesh: str, limit: int, size: int | None = None) -> CallRefused:
     takes = f"take {size} bytes of memory" if size is not None else "do not fit into memory"
-    return CallRefused(
-        f"the results of '{mesh}' {takes}; the limit is {limit} bytes",
-        hint="Raise `memory_limit`, record fewer variables, or record into a file with `output=...`.",
-    )
+    hint = "Raise `memory_limit`, record fewer variables, or record into a file with `output=...`."
+    return CallRefused(f"the results of '{mesh}' {takes}; the limit is {limit} bytes", hint=hint)
 
 
 def _log(event: Event) -> None:
@@ -341,5 +319,3 @@ def _log(event: Event) -> None:
             log.info("%s: %s", process, paragraph(text))
         case Restarted(error, number, _):
             log.warning("restart %d: %s", number, paragraph(error.message))
-        case _:
-            pass

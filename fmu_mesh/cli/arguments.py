@@ -14,7 +14,7 @@ from typing import Any, NoReturn, Protocol
 
 from ..config.base import ENDPOINT_PATTERN
 from ..errors import ConfigurationError
-from ..text import listed, nearest
+from ..text import listed, meant, nearest
 
 __all__ = [
     "PACKAGE",
@@ -74,12 +74,11 @@ class CommandParser(argparse.ArgumentParser):
         own = self.option_names
         near = nearest(name, own)
         elsewhere = [command for command, parser in others.items() if name in parser.option_names]
+        hint = meant(near, f"`{self.prog} --help` lists them.")
         if name in own:
             hint = f"It comes after the command: `{self.prog} {name}`."
         elif elsewhere and near is None:
             hint = f"It is an option of {listed([f'`{command}`' for command in elsewhere])}."
-        else:
-            hint = f"Did you mean '{near}'?" if near is not None else f"`{self.prog} --help` lists them."
         return ConfigurationError(f"`{self.prog}` has no option '{name}'", hint=hint)
 
     @property

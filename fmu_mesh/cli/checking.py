@@ -20,19 +20,12 @@ __all__ = ["RUNS", "CheckReport"]
 
 
 class CheckReport(msgspec.Struct, frozen=True):
-    """The output of `check --json`.
+    """The output of `check --json`."""
 
-    Attributes:
-        file: the configuration as it was given.
-        exit_code: that of the command.
-        plan: what would run; None if the configuration is wrong.
-        error: what is wrong, with all findings.
-    """
-
-    file: str
+    file: str  # the configuration as it was given
     exit_code: int
-    plan: PlanView | msgspec.Raw | None = None
-    error: Failure | None = None
+    plan: PlanView | msgspec.Raw | None = None  # what would run; None if the configuration is wrong
+    error: Failure | None = None  # what is wrong, with all findings
 
 
 def _check(arguments: argparse.Namespace) -> int:

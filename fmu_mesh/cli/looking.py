@@ -120,12 +120,11 @@ def _status(arguments: argparse.Namespace, meshes: Meshes) -> int:
             continue
         if index:
             print()
-        match view:
-            case MeshStatus():
-                _print(mesh_status(view, ros))
-                _print(["", *instances(statuses)])
-            case InstanceStatus():
-                _print(instance_status(view))
+        _print(
+            [*mesh_status(view, ros), "", *instances(statuses)]
+            if isinstance(view, MeshStatus)
+            else instance_status(view)
+        )
     return 0
 
 
@@ -135,12 +134,8 @@ def _info(arguments: argparse.Namespace, meshes: Meshes) -> int:
     view = client.info() if instance is None else client.instance_info(instance)
     if arguments.json:
         print_json(view)
-        return 0
-    match view:
-        case MeshInfo():
-            _print(mesh_info(view))
-        case InstanceInfo():
-            _print(instance_info(view))
+    else:
+        _print(mesh_info(view) if isinstance(view, MeshInfo) else instance_info(view))
     return 0
 
 

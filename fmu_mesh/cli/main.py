@@ -116,7 +116,11 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
     """The command and its arguments; None, after the help, without a command."""
     name = next((argument for argument in given if not argument.startswith("-")), None)
     if name is not None and given[0] == name and name not in COMMANDS:
-        raise _unknown(name)
+        suffix = PurePath(name).suffix  # somebody may have left the command out
+        hint = did_you_mean(name, COMMANDS, "`fmu-mesh --help` lists them.")
+        if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
+            hint = f"Did you mean `fmu-mesh {'simulate' if suffix == '.fmu' else 'launch'} {name}`?"
+        raise ConfigurationError(f"there is no command '{name}'.", hint=hint)
     parser, commands = command_parser([] if name is None else [name])
     options, others = parser.parse_known_args(given)
     if others:
@@ -127,15 +131,6 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
         parser.print_help()
         return None
     return options
-
-
-def _unknown(name: str) -> ConfigurationError:
-    """The error for a first argument that is not a command, such as a file."""
-    suffix = PurePath(name).suffix
-    hint = did_you_mean(name, COMMANDS, "`fmu-mesh --help` lists them.")
-    if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
-        hint = f"Did you mean `fmu-mesh {'simulate' if suffix == '.fmu' else 'launch'} {name}`?"
-    return ConfigurationError(f"there is no command '{name}'.", hint=hint)
 
 
 def command_parser(needed: Collection[str] = COMMANDS) -> tuple[CommandParser, Mapping[str, CommandParser]]:

@@ -52,19 +52,12 @@ _PARAMETERS: Final = 8
 
 
 class Model(msgspec.Struct, frozen=True):
-    """One FMU.
+    """One FMU."""
 
-    Attributes:
-        name: of its instance.
-        path: as the configuration names it.
-        description: None if it cannot run here.
-        problem: why not.
-    """
-
-    name: str
-    path: str
-    description: ModelDescription | None
-    problem: str = ""
+    name: str  # of its instance
+    path: str  # as the configuration names it
+    description: ModelDescription | None  # None if it cannot run here
+    problem: str = ""  # why not
 
 
 def _new(arguments: argparse.Namespace) -> int:
@@ -189,11 +182,8 @@ def _instance(model: Model, base_step: float) -> list[str]:
         whole = steps_between(0.0, own, base_step)
         note = "" if whole else f"  # its default, but no multiple of {short_number(base_step)}"
         lines.append(f"    {'' if whole else '# '}step_size: {own!r}{note}")
-    parameters = [
-        variable
-        for variable in model.description.variables
-        if variable.causality == "parameter" and variable.start is not None and variable.settable_before_start
-    ]
+    with_start = (v for v in model.description.with_causality("parameter") if v.start is not None)
+    parameters = [variable for variable in with_start if variable.settable_before_start]
     if parameters:
         lines.append("    # start_values:")
         lines += [f"    #   {_scalar(v.name)}: {_start(v)}{_about(v)}" for v in parameters[:_PARAMETERS]]
@@ -210,14 +200,12 @@ def _connections(descriptions: Mapping[str, ModelDescription]) -> list[str]:
     for name, description in descriptions.items():
         for variable in description.with_causality("input"):
             target = f"{name}.{variable.name}"
-            sources = [
-                f"{other}.{output.name}"
+            fitting = [
+                source
                 for other, others in descriptions.items()
-                if other != name
-                for output in others.with_causality("output")
-                if output.name == variable.name
+                if other != name and variable.name in {output.name for output in others.with_causality("output")}
+                if _fits(source := f"{other}.{variable.name}", target, descriptions)
             ]
-            fitting = [source for source in sources if _fits(source, target, descriptions)]
             if len(fitting) == 1:
                 chosen.append(f"  - {_scalar(f'{fitting[0]} -> {target}')}")
                 continue

@@ -116,24 +116,22 @@ def plot_results(result: Path | Result, plot: Path, plan: Plan) -> None:
 @contextmanager
 def plotted_where_it_ends(plan: Plan, plot: Path | None) -> Iterator[None]:
     """Inside, a run: if it ends early, what it recorded up to then is drawn, and never what an earlier run has left."""
-    result = plan.system.result_file
-    before = _state_of(result)
+    file = Path(plan.system.result_file or "")  # the current folder is no file
+
+    def state() -> tuple[int, int, int] | None:
+        """What changes when something is written into the file."""
+        status = file.stat() if file.is_file() else None
+        return (status.st_ino, status.st_size, status.st_mtime_ns) if status is not None else None
+
+    before = state()
     try:
         yield
     except FmuMeshError as error:
-        if plot is not None and result is not None and _state_of(result) != before:
-            plot_results(Path(result), plot, plan)
+        if plot is not None and state() != before:
+            plot_results(file, plot, plan)
         elif plot is not None and isinstance(error.result, Result) and len(error.result.times):  # it is in memory
             plot_results(error.result, plot, plan)
         raise
-
-
-def _state_of(result: str | None) -> tuple[int, int, int] | None:
-    """What changes of a file when something is written into it."""
-    if result is None or not Path(result).is_file():
-        return None
-    status = Path(result).stat()
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _compare(arguments: argparse.Namespace) -> int:
@@ -155,8 +153,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    rows = recover(arguments.results)
-    print(f"{arguments.results}: {rows} rows")
+    print(f"{arguments.results}: {recover(arguments.results)} rows")
     return 0
 
 

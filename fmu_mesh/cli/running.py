@@ -10,9 +10,8 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -68,23 +67,36 @@ def run_mesh(
 ) -> None:
     """Run a mesh, show its events, and at the end what the arguments ask for."""
     plan = _planned(mesh, options, arguments)
-    reporter.planned(plan)
     with (
         plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
-        Display(plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),
-        interrupted_by_signals() as runs,
     ):
-        how["on_event"] = partial(_show_event, reporter, display)
-        run = Run.start(plan, **how)
-        runs.append(run)
-        result = run.wait()
+        result = _shown(plan, arguments, reporter, how)
     _finish(plan.plan, result, arguments)
 
 
-def _show_event(reporter: RunReporter, display: Display, event: Event) -> None:
-    reporter.event(event)
-    display.event(event)
+def _shown(
+    plan: RunPlan,
+    arguments: argparse.Namespace,
+    reporter: RunReporter,
+    how: dict[str, Any],
+    drive: Callable[[Run], None] = lambda _run: None,
+) -> Result:
+    """The result of a run whose events are shown; ``drive`` is called when it has started."""
+    reporter.planned(plan)
+    with (
+        Display(plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+        interrupted_by_signals() as runs,
+    ):
+
+        def show(event: Event) -> None:
+            reporter.event(event)
+            display.event(event)
+
+        run = Run.start(plan, **how, on_event=show)
+        runs.append(run)
+        drive(run)
+        return run.wait()
 
 
 def _planned(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:
@@ -116,7 +128,6 @@ def interrupted_by_signals() -> Iterator[list[Run | Sweep]]:
 
 
 def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
-    """Show what the options of the command ask for, and print the summary."""
     outcome = result.outcome
     assert outcome is not None  # it has run
     if outcome.profile is not None:
@@ -178,18 +189,10 @@ def _rerun(arguments: argparse.Namespace) -> int:
 
     with RunReporter(wanted=arguments.json) as reporter:
         again = planned_rerun(arguments.result, **given_options(arguments, RerunOptions))
-        reporter.planned(again.plan)
         plan = again.plan.plan
         if not arguments.quiet:
             warn(plan)
-        with (
-            Display(plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
-            interrupted_by_signals() as runs,
-        ):
-            run = Run.start(again.plan, on_event=partial(_show_event, reporter, display))
-            runs.append(run)
-            again.drive(run)
-            outcome = run.wait().outcome
+        outcome = _shown(again.plan, arguments, reporter, {}, again.drive).outcome
         assert outcome is not None  # it has run
         for line in summary(plan, outcome):
             print(line)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Literal
 
 import msgspec
@@ -13,7 +12,7 @@ import msgspec
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..sweeps.dask_cluster import dask_executor
 from ..sweeps.planned_sweep import PlannedSweep, continued_sweep, planned_sweep
-from ..sweeps.slurm_sweep import SlurmOptions, SlurmSweep
+from ..sweeps.slurm_sweep import SlurmSweep
 from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_options import SweepOptions
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
@@ -37,31 +36,18 @@ _OF_FOLDER = {"allow_code", "on_notice", "resume", "workers"}
 
 
 class SweepReport(msgspec.Struct, frozen=True):
-    """The output of `sweep --json`.
+    """The output of `sweep --json`."""
 
-    Attributes:
-        mesh: name of the mesh; None if the sweep could not be planned.
-        state: whether every variant has a row, and none has failed.
-        exit_code: that of the command.
-        variants: how many there are.
-        runs: how many have a row.
-        failed: how many of these have failed.
-        seconds: wall-clock time in s.
-        folder: the folder of the sweep.
-        table: the CSV file with all rows.
-        error: why the sweep ended early; not why a run has failed, which its row says.
-    """
-
-    mesh: str | None
-    state: Literal["done", "failed"]
+    mesh: str | None  # name of the mesh; None if the sweep could not be planned
+    state: Literal["done", "failed"]  # whether every variant has a row, and none has failed
     exit_code: int
-    variants: int = 0
-    runs: int = 0
-    failed: int = 0
-    seconds: float = 0.0
+    variants: int = 0  # how many there are
+    runs: int = 0  # how many have a row
+    failed: int = 0  # how many of these have failed
+    seconds: float = 0.0  # wall-clock time in s
     folder: str | None = None
-    table: str | None = None
-    error: Failure | None = None
+    table: str | None = None  # the CSV file with all rows
+    error: Failure | None = None  # why the sweep ended early; not why a run has failed, which its row says
 
 
 def _sweep(arguments: argparse.Namespace) -> int:
@@ -109,20 +95,16 @@ def _started(planned: PlannedSweep, arguments: argparse.Namespace) -> Iterator[S
     """The sweep, where the arguments want it; it ends with the block."""
     if arguments.slurm and arguments.dask is not None:
         raise ConfigurationError("--slurm and --dask do not go together", hint="Leave one of them out.")
-    if arguments.slurm:
-        options = SlurmOptions(arguments.tasks, arguments.workers or 1, tuple(arguments.slurm_option))
-        with SlurmSweep(planned, options) as sweep:
-            yield sweep
-        return
     part = SweepPart(*arguments.part) if arguments.part is not None else None
-    dask: AbstractContextManager[Executor | None] = nullcontext()
-    if arguments.dask is not None:
-        dask = dask_executor(None if arguments.dask == HERE else arguments.dask, arguments.workers)
-    with (
-        dask as executor,
-        ExecutorSweep(planned, executor=executor, workers=arguments.workers, part=part) as sweep,
-    ):
-        yield sweep
+    workers, executor = arguments.workers, None
+    with ExitStack() as stack:
+        if arguments.dask is not None:
+            executor = stack.enter_context(dask_executor(None if arguments.dask == HERE else arguments.dask, workers))
+        yield stack.enter_context(
+            SlurmSweep(planned, tasks=arguments.tasks, workers=workers or 1, options=arguments.slurm_option)
+            if arguments.slurm
+            else ExecutorSweep(planned, executor=executor, workers=workers, part=part)
+        )
 
 
 def _follow(sweep: Sweep, arguments: argparse.Namespace) -> None:
@@ -185,11 +167,9 @@ def _show(sweep: Sweep) -> None:
     if table.is_file():
         print(f"table: {short_path(table)}")
     rate = f": {sweep.ran / progress.seconds:.3g} runs/s" if sweep.ran and progress.seconds > 0.0 else ""
-    kept = progress.done - sweep.ran
-    before = f", {kept} of them before" if kept else ""
-    print(
-        f"{progress.done} of {progress.total} runs{before}, {progress.failed} failed, in {progress.seconds:.3f} s{rate}"
-    )
+    before = f", {kept} of them before" if (kept := progress.done - sweep.ran) else ""
+    runs = f"{progress.done} of {progress.total} runs{before}, {progress.failed} failed"
+    print(f"{runs}, in {progress.seconds:.3f} s{rate}")
 
 
 RUNS: Runs = {"sweep": _sweep}

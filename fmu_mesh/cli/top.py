@@ -64,15 +64,11 @@ class _Courses:
     """The course of variables, as long as the `with` block lasts.
 
     A thread asks for the values, because `top` has to show the state of a mesh whose values do not come.
-
-    Attributes:
-        per_look: number of values in the time between two looks.
-        interval_s: time between two values in s.
     """
 
     def __init__(self, run: Run, names: Sequence[str], interval_s: float) -> None:
-        self.per_look = _VALUES_PER_LOOK if names else 1
-        self.interval_s = interval_s / self.per_look
+        self.per_look = _VALUES_PER_LOOK if names else 1  # values in the time between two looks
+        self.interval_s = interval_s / self.per_look  # from one value to the next
         self._run = run
         self._names = tuple(names)
         self._histories = Histories()
@@ -92,7 +88,6 @@ class _Courses:
             self._thread.join()
 
     def lines(self, width: int | None) -> list[str]:
-        """The lines below the table; none without variables."""
         with self._lock:
             lines = self._histories.lines(width, sparkline_signs(sys.stdout.encoding))
         return ["", *lines] if lines else []
@@ -118,8 +113,7 @@ class _Courses:
 
 def _show_once(look: Look, courses: _Courses, *, as_json: bool) -> None:
     if as_json:
-        content = {"mesh": look[0], "instances": list(look[1].values()), **courses.values()}
-        print_json(content)
+        print_json({"mesh": look[0], "instances": list(look[1].values()), **courses.values()})
     else:
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
         print(printing.page([*page(look, width=width), *courses.lines(width)]), flush=True)

@@ -150,7 +150,6 @@ def empty_figure() -> Figure:
 
 
 def _legend_columns(count: int) -> int:
-    """Number of columns of a legend with this number of names."""
     return math.ceil(min(count, _NAMES + 1) / _ROWS) or 1
 
 
@@ -165,10 +164,8 @@ def add_legend(axes: Axes, lines: Sequence[Line2D], labels: Sequence[str], title
 
     lines, shown = list(lines)[: len(labels)], list(labels)
     if len(shown) > _NAMES:
-        lines, shown = (
-            [*lines[:_NAMES], Line2D([], [], linestyle="none")],
-            [*shown[:_NAMES], f"and {len(shown) - _NAMES} more"],
-        )
+        lines = [*lines[:_NAMES], Line2D([], [], linestyle="none")]
+        shown = [*shown[:_NAMES], f"and {len(shown) - _NAMES} more"]
     legend = axes.legend(
         lines,
         # matplotlib omits a name that begins with an underscore; an invisible word joiner before it prevents that.

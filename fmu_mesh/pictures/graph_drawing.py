@@ -160,23 +160,15 @@ class DrawnWire(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """All shapes of a picture.
-
-    Attributes:
-        groups: the box of each process with several instances, and its title.
-        instances: the boxes of instances.
-        wires: the wires, those of cycles last, so that they are on top.
-        labels: the title and the legend.
-        edges: source and target of each edge.
-    """
+    """All shapes of a picture."""
 
     width: float
     height: float
-    groups: tuple[tuple[Box, Label], ...]
+    groups: tuple[tuple[Box, Label], ...]  # the box of each process with several instances, and its title
     instances: tuple[DrawnInstance, ...]
-    wires: tuple[DrawnWire, ...]
-    labels: tuple[Label, ...]
-    edges: tuple[tuple[str, str], ...]
+    wires: tuple[DrawnWire, ...]  # the wires, those of cycles last, so that they are on top
+    labels: tuple[Label, ...]  # the title and the legend
+    edges: tuple[tuple[str, str], ...]  # source and target of each edge
 
 
 class _Ports(NamedTuple):
@@ -229,12 +221,12 @@ def drawing_of(
         (box, Label(box.x + _PAD, box.y + 16.0, f"group {shortened(name, 40)}: one process", 11.0, FAINT))
         for name, box in plan.groups.items()
     ]
-    legend = _legend(edges)
-    height = plan.height + 18.0 * len(legend)
-    labels = [
-        Label(_MARGIN, _MARGIN + 8.0, title, 14.0, bold=True),
-        *(Label(_MARGIN, plan.height + 18.0 * number, text, 11.0, FAINT) for number, text in enumerate(legend)),
-    ]
+    labels, height = [Label(_MARGIN, _MARGIN + 8.0, title, 14.0, bold=True)], plan.height
+    dashed = "dashed: delay 1, the step uses the value at its start" if any(edge.delay > 0 for edge in edges) else ""
+    thick = "thick and coloured: a cycle" if any(edge.cycle is not None for edge in edges) else ""
+    if legend := "; ".join(filter(None, (dashed, thick))):
+        labels.append(Label(_MARGIN, height, legend, 11.0, FAINT))
+        height += 18.0
     width = max(plan.width, *(_text_width(label) + 2.0 * _MARGIN for label in labels))
     return Drawing(
         width,
@@ -245,15 +237,6 @@ def drawing_of(
         tuple(labels),
         tuple((edge.source, edge.target) for edge in edges),
     )
-
-
-def _legend(edges: Sequence[GraphEdge]) -> list[str]:
-    texts = []
-    if any(edge.delay > 0 for edge in edges):
-        texts.append("dashed: delay 1, the step uses the value at its start")
-    if any(edge.cycle is not None for edge in edges):
-        texts.append("thick and coloured: a cycle")
-    return ["; ".join(texts)] if texts else []
 
 
 def _drawn_instance(node: GraphNode, plan: _Plan, cycle: int | None, *, is_live: bool) -> DrawnInstance:
@@ -306,13 +289,13 @@ class _Planning:
         self._ends = [(edges[port.edge].source, edges[port.edge].target) for port in self._ports]
         self._wires = [
             Wire(
-                edges[port.edge].source,
-                edges[port.edge].target,
-                _row_y(rows[edges[port.edge].source][1][port.source], is_live=is_live),
-                _row_y(rows[edges[port.edge].target][0][port.target], is_live=is_live),
+                source,
+                target,
+                _row_y(rows[source][1][port.source], is_live=is_live),
+                _row_y(rows[target][0][port.target], is_live=is_live),
                 abs(edges[port.edge].delay),
             )
-            for port in self._ports
+            for port, (source, target) in zip(self._ports, self._ends, strict=True)
         ]
 
     def plan(self) -> _Plan:
@@ -380,7 +363,6 @@ def _moved(path: Sequence[Dot], group: Box) -> list[Dot]:
 
 
 def _without_repeats(path: Sequence[Dot]) -> list[Dot]:
-    """A path without corners that are none."""
     kept: list[Dot] = []
     for dot, after in zip(path, [*path[1:], None], strict=True):
         if dot == after or (kept and after and kept[-1][1] == dot[1] == after[1] and kept[-1][0] <= dot[0] <= after[0]):

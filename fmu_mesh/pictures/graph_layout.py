@@ -28,35 +28,22 @@ nothing asks for more."""
 
 
 class Wire(NamedTuple):
-    """One wire.
+    """One wire."""
 
-    Attributes:
-        source: the box it begins at, on the right; None if it comes from the left border.
-        target: the box it ends at, on the left; None if it goes to the right border.
-        source_y: how far its beginning lies below the upper edge of the box; ``target_y`` likewise.
-        delay: 0 or 1: of wires that form a cycle, one with a delay goes back.
-    """
-
-    source: str | None
-    target: str | None
-    source_y: float = 0.0
+    source: str | None  # the box it begins at, on the right; None if it comes from the left border
+    target: str | None  # the box it ends at, on the left; None if it goes to the right border
+    source_y: float = 0.0  # how far its beginning lies below the upper edge of the box; `target_y` likewise
     target_y: float = 0.0
-    delay: int = 0
+    delay: int = 0  # 0 or 1: of wires that form a cycle, one with a delay goes back
 
 
 class Arrangement(NamedTuple):
-    """Where everything lies.
+    """Where everything lies."""
 
-    Attributes:
-        width: of all; ``height`` likewise.
-        places: the upper left corner of each box.
-        paths: the corners of each wire. Between two of them that differ in x and in y, it is curved.
-    """
-
-    width: float
+    width: float  # of all; `height` likewise
     height: float
-    places: dict[str, Dot]
-    paths: list[list[Dot]]
+    places: dict[str, Dot]  # the upper left corner of each box
+    paths: list[list[Dot]]  # the corners of each wire. Between two of them that differ in x and in y, it is curved
 
 
 class _Part(NamedTuple):

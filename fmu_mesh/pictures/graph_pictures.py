@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Literal
 
 from ..printing import printable
 from .drawing import FONT, GROUP, GROUP_BORDER, empty_figure
@@ -18,32 +18,22 @@ if TYPE_CHECKING:
 __all__ = ["figure_of_drawing", "svg_of_drawing"]
 
 
-# --- commands of a path
-
-
-class _Move(NamedTuple):
-    """One command: M, L, Q or C with its points."""
-
-    command: Literal["M", "L", "Q", "C"]
-    dots: tuple[Dot, ...]
-
-
-def _moves(path: Sequence[Dot]) -> Iterator[_Move]:
-    """The commands of a path: curves between columns, and round corners between straight lines."""
-    yield _Move("M", (path[0],))
+def _moves(path: Sequence[Dot]) -> Iterator[tuple[Literal["M", "L", "Q", "C"], tuple[Dot, ...]]]:
+    """The commands of a path with their points: curves between columns, and round corners between straight lines."""
+    yield "M", (path[0],)
     for number, (before, here) in enumerate(pairwise(path), 1):
         if before[0] != here[0] and before[1] != here[1]:
             middle = 0.5 * (before[0] + here[0])
-            yield _Move("C", ((middle, before[1]), (middle, here[1]), here))
+            yield "C", ((middle, before[1]), (middle, here[1]), here)
             continue
         after = path[number + 1] if number + 1 < len(path) else here
         turns = (before[0] == here[0]) != (after[0] == here[0]) and (before[1] == here[1]) != (after[1] == here[1])
         if not turns:
-            yield _Move("L", (here,))
+            yield "L", (here,)
             continue
         radius = min(7.0, 0.5 * _distance(before, here), 0.5 * _distance(here, after))
-        yield _Move("L", (_towards(here, before, radius),))
-        yield _Move("Q", (here, _towards(here, after, radius)))
+        yield "L", (_towards(here, before, radius),)
+        yield "Q", (here, _towards(here, after, radius))
 
 
 def _distance(first: Dot, second: Dot) -> float:
@@ -81,9 +71,8 @@ def svg_of_drawing(drawing: Drawing) -> str:
         lines.append(f'<g class="edge" data-source="{escaped(source)}" data-target="{escaped(target)}">')
         for wire in wires:
             dashes = ' stroke-dasharray="6 4"' if wire.dashed else ""
-            commands = "".join(
-                f"{m.command}{' '.join(f'{x:.1f} {y:.1f}' for x, y in m.dots)}" for m in _moves(wire.path)
-            )
+            moves = ((command, " ".join(f"{x:.1f} {y:.1f}" for x, y in dots)) for command, dots in _moves(wire.path))
+            commands = "".join(chain.from_iterable(moves))
             lines.append(
                 f'<g><path d="{commands}" fill="none" stroke="{wire.colour}" stroke-width="{wire.width}"{dashes}/>'
                 f'<polygon points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in _arrow(wire.path[-1]))}" '
@@ -160,7 +149,7 @@ def figure_of_drawing(drawing: Drawing) -> Figure:
     for wire in drawing.wires:
         moves = [*_moves(wire.path)]
         path = Path(
-            [dot for move in moves for dot in move.dots], [code for move in moves for code in codes[move.command]]
+            [dot for _, dots in moves for dot in dots], [code for command, _ in moves for code in codes[command]]
         )
         axes.add_patch(
             PathPatch(

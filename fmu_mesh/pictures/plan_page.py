@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from ..config.findings import ValueOrigin
@@ -11,15 +12,16 @@ from ..run.one_process import apart, claims_in
 from ..system.plan import Plan
 from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
+from ..system.schedule import Course, Schedule
 from ..system.series_files import course_of
 from ..system.system import Connection, SystemInstance
 from ..system.value_map import map_text
 from ..text import listed, short_number, short_path, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
-from .tables import pairs, table
+from .tables import pairs, table, titled
 
-__all__ = ["plan_page", "slower_than_it_could_be", "start_value_origin"]
+__all__ = ["plan_page", "scheduled", "slower_than_it_could_be", "start_value_origin"]
 
 _PROBLEM_CHARACTERS = 200
 
@@ -39,11 +41,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Recorded", _recorded(plan)),
         ("Warnings", _warnings(plan)),
     ]
-    lines: list[str] = []
-    for title, content in sections:
-        if content:
-            lines += ([""] if lines else []) + ([title] if title else []) + content
-    return lines
+    return titled(sections)
 
 
 def slower_than_it_could_be() -> str | None:
@@ -57,7 +55,6 @@ def _head(plan: Plan) -> list[str]:
     window = f"{plan.window} points" if plan.window > 1 else "1 point: lockstep"
     end = f"{short_number(grid.stop_time)} s in {grid.last_point}" if grid.stop_time is not None else "an open end in"
     times = f"{short_number(grid.start_time)} s to {end} steps of"
-    without = why_no_library()
     return pairs(
         [
             ("Mesh", plan.system.config.mesh),
@@ -65,28 +62,19 @@ def _head(plan: Plan) -> list[str]:
             ("Algorithm", simulation.algorithm),
             ("Window", window),
             ("Speed", f"{factor:g} times real time" if factor else "as fast as possible"),
-            *([("Library", without)] if without is not None else []),
+            ("Library", why_no_library() or ""),
         ]
     )
 
 
 def _instances(plan: Plan) -> list[str]:
-    rows = [
-        [
-            instance.name,
-            _model(plan, instance),
-            f"step {short_number(instance.step_points * plan.grid.step_size)} s",
-            "a process of its own" if instance.node == instance.name else f"group {instance.node}",
-        ]
-        for instance in plan.system.instances.values()
-    ]
+    rows = []
+    for name, own in plan.system.instances.items():
+        summary = plan.system.config.instances[name].summary(own.description)
+        model = f"{Path(own.fmu).name or own.description.model_name} ({summary})"
+        step = f"step {short_number(own.step_points * plan.grid.step_size)} s"
+        rows.append([name, model, step, "a process of its own" if own.node == name else f"group {own.node}"])
     return table(rows, indent=2)
-
-
-def _model(plan: Plan, instance: SystemInstance) -> str:
-    """The file of an instance, and what computes it."""
-    summary = plan.system.config.instances[instance.name].summary(instance.description)
-    return f"{Path(instance.fmu).name or instance.description.model_name} ({summary})"
 
 
 def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:
@@ -142,27 +130,28 @@ def _free_inputs(plan: Plan) -> list[str]:
 
 def _scenario(plan: Plan) -> list[str]:
     rows = []
+    for name, own, course, (first, last) in scheduled(plan):
+        if course.changes == 1:
+            since = "" if own.initial and not course.first_step else f" from {short_number(first)} s on"
+            unit = _unit(plan.system.instances[name].description.variable(own.variable))
+            what, shape = f"= {shown(to_plain(course.end))}{unit}{since}", ""
+        else:
+            what = f"{course.changes} values from {short_number(first)} s to {short_number(last)} s"
+            shape = "linear" if own.linear else "hold"
+        source = f"column '{own.file.column}' of {short_path(own.file.path)}" if own.file is not None else ""
+        rows.append([f"{name}.{own.variable}", what, shape, source])
+    return table(rows, indent=2)
+
+
+def scheduled(plan: Plan) -> Iterator[tuple[str, Schedule, Course, tuple[float, float]]]:
+    """What the scenario sets: the instance, how, and the times in s of the first and the last value."""
     for name, instance in plan.system.instances.items():
         for own in instance.scenario:
             variable = instance.description.variable(own.variable)
             assert variable is not None  # the plan is valid
             course = course_of(own, variable, plan.grid, instance.step_points)
-            first, last = (
-                short_number(plan.grid.time(step * instance.step_points))
-                for step in (course.first_step, course.last_step)
-            )
-            shape = "linear" if own.linear else "hold"
-            if course.changes == 1:
-                value = f"{shown(to_plain(course.end))}{_unit(variable)}"
-                what, shape = (
-                    f"= {value}" if own.initial and not course.first_step else f"= {value} from {first} s on",
-                    "",
-                )
-            else:
-                what = f"{course.changes} values from {first} s to {last} s"
-            source = f"column '{own.file.column}' of {short_path(own.file.path)}" if own.file is not None else ""
-            rows.append([f"{name}.{own.variable}", what, shape, source])
-    return table(rows, indent=2)
+            first, last = (plan.grid.time(n * instance.step_points) for n in (course.first_step, course.last_step))
+            yield name, own, course, (first, last)
 
 
 def _arithmetic(c: Connection) -> str:
@@ -178,9 +167,9 @@ def _arithmetic(c: Connection) -> str:
 
 
 def _order(plan: Plan) -> list[str]:
-    instant = {(c.source_instance, c.target_instance) for c in plan.connections if c.delay == 0}
-    arrow = " -> " if instant else ", "
-    lines = [f"  {arrow.join(plan.order)}" + ("" if instant else "  (at the same time)" if len(plan.order) > 1 else "")]
+    is_chain = any(c.delay == 0 for c in plan.connections)
+    together = "  (at the same time)" if len(plan.order) > 1 and not is_chain else ""
+    lines = [f"  {(' -> ' if is_chain else ', ').join(plan.order)}{together}"]
     lines += [f"  cycle: {', '.join(cycle)}" for cycle in plan.cycles]
     return lines
 

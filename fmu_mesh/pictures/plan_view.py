@@ -9,14 +9,11 @@ from ..config.mesh import SimulationConfig
 from ..errors import Finding
 from ..rings.library import why_no_library
 from ..system.plan import Plan
-from ..system.schedule import Schedule
-from ..system.series_files import course_of
-from ..system.system import SystemInstance
 from ..system.value_map import map_words
 from ..text import counted
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
-from .plan_page import start_value_origin
+from .plan_page import scheduled, start_value_origin
 
 __all__ = ["PlanView", "plan_view"]
 
@@ -132,7 +129,11 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
             own.step_points * grid.step_size,
             own.node,
             {name: to_plain(value) for name, value in own.start_values.items()},
-            {name: _origin(loaded, own, name) for name in own.start_values},
+            {
+                name: PlannedOrigin(origin.file or None, origin.line, origin.text)
+                for name in own.start_values
+                for origin in [start_value_origin(loaded, own, name)]
+            },
         )
         for own in system.instances.values()
     ]
@@ -174,27 +175,16 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
         recorded=records[0].variables if records else [],
         result_file=system.result_file,
         records=records,
-        scenario=[_scheduled(plan, own, schedule) for own in system.instances.values() for schedule in own.scenario],
+        scenario=[
+            PlannedSchedule(
+                f"{name}.{own.variable}",
+                course.changes,
+                *times,
+                "linear" if own.linear else "hold",
+                own.file.path if own.file is not None else None,
+            )
+            for name, own, course, times in scheduled(plan)
+        ],
         warnings=system.warnings,
         library=why_no_library(),
-    )
-
-
-def _origin(loaded: LoadedConfig, instance: SystemInstance, variable: str) -> PlannedOrigin:
-    origin = start_value_origin(loaded, instance, variable)
-    return PlannedOrigin(origin.file or None, origin.line, origin.text)
-
-
-def _scheduled(plan: Plan, instance: SystemInstance, schedule: Schedule) -> PlannedSchedule:
-    variable = instance.description.variable(schedule.variable)
-    assert variable is not None  # the plan is valid
-    course = course_of(schedule, variable, plan.grid, instance.step_points)
-    first, last = (plan.grid.time(step * instance.step_points) for step in (course.first_step, course.last_step))
-    return PlannedSchedule(
-        f"{instance.name}.{schedule.variable}",
-        course.changes,
-        first,
-        last,
-        "linear" if schedule.linear else "hold",
-        schedule.file.path if schedule.file is not None else None,
     )

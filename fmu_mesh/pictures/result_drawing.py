@@ -64,19 +64,12 @@ _DIMENSIONLESS = ("", "1", "-")
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """How one variable is drawn.
+    """How one variable is drawn."""
 
-    Attributes:
-        unit: its unit; variables of one unit share axes.
-        axis: `FLAGS` or `NUMBERS` for values without a unit that have axes of their own.
-        note: added to its name in the legend.
-        held: whether its values hold until the next one, so that it is drawn in steps.
-    """
-
-    unit: str = ""
-    axis: str = ""
-    note: str = ""
-    held: bool = False
+    unit: str = ""  # its unit; variables of one unit share axes
+    axis: str = ""  # `FLAGS` or `NUMBERS` for values without a unit that have axes of their own
+    note: str = ""  # added to its name in the legend
+    held: bool = False  # whether its values hold until the next one, so that it is drawn in steps
 
     @property
     def key(self) -> str:
@@ -85,36 +78,23 @@ class Curve(msgspec.Struct, frozen=True):
 
 
 class Curves(NamedTuple):
-    """What is drawn of one result.
+    """What is drawn of one result."""
 
-    Attributes:
-        title: its name in the legend.
-        times: the times in s, shape `(rows,)`.
-        values: an array of this shape for each variable, by name; those of texts are left out.
-        differences: by name, the times of the first result and its values minus those of this one.
-    """
-
-    title: str
-    times: NDArray[np.float64]
-    values: Mapping[str, NDArray[Any]]
+    title: str  # its name in the legend
+    times: NDArray[np.float64]  # the times in s, shape `(rows,)`
+    values: Mapping[str, NDArray[Any]]  # an array of this shape for each variable, by name; those of texts are left out
+    # by name, the times of the first result and its values minus those of this one
     differences: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
 
 class PictureOptions(NamedTuple):
-    """What a picture shows beside its curves.
-
-    Attributes:
-        title: the title.
-        curves: by name of a variable, how to draw it, if more than its values is known.
-        x: the variable that is the horizontal axis; None: time.
-        difference: whether there are axes with the differences of the results below those of the curves.
-        annotations: by time in s and variable, a text at this place of the first result.
-    """
+    """What a picture shows beside its curves."""
 
     title: str
-    curves: Mapping[str, Curve] = {}
-    x: str | None = None
-    difference: bool = False
+    curves: Mapping[str, Curve] = {}  # by name of a variable, how to draw it, if more than its values is known
+    x: str | None = None  # the variable that is the horizontal axis; None: time
+    difference: bool = False  # whether there are axes with the differences of the results below those of the curves
+    # by time in s and variable, a text at this place of the first result
     annotations: Mapping[tuple[float, str], str] = {}
 
 
@@ -277,7 +257,6 @@ class _Drawer:
         return limited(result.values[x][::stride].astype(np.float64)), limited(values[::stride])
 
     def _legend(self, panel: _Panel, lines: Sequence[Line2D]) -> tuple[list[Line2D], list[str]]:
-        """The lines and texts of a legend: the variables, and of several results these as well."""
         from matplotlib.lines import Line2D as Line  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
         texts = [short(name) + self._curve(name).note for name in panel.names]

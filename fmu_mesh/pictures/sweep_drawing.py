@@ -58,17 +58,12 @@ _Path = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class VariantCurve(msgspec.Struct, frozen=True):
-    """One variable of one variant over time.
+    """One variable of one variant over time."""
 
-    Attributes:
-        times: the simulation times in s, shape `(rows,)`.
-        values: one for each time. Values that are no floats hold until the next one. A variant that failed has no rows.
-        colour: the value of the parameter that colours the curve.
-    """
-
-    times: NDArray[np.float64]
+    times: NDArray[np.float64]  # the simulation times in s, shape `(rows,)`
+    # one for each time. Values that are no floats hold until the next one. A variant that failed has no rows
     values: NDArray[Any]
-    colour: PlainValue
+    colour: PlainValue  # the value of the parameter that colours the curve
 
 
 def curves_figure(title: str, y_label: str, colour_label: str, curves: Iterable[VariantCurve]) -> Figure:
@@ -246,19 +241,12 @@ def _draw_points(
 
 
 class _Scale(NamedTuple):
-    """Where the values of a parameter lie: numbers where they are, all other values side by side.
+    """Where the values of a parameter lie: numbers where they are, all other values side by side."""
 
-    Attributes:
-        title: name and unit of the parameter.
-        marks: the different places, in increasing order.
-        texts: the value at each place; empty for numbers.
-        logarithmic: whether the numbers are spread by ratio.
-    """
-
-    title: str
-    marks: list[float]
-    texts: list[str]
-    logarithmic: bool
+    title: str  # name and unit of the parameter
+    marks: list[float]  # the different places, in increasing order
+    texts: list[str]  # the value at each place; empty for numbers
+    logarithmic: bool  # whether the numbers are spread by ratio
 
     @classmethod
     def of(cls, title: str, values: Sequence[PlainValue]) -> _Scale:
@@ -288,7 +276,6 @@ class _Scale(NamedTuple):
         return np.exp(edges) if self.logarithmic else edges
 
     def label(self, axis: Axis) -> None:
-        """Give an axis its title, its scale and its ticks."""
         axis.set_label_text(short(self.title), parse_math=False)
         if self.texts:
             axis.set_ticks(self.marks, [short(text) for text in self.texts])
@@ -297,14 +284,11 @@ class _Scale(NamedTuple):
             return
         if self.logarithmic:
             _set_logarithmic(axis)
-        if len(self.marks) <= _FEW and self._are_apart():
+        marks = np.log(self.marks) if self.logarithmic else np.array(self.marks)
+        least = (marks[-1] - marks[0]) / (2.0 * _FEW)  # so that there is room for the number at each place
+        if len(marks) <= _FEW and (np.diff(marks) >= least).all():
             axis.set_ticks(self.marks, [f"{mark:.4g}" for mark in self.marks])
             axis.set_ticks([], minor=True)
-
-    def _are_apart(self) -> bool:
-        """Whether there is room for the number at each place."""
-        marks = np.log(self.marks) if self.logarithmic else np.array(self.marks)
-        return len(marks) < 2 or float(np.diff(marks).min()) >= (marks[-1] - marks[0]) / (2.0 * _FEW)
 
 
 def _set_logarithmic(axis: Axis) -> None:
@@ -347,7 +331,6 @@ def _unevenness(numbers: NDArray[np.float64]) -> float:
 
 
 def _norm(numbers: NDArray[np.float64], *, logarithmic: bool) -> Normalize:
-    """From numbers to shares of a colour map."""
     from matplotlib.colors import LogNorm, Normalize  # noqa: PLC0415  as above
 
     if not len(numbers):

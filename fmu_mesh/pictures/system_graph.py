@@ -6,7 +6,6 @@ Owns what the graph says; `graph_layout` has where things lie, and `graph_drawin
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,7 +83,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
         """The same graph with the state of each instance, as `Run.all_status` has it.
 
         Example:
-            >>> import fmu_mesh
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", paused=True) as run:
             ...     _ = run.wait_for("paused")
@@ -103,7 +101,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
         """The picture as the text of an SVG file; needs no library.
 
         Example:
-            >>> import fmu_mesh
             >>> picture = fmu_mesh.load("configs/cycle2.yaml").graph().svg()
             >>> picture[:4], 'data-instance="velocity"' in picture
             ('<svg', True)
@@ -117,7 +114,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
         """The picture as a figure of matplotlib.
 
         Example:
-            >>> import fmu_mesh
             >>> fmu_mesh.load("configs/cycle2.yaml").graph().figure().savefig("cycle2.pdf")
 
         Raises:
@@ -127,10 +123,11 @@ class SystemGraph(msgspec.Struct, frozen=True):
 
     def text(self) -> str:
         """The graph as text of at most 80 columns: below each instance, what its outputs are connected to."""
-        members = sorted(self.nodes, key=lambda node: self._first_of_group[node.group])
+        groups: dict[str, list[GraphNode]] = {}
+        for node in self.nodes:
+            groups.setdefault(node.group, []).append(node)
         lines = [shortened(self.title, _COLUMNS), ""]
-        for group, of_group in groupby(members, key=lambda node: node.group):
-            nodes = list(of_group)
+        for group, nodes in groups.items():
             indent = 2 if len(nodes) > 1 else 0
             if indent:
                 lines.append(f"group {shortened(group, _COLUMNS - 30)}, one process")
@@ -149,13 +146,6 @@ class SystemGraph(msgspec.Struct, frozen=True):
             return f'<div style="overflow-x: auto">{self.svg()}</div>'
         rows = ((node.instance, node.model, node.group, node.live) for node in self.nodes)
         return html_table(self.title, ["instance", "model", "process", "state"], rows, len(self.nodes))
-
-    @property
-    def _first_of_group(self) -> dict[str, int]:
-        first: dict[str, int] = {}
-        for number, node in enumerate(self.nodes):
-            first.setdefault(node.group, number)
-        return first
 
     def _lines_of(self, node: GraphNode, indent: int) -> list[str]:
         heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), node.live]

@@ -8,7 +8,7 @@ from itertools import islice
 
 from ..text import counted, printable
 
-__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "wrapped"]
+__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "titled", "wrapped"]
 
 _GAP = "  "
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -24,6 +24,15 @@ def table(rows: Iterable[Sequence[str]], *, heading: Sequence[str] | None = None
         cells.insert(0, list(heading))
     widths = {column: max(len(row[column]) for row in cells) for column in shown}
     return [" " * indent + _GAP.join(row[column].ljust(widths[column]) for column in shown).rstrip() for row in cells]
+
+
+def titled(sections: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+    """The lines of a page: sections with their titles, an empty line between them; empty sections are left out."""
+    lines: list[str] = []
+    for title, content in sections:
+        if content:
+            lines += [*([""] if lines else []), *([title] if title else []), *content]
+    return lines
 
 
 def shortened(name: str, width: int) -> str:

@@ -84,14 +84,10 @@ class _DaskExecutor(Executor):
 
     def _settle(self, future: Future[Any], job: Any) -> None:  # noqa: ANN401  Dask has no types
         """On a thread of Dask: a job has ended."""
-        try:
-            result, error = job.result(), None
-        except Exception as caught:  # noqa: BLE001  whoever waits gets it
-            result, error = None, caught
         del self._under_way[future]
         if not future.set_running_or_notify_cancel():
             return
-        if error is not None:
+        try:
+            future.set_result(job.result())
+        except Exception as error:  # noqa: BLE001  whoever waits gets it
             future.set_exception(error)
-        else:
-            future.set_result(result)

@@ -24,7 +24,7 @@ from ..run.allowed_code import check_owner
 from ..run.one_process import apart
 from ..run.options import VariantOptions
 from ..run.run_plan import RunPlan
-from ..text import did_you_mean, listed, nearest
+from ..text import did_you_mean, listed, meant, nearest
 from .reductions import check_reductions, read_reduction
 from .sweep_folder import SweepFolder, Wanted, identity_of, is_sweep
 from .sweep_options import Own, SweepOptions
@@ -46,43 +46,23 @@ _OF_EACH_RUN = [name for name in VariantOptions.__struct_fields__ if name != "on
 
 
 class PlannedSweep(NamedTuple):
-    """A sweep that can run.
+    """A sweep that can run."""
 
-    Attributes:
-        wanted: what was asked.
-        folder: where everything goes.
-        plan: the plan of a variant, for what all have in common.
-        columns: what is calculated from the curves of each run.
-        functions: the columns that functions of the user calculate.
-        task: what every worker gets.
-        at_once: how many variants may be under way, because of `max_instances`; None: any number.
-        found: the rows that are in the folder already, by their id.
-    """
-
-    wanted: Wanted
-    folder: SweepFolder
-    plan: RunPlan
-    columns: tuple[str, ...]
-    functions: OwnReductions
-    task: bytes
-    at_once: int | None
-    found: dict[str, Row]
+    wanted: Wanted  # what was asked
+    folder: SweepFolder  # where everything goes
+    plan: RunPlan  # the plan of a variant, for what all have in common
+    columns: tuple[str, ...]  # what is calculated from the curves of each run
+    functions: OwnReductions  # the columns that functions of the user calculate
+    task: bytes  # what every worker gets
+    at_once: int | None  # how many variants may be under way, because of `max_instances`; None: any number
+    found: dict[str, Row]  # the rows that are in the folder already, by their id
 
 
 @takes(SweepOptions)
 def planned_sweep(
     mesh: Mesh | str | Path, vary: Mapping[str, Any] | Iterable[Mapping[str, Any]], options: SweepOptions
 ) -> PlannedSweep:
-    """Plan a sweep.
-
-    Args:
-        mesh: the mesh, or its configuration file.
-        vary: values by the name of a parameter, or the parameters of each variant.
-        options: see `SweepOptions`.
-
-    Raises:
-        ConfigurationError: the mesh, a parameter, or a column is wrong; or the folder holds another sweep.
-    """
+    """Plan a sweep; arguments and errors are those of `sweep`."""
     own = mesh if isinstance(mesh, Mesh) else load(mesh)
     variants = variants_of(vary, options.sampler, options.seed)
     _check_names(own, list(variants[0]))
@@ -90,9 +70,8 @@ def planned_sweep(
     base = {name: given[name] for name in _OF_EACH_RUN if name in given}
     folder = SweepFolder(Path(options.folder).absolute() if options.folder is not None else _usual_folder(own, base))
     if options.resume and options.force:
-        raise CallRefused(
-            "`resume=True` keeps the runs of the folder, and `force=True` removes them", hint="Choose one of them."
-        )
+        text = "`resume=True` keeps the runs of the folder, and `force=True` removes them"
+        raise CallRefused(text, hint="Choose one of them.")
     errors = []
     if is_sweep(folder.path) and not (options.resume or options.force):
         hint = "Continue it with `resume=True`, replace it with `force=True`, or choose another folder."
@@ -183,10 +162,10 @@ def _check_names(mesh: Mesh, names: Sequence[str]) -> None:
         if first in mesh.instances and dot and rest:
             continue
         if first not in sections:
-            found = f"'{name}' is neither a variable of an instance nor a key of the configuration"
+            found = f"'{name}' is neither a variable of an instance nor a key of the configuration."
             near = nearest(first, [*mesh.instances, *sections])
             there = f"There are the instances {listed(mesh.instances)}."
-            raise ConfigurationError(f"{found}.", hint=f"Did you mean '{near}{dot}{rest}'?" if near else there)
+            raise ConfigurationError(found, hint=meant(near and f"{near}{dot}{rest}", there))
 
 
 def _any_plan(mesh: Mesh, base: Mapping[str, Any], wanted: Wanted, tell: Callable[[str], None] = log.info) -> RunPlan:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..api.result import Result
 from ..config.findings import Findings
 from ..errors import CallRefused, ConfigurationError
-from ..text import listed, nearest
+from ..text import listed, meant, nearest
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue, VariableType, is_text
 
@@ -30,20 +30,12 @@ _ULPS = 4
 
 
 class Reduction(msgspec.Struct, frozen=True):
-    """One value of one recorded variable.
+    """One value of one recorded variable."""
 
-    Attributes:
-        text: as it was written; also the name of the column.
-        function: one of `first`, `last`, `min`, `max`, `mean`, `std`, `rms`, `span`, `integral`, `time_of_min`,
-            `time_of_max`, `at`.
-        variable: the variable, as `instance.variable`.
-        time: the simulation time of `at` in s.
-    """
-
-    text: str
-    function: str
+    text: str  # as it was written; also the name of the column
+    function: str  # one of `FUNCTIONS`
     variable: str
-    time: float | None = None
+    time: float | None = None  # the simulation time of `at` in s
 
 
 def read_reduction(text: str) -> Reduction:
@@ -72,7 +64,7 @@ def read_reduction(text: str) -> Reduction:
         name = found[1] if found is not None else text.partition("(")[0].strip()
         near = nearest(name, FUNCTIONS) or ("last" if found is None else None)
         inner = found[2] if found is not None else text if "(" not in text else "pendulum.a"
-        hint = f"Did you mean '{near}({inner})'?" if near else f"There are: {', '.join(FUNCTIONS)}."
+        hint = meant(near and f"{near}({inner})", f"There are: {', '.join(FUNCTIONS)}.")
         raise ConfigurationError(f"'{text}' is no reduction.", hint=hint)
     function, variable, time = found[1], found[2].strip(), None
     if function == "at":

@@ -77,18 +77,12 @@ class SlurmJob(msgspec.Struct, frozen=True):
     Example:
         >>> SlurmJob("4711", Path("damping/sweep.sbatch"), tasks=8).log(3)
         PosixPath('damping/slurm-3.log')
-
-    Attributes:
-        id: number of the job, as `squeue --jobs` and `scancel` take it.
-        script: its batch script, in the folder that also has the logs.
-        tasks: how many tasks it has; they are numbered from 1.
-        cluster: name of the cluster, if `sbatch` has named one.
     """
 
-    id: str
-    script: Path
-    tasks: int
-    cluster: str | None = None
+    id: str  # number of the job, as `squeue --jobs` and `scancel` take it
+    script: Path  # its batch script, in the folder that also has the logs
+    tasks: int  # they are numbered from 1
+    cluster: str | None = None  # name of the cluster, if `sbatch` has named one
 
     def log(self, task: int) -> Path:
         """The file with what a task has printed."""
@@ -101,18 +95,13 @@ class EndedTask(NamedTuple):
     Example:
         >>> print(EndedTask(3, "TIMEOUT", Path("damping/slurm-3.log"), "error: *** CANCELLED DUE TO TIME LIMIT ***"))
         task 3: TIMEOUT; the last line of 'damping/slurm-3.log': error: *** CANCELLED DUE TO TIME LIMIT ***
-
-    Attributes:
-        task: its number.
-        state: the state of Slurm, such as FAILED, TIMEOUT, NODE_FAIL or OUT_OF_MEMORY; None if it is not known.
-        log: the file with what it has printed.
-        last_line: the last line there; None if there is no such file.
     """
 
     task: int
+    # the state of Slurm, such as FAILED, TIMEOUT, NODE_FAIL or OUT_OF_MEMORY; None if it is not known
     state: str | None
-    log: Path
-    last_line: str | None
+    log: Path  # the file with what it has printed
+    last_line: str | None  # the last line there; None if there is no such file
 
     def __str__(self) -> str:
         if self.last_line is None:
@@ -222,7 +211,7 @@ def cancel(job: SlurmJob) -> None:
 
 
 def _check_option(option: str) -> None:
-    """Check that an option can be a line of the script, and does not belong to the sweep."""
+    """Refuse an option that cannot be a line of the script, or belongs to the sweep."""
     if not option.startswith("-") or not option.isprintable():
         hint = "Write it as `sbatch` takes it, such as --slurm-option=--partition=short."
         raise ConfigurationError(f"{option!r} is no option of `sbatch`", hint=hint)
@@ -267,13 +256,12 @@ def _accounted(job: SlurmJob) -> dict[int, str]:
     except FmuMeshError:
         return {}
     found = re.finditer(rf"^{job.id}_(\d+)\|([A-Z_]+)[^|]*\|(\d+):(\d+)$", printed if not code else "", re.MULTILINE)
-    return {int(match[1]): f"{match[2]}{_how(match[3], match[4])}" for match in found if match[2] in _ENDED}
-
-
-def _how(code: str, number: str) -> str:
-    if number != "0":
-        return f" by signal {number}"
-    return f" with exit code {code}" if code != "0" else ""
+    states = {}
+    for task, state, exit_code, number in (match.groups() for match in found):
+        how = f" by signal {number}" if number != "0" else f" with exit code {exit_code}" if exit_code != "0" else ""
+        if state in _ENDED:
+            states[int(task)] = f"{state}{how}"
+    return states
 
 
 def _last_line(log: Path) -> str | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -22,7 +23,7 @@ from .slurm import PART, SlurmJob, ended_tasks, submit, unfinished
 from .sweeping import Sweep
 from .variant_run import path_of
 
-__all__ = ["SlurmOptions", "SlurmSweep"]
+__all__ = ["SlurmSweep"]
 
 _JOB: Final = "slurm.json"
 # A shared file system shows a new file after about a second, and each look costs its server something.
@@ -33,40 +34,28 @@ _SILENCE_S: Final = 600.0
 _SHOWN: Final = 3
 
 
-class SlurmOptions(msgspec.Struct, frozen=True):
-    """How a sweep is given to Slurm.
-
-    Attributes:
-        tasks: number of tasks of the array, at most.
-        workers: processes of each task, which asks for so many processors.
-        options: more options of `sbatch`, such as `--partition=short`.
-    """
-
-    tasks: int = 16
-    workers: int = 1
-    options: tuple[str, ...] = ()
-
-
 class SlurmSweep(Sweep):
     """A sweep whose variants run in the tasks of an array of jobs; all hosts share its folder.
 
-    To leave it, or to interrupt it, leaves the tasks as they are.
-
-    Attributes:
-        job: the array of jobs; None if nothing is missing.
+    To leave it, or to interrupt it, leaves the tasks as they are. There are at most so many ``tasks``; each asks for
+    one processor for each of its ``workers``. ``options`` are more options of `sbatch`, such as `--partition=short`.
 
     Raises:
         ConfigurationError: Slurm refuses it, or is not installed.
         DeadlineExceeded: Slurm does not answer.
     """
 
-    def __init__(self, planned: PlannedSweep, options: SlurmOptions) -> None:
+    def __init__(
+        self, planned: PlannedSweep, *, tasks: int = 16, workers: int = 1, options: Sequence[str] = ()
+    ) -> None:
         super().__init__(planned)
         if planned.functions:
             raise ConfigurationError("functions of a program cannot be columns of a sweep by Slurm.")
         planned.folder.begin(planned.wanted)
         self._note = planned.folder.path / _JOB
-        self.job = self._submitted_before() or (self._submit(options) if self._waiting else None)
+        self.job = self._submitted_before()  # None if nothing is missing
+        if self.job is None and self._waiting:
+            self.job = self._submit(min(tasks, len(self._waiting)), workers, options)
         self._thread.start()
 
     def _submitted_before(self) -> SlurmJob | None:
@@ -77,16 +66,15 @@ class SlurmSweep(Sweep):
             return None
         return None if unfinished(job) == 0 else job
 
-    def _submit(self, options: SlurmOptions) -> SlurmJob:
-        planned, tasks = self._planned, min(options.tasks, len(self._waiting))
-        at_once = None
+    def _submit(self, tasks: int, workers: int, options: Sequence[str]) -> SlurmJob:
+        planned, at_once = self._planned, None
         if planned.at_once is not None:
-            at_once = planned.at_once // options.workers
+            at_once = planned.at_once // workers
             if not at_once:
-                text = f"{options.workers} workers of a task need more instances of a model than may exist"
+                text = f"{workers} workers of a task need more instances of a model than may exist"
                 raise ConfigurationError(text, hint="Give each task fewer workers.")
         command = [sys.executable, "-Pm", "fmu_mesh", "sweep", str(planned.folder.path), "--part", PART]
-        command += ["--workers", str(options.workers), "--no-progress"]
+        command += ["--workers", str(workers), "--no-progress"]
         if planned.wanted.options.get("allow_code") or not planned.plan.loaded.foreign:  # the tasks see only the folder
             command.append("--allow-code")
         job = submit(
@@ -95,8 +83,8 @@ class SlurmSweep(Sweep):
             name=self.mesh,
             tasks=tasks,
             at_once=at_once,
-            cpus=options.workers,
-            options=options.options,
+            cpus=workers,
+            options=options,
         )
         self._note.write_bytes(msgspec.json.encode(job, enc_hook=str))
         return job
@@ -107,7 +95,6 @@ class SlurmSweep(Sweep):
                 self._follow(self.job)
 
     def _follow(self, job: SlurmJob) -> None:
-        """Read the rows until no task is left."""
         left: int | None = job.tasks
         answered = asked = time.monotonic()
         while self._left and left != 0 and not self._cancelled.wait(_FOLDER_CHECK_S):

@@ -19,7 +19,7 @@ import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,26 +39,17 @@ _CURVES: Final = "runs"
 
 
 class Wanted(Common, frozen=True, kw_only=True):
-    """What was asked: `sweep.json`.
-
-    Attributes:
-        mesh: name of the mesh.
-        names: names of the parameters.
-        variants: for each variant the values of the parameters, in this order.
-        recorded: names of the recorded variables.
-        identities: the id of each variant.
-        units: unit of each recorded variable and of each parameter; None without one.
-        curves: whether the curves of each run are kept.
-        most_instances: by the name of a model file, how many instances there may be at a time.
-    """
+    """What was asked: `sweep.json`."""
 
     mesh: str
     names: tuple[str, ...]
-    variants: tuple[tuple[Any, ...], ...]
+    variants: tuple[tuple[Any, ...], ...]  # for each variant the values of the parameters, in this order
     recorded: tuple[str, ...] = ()
+    # unit of each recorded variable and of each parameter; None without one
     units: dict[str, str | None] = msgspec.field(default_factory=dict)
-    identities: tuple[str, ...] = ()
-    curves: bool = True
+    identities: tuple[str, ...] = ()  # the id of each variant
+    curves: bool = True  # whether the curves of each run are kept
+    # by the name of a model file, how many instances there may be at a time
     most_instances: dict[str, int] = msgspec.field(default_factory=dict)
 
     def parameters(self, number: int) -> Parameters:
@@ -67,13 +58,7 @@ class Wanted(Common, frozen=True, kw_only=True):
 
 
 class SweepFolder:
-    """One folder, which may not exist yet; see above.
-
-    Attributes:
-        table: the file of the table.
-        curves: the folder of the curves.
-        wanted_file: the file that says what was asked.
-    """
+    """One folder, which may not exist yet; see above."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -124,19 +109,14 @@ class SweepFolder:
             rows |= {row.id: row for row in _lines(file)}
         return rows
 
-    @contextmanager
-    def writing(self, part: int | None = None) -> Iterator[RowFile]:
-        """In the block, rows can be added; one process at a time may do so for each part."""
+    def writing(self, part: int | None = None) -> closing[RowFile]:
+        """For a block in which rows can be added; one process at a time may do so for each part."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise self._unwritable(error) from error
         name = _ROWS if part is None else f"{_ROWS}-{part}"
-        file = RowFile(self.path / f"{name}.jsonl")
-        try:
-            yield file
-        finally:
-            file.close()
+        return closing(RowFile(self.path / f"{name}.jsonl"))
 
     def _unwritable(self, error: OSError) -> ConfigurationError:
         return ConfigurationError(f"the folder '{self.path}' cannot be written: {error.strerror}")

@@ -93,7 +93,6 @@ class SweepResult(Sequence[SweepRow]):
         """Read the folder of a sweep, which may still go on.
 
         Example:
-            >>> import fmu_mesh
             >>> options = {"stop_time": 1.0, "folder": "results/to_read"}
             >>> with fmu_mesh.sweep("configs/pendulum_delay.yaml", {"pendulum.d": [0.1, 0.2]}, **options) as running:
             ...     result = running.wait()
@@ -177,7 +176,6 @@ class SweepResult(Sequence[SweepRow]):
         """The curves of all runs as one data frame, with `variant` and `time` as its index; not of those that failed.
 
         Example:
-            >>> import fmu_mesh
             >>> options = {"stop_time": 1.0, "folder": "results/frame"}
             >>> with fmu_mesh.sweep("configs/pendulum_delay.yaml", {"pendulum.d": [0.1, 0.2]}, **options) as running:
             ...     frame = running.wait().curves_to_pandas("pendulum.a")
@@ -269,9 +267,8 @@ class SweepResult(Sequence[SweepRow]):
             ConfigurationError: matplotlib is not installed.
         """
         if len(self.names) < 2 and (x is None or y is None):
-            raise CallRefused(
-                "a heat map needs two parameters, and this sweep has one", hint="`plot` draws its curves."
-            )
+            text = "a heat map needs two parameters, and this sweep has one"
+            raise CallRefused(text, hint="`plot` draws its curves.")
         axes = [(self._axis(name), self.values(name)) for name in (x or self.names[0], y or self.names[1])]
         values = [None if value is None or isinstance(value, str) else float(value) for value in self.values(column)]
         return heat_map_figure(title or self._wanted.mesh, axes[0], axes[1], (column, values))
@@ -285,8 +282,7 @@ class SweepResult(Sequence[SweepRow]):
         return VariantCurve(result.times, result[name], colour)
 
     def _axis(self, name: str) -> str:
-        unit = self._wanted.units.get(name)
-        return in_unit(name, unit or "")
+        return in_unit(name, self._wanted.units.get(name) or "")
 
     def _row(self, number: int, row: Row) -> SweepRow:
         return SweepRow(

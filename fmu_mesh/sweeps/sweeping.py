@@ -209,7 +209,6 @@ class Sweep(ABC):
         return f"{done} of {total} runs are in '{self.folder}'; `resume=True` runs the others."
 
     def _take(self, row: Row) -> None:
-        """Count the row of a variant that has ended."""
         self._rows[row.id] = row
         self._left -= 1
         self._failed += row.exit_code != 0

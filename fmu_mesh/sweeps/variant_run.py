@@ -19,9 +19,10 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -43,67 +44,46 @@ _GROWTH_BYTES = 256 * 2**20
 Cell = float | int | bool | str | None
 """One value of the table."""
 
+_Jobs = SimpleQueue[tuple[dict[str, Any], Future[Result]] | None]
+"""Options of a run, and who waits for its result; None at the end."""
+
 OwnReductions = Mapping[str, Callable[[Result], object]]
 """Functions of the user by the name of their column."""
 
 
 class Common(msgspec.Struct, frozen=True, kw_only=True):
-    """What all variants of a sweep have in common.
+    """What all variants of a sweep have in common."""
 
-    Attributes:
-        version: that of fmu_mesh, which all workers must have.
-        file: the file of the configuration, absolute.
-        data: the values of the configuration.
-        options: the options of each run that have another value than their default.
-        reductions: columns that are calculated from the curves of each run.
-        processes: whether each run starts processes, as `launch` does.
-        reset: whether instances are reset between two runs, and not made anew.
-    """
-
-    version: str
-    file: str
-    data: Any
-    options: dict[str, Any]
-    reductions: tuple[str, ...] = ()
-    processes: bool = False
-    reset: bool = False
+    version: str  # that of fmu_mesh, which all workers must have
+    file: str  # the file of the configuration, absolute
+    data: Any  # the values of the configuration
+    options: dict[str, Any]  # the options of each run that have another value than their default
+    reductions: tuple[str, ...] = ()  # columns that are calculated from the curves of each run
+    processes: bool = False  # whether each run starts processes, as `launch` does
+    reset: bool = False  # whether instances are reset between two runs, and not made anew
 
 
 class SweepTask(Common, frozen=True, kw_only=True):
-    """What every worker gets.
+    """What every worker gets."""
 
-    Attributes:
-        folder: for the curves of each run; None: they are not kept.
-        foreign: as in `PlainConfig`.
-    """
-
-    folder: Path | None = None
-    foreign: str = ""
+    folder: Path | None = None  # for the curves of each run; None: they are not kept
+    foreign: str = ""  # as in `PlainConfig`
 
 
 class Row(msgspec.Struct, frozen=True):
-    """How one variant ended: a row of the table.
+    """How one variant ended: a row of the table."""
 
-    Attributes:
-        id: SHA-256 of the configuration, the parameters, and the files of all models.
-        exit_code: 0, or that of `launch` for the same error.
-        message: why it failed, or what its result warns of; empty if there is nothing to say.
-        values: by the name of the column, what was calculated from its curves; None where there is nothing.
-        seconds: wall-clock time of the run in s, with its planning.
-        worker: host and process id of the worker.
-        spent: whether the worker is to be replaced: an FMU has not returned, or has crashed while it was closed, or
-            the process has grown, because an FMU does not free its memory.
-        machine: what the last digits of results depend on, on the host of the worker.
-    """
-
-    id: str
-    exit_code: int
-    message: str
+    id: str  # SHA-256 of the configuration, the parameters, and the files of all models
+    exit_code: int  # 0, or that of `launch` for the same error
+    message: str  # why it failed, or what its result warns of; empty if there is nothing to say
+    # by the name of the column, what was calculated from its curves; None where there is nothing
     values: dict[str, Cell]
-    seconds: float
-    worker: str
+    seconds: float  # wall-clock time of the run in s, with its planning
+    worker: str  # host and process id of the worker
+    # whether the worker is to be replaced: an FMU has not returned, or has crashed while it was closed, or the
+    # process has grown, because an FMU does not free its memory
     spent: bool = False
-    machine: str = ""
+    machine: str = ""  # what the last digits of results depend on, on the host of the worker
 
 
 def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], parameters: Parameters) -> dict[str, Any]:
@@ -115,11 +95,7 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
 
 
 def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
-    """Run one variant. Called in a worker, by whichever executor.
-
-    Returns:
-        The row; also of a run that failed.
-    """
+    """Run one variant. Called in a worker, by whichever executor; a run that failed has a row, too."""
     own = _mine.loaded_for(task)
     started = time.perf_counter()
     values: dict[str, Cell] = {}
@@ -139,7 +115,7 @@ def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters
         values=values,
         seconds=time.perf_counter() - started,
         worker=f"{socket.gethostname()}:{os.getpid()}",
-        spent=own.stuck or own.has_grown(),
+        spent=own.hung.stuck or own.has_grown(),
         machine=", ".join(machine().values()),
     )
 
@@ -151,7 +127,7 @@ class _Mine(threading.local):
         self._loaded: _Loaded | None = None
 
     def loaded_for(self, task: bytes) -> _Loaded:
-        if self._loaded is None or self._loaded.task != task or self._loaded.stuck:
+        if self._loaded is None or self._loaded.task != task or self._loaded.hung.stuck:
             self._loaded = _Loaded(task)
         return self._loaded
 
@@ -170,19 +146,12 @@ class _Loaded:
         if isinstance(data, dict) and isinstance(records := data.get("record"), list):
             data = {**data, "record": records[:1]}  # variants must not write into the same files
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
-        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
+        self._jobs: _Jobs = SimpleQueue()
         self.hung = _Hung()
         self._bytes = 0
-        arguments = self._mesh, self._jobs, self.hung
-        threading.Thread(
-            target=_work, args=arguments, kwargs={"reset": self._task.reset}, name="variants", daemon=True
-        ).start()
+        work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset)
+        threading.Thread(target=work, name="variants", daemon=True).start()
         weakref.finalize(self, self._jobs.put, None)
-
-    @property
-    def stuck(self) -> bool:
-        """Whether its thread is inside an FMU that does not return."""
-        return self.hung.stuck
 
     def has_grown(self) -> bool:
         """Whether this process has more than twice the memory that it had after its first run."""
@@ -201,13 +170,12 @@ class _Loaded:
             options["record"] = "memory"
         if not task.processes:
             ended: Future[Result] = Future()
-            self._jobs.put(_Job(options, ended))
+            self._jobs.put((options, ended))
             with suppress(NotInOneProcess):  # a parameter may be the path of a model
                 return ended.result()
         return self._mesh.run(**options)
 
     def values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
-        """What the row of a variant has of its result."""
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
         for name, function in functions.items():
             try:
@@ -218,24 +186,13 @@ class _Loaded:
         return values
 
 
-class _Job(NamedTuple):
-    options: dict[str, Any]
-    ended: Future[Result]
-
-
 class _Hung:
-    """Tells whoever waits for a run that an FMU does not return.
-
-    Attributes:
-        ended: the run under way.
-        stuck: whether it has not returned.
-        warning: why, if the run was over before.
-    """
+    """Tells whoever waits for a run that an FMU does not return."""
 
     def __init__(self) -> None:
-        self.ended: Future[Result] = Future()
-        self.stuck = False
-        self.warning = ""
+        self.ended: Future[Result] = Future()  # the run under way
+        self.stuck = False  # whether it has not returned
+        self.warning = ""  # why, if the run was over before
         self._end: Result | BaseException | None = None
 
     def begin(self, ended: Future[Result]) -> None:
@@ -256,17 +213,18 @@ class _Hung:
             self.ended.set_result(end)
 
 
-def _work(mesh: Mesh, jobs: SimpleQueue[_Job | None], hung: _Hung, *, reset: bool) -> None:
+def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
     own = mesh.from_configuration(mesh.configuration, keeps_code=True)
     with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
-            hung.begin(job.ended)
+            options, ended = job
+            hung.begin(ended)
             try:
-                job.ended.set_result(runs.run(**job.options))
+                ended.set_result(runs.run(**options))
             except BaseException as error:  # noqa: BLE001  whoever waits gets it
                 if not hung.stuck:
-                    job.ended.set_exception(error)
+                    ended.set_exception(error)
 
 
 def curves_of(folder: Path, identity: str) -> Path:

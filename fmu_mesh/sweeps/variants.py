@@ -20,7 +20,7 @@ from ..config.plain_values import plain
 from ..config.yaml_text import read
 from ..errors import CallRefused, ConfigurationError
 from ..installing import importing
-from ..text import listed, nearest, shown
+from ..text import listed, meant, nearest, shown
 from ..variables.value_types import PlainValue
 
 __all__ = ["MAX_VARIANTS", "SAMPLERS", "Parameters", "Range", "Values", "grid", "read_values", "sampled", "variants_of"]
@@ -255,7 +255,7 @@ def _shares(sampler: str, dimensions: int, seed: object) -> NDArray[np.float64]:
     name, count = (found[1], int(found[2])) if found is not None else (sampler.partition(":")[0], 0)
     if name not in SAMPLERS:
         near = nearest(name, SAMPLERS)
-        hint = f"Did you mean '{near}:{count or 64}'?" if near else f"There are {listed([*SAMPLERS])}, as in lhs:64."
+        hint = meant(near and f"{near}:{count or 64}", f"There are {listed([*SAMPLERS])}, as in lhs:64.")
         raise ConfigurationError(f"there is no sampler '{sampler}'.", hint=hint)
     if not 0 < count <= MAX_VARIANTS:
         raise ConfigurationError(f"the sampler '{sampler}' has no count from 1 to {MAX_VARIANTS}, as in {name}:64.")
@@ -276,12 +276,9 @@ def _shares(sampler: str, dimensions: int, seed: object) -> NDArray[np.float64]:
 
 def _scaled(span: Range, shares: NDArray[np.float64]) -> NDArray[np.float64]:
     """The values of a range that have these shares of it below them."""
-    if span.scale == "log":
-        values = span.low * (span.high / span.low) ** shares
-    else:
-        values = span.low + shares * (span.high - span.low)
-    # Rounding must not lead outside.
-    return np.clip(values, min(span.low, span.high), max(span.low, span.high))
+    low, high = span.low, span.high
+    values = low * (high / low) ** shares if span.scale == "log" else low + shares * (high - low)
+    return np.clip(values, min(low, high), max(low, high))  # rounding must not lead outside
 
 
 # --- what a program gives
@@ -340,8 +337,5 @@ def _listed_variants(given: Sequence[object]) -> list[Parameters]:
 
 def _once(names: Iterable[str], rows: Iterable[Sequence[PlainValue]]) -> list[Parameters]:
     """The rows as variants, without those that came before. The types count: 1 and 1.0 are different values."""
-    kept: dict[str, Parameters] = {}
-    names = [*names]
-    for row in rows:
-        kept.setdefault(repr(row), dict(zip(names, row, strict=True)))
-    return [*kept.values()]
+    names, different = [*names], {repr(row): row for row in rows}
+    return [dict(zip(names, row, strict=True)) for row in different.values()]

@@ -115,21 +115,16 @@ class _Job(NamedTuple):
 
 
 class _Worker:
-    """One process and its successors.
-
-    Attributes:
-        jobs: what it has to do, the job that runs first.
-    """
+    """One process and its successors."""
 
     def __init__(self) -> None:
-        self.jobs: deque[_Job] = deque()
+        self.jobs: deque[_Job] = deque()  # what it has to do, the job that runs first
         self._changing = threading.RLock()
         self._closed = False
         self._renew()
 
     @property
     def pid(self) -> int | None:
-        """The process id; None if it has not started."""
         started = self._context.started
         return started[-1].pid if started else None
 
@@ -155,11 +150,11 @@ class _Worker:
     def shutdown(self, *, wait: bool, now: bool) -> None:
         with self._changing:
             self._closed = True
-            jobs = list(self.jobs) if now else []
+            jobs = list(self.jobs)
         if now:
             self._context.kill()
-        for job in jobs:
-            job.future.cancel()
+            for job in jobs:
+                job.future.cancel()
         self._pool.shutdown(wait=wait, cancel_futures=now)
 
     def _renew(self) -> None:

@@ -23,7 +23,7 @@ from fmu_mesh.errors import ConfigurationError, DeadlineExceeded
 from fmu_mesh.sweeps import slurm
 from fmu_mesh.sweeps.planned_sweep import planned_sweep
 from fmu_mesh.sweeps.slurm import PART, SlurmJob, cancel, ended_tasks, submit, unfinished
-from fmu_mesh.sweeps.slurm_sweep import SlurmOptions, SlurmSweep
+from fmu_mesh.sweeps.slurm_sweep import SlurmSweep
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
 from fmu_mesh.sweeps.variant_run import Row
 from tests.helpers import Launched, Place, wait_until
@@ -593,7 +593,7 @@ def test_the_tasks_of_a_sweep_may_run_its_code(fake: Fake, tmp_path: Path) -> No
     mesh.add("gate", python=tmp_path / "gate.py:Gate")
     planned = planned_sweep(mesh, {"gate.number": [1.0, 2.0]}, folder=tmp_path / "held")
 
-    with SlurmSweep(planned, SlurmOptions(tasks=1)) as sweep:
+    with SlurmSweep(planned, tasks=1) as sweep:
         assert sweep.again.endswith("held --slurm --allow-code")
 
     script = (tmp_path / "held" / "sweep.sbatch").read_text(encoding="utf-8")

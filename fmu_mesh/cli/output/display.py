@@ -103,14 +103,10 @@ class Display:
 
     def _warn(self) -> None:
         """Warn if other hosts can reach it."""
-        config = self._plan.system.config
-        if (
-            not self._quiet
-            and config.zenoh.mode == "peer"
-            and (wide := ", ".join(filter(leaves_host, config.zenoh.listen)))
-        ):
-            text = f"warning: whoever can reach this host at {wide} can read, set and end this mesh"
-            self._print(text, "yellow")
+        zenoh = self._plan.system.config.zenoh
+        wide = ", ".join(filter(leaves_host, zenoh.listen)) if zenoh.mode == "peer" else ""
+        if wide and not self._quiet:
+            self._print(f"warning: whoever can reach this host at {wide} can read, set and end this mesh", "yellow")
 
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
@@ -137,10 +133,10 @@ class Display:
         """Show the messages that are held back, except those in the text of ``error``."""
         told = error.partition("the FMU says: ")[2]
         self._held = deque(line for line in self._held if line.message not in told)
-        self._release(lambda _line: True)
+        self._release()
 
-    def _release(self, may_go: Callable[[LogLine], bool]) -> None:
-        """Show the messages for which ``may_go`` is true."""
+    def _release(self, may_go: Callable[[LogLine], bool] = lambda _line: True) -> None:
+        """Show the messages that are held back, all of them or those for which ``may_go`` is true."""
         held, self._held = self._held, deque()
         for line in held:
             if may_go(line):
@@ -170,7 +166,7 @@ class Display:
         if status.state in ("running", "paused", "stopping", "done"):
             self._show_address()
         if status.state == "paused":
-            self._release(lambda _line: True)
+            self._release()
         elif self._held:
             self._release(lambda line: status.progress[self._plan.node_of(line.instance)] > line.point)
 

@@ -57,9 +57,8 @@ def _rows(node: NodeProfile) -> Iterator[list[str]]:
     of_node = [share(node.transport_s), share(node.waited_s), share(_other_s(node)), waits]
     for number, unit in enumerate(node.units):
         own = [", ".join(unit.instances), str(unit.steps), f"{unit.steps / seconds:.0f}"]
-        first = number == 0
-        name, time = (node.node, f"{node.seconds:.3f} s") if first else ("", "")
-        yield [name, *own, time, share(unit.compute_s), *(of_node if first else [""] * len(of_node))]
+        name, time, others = ("", "", [""] * len(of_node)) if number else (node.node, f"{node.seconds:.3f} s", of_node)
+        yield [name, *own, time, share(unit.compute_s), *others]
 
 
 def _share(part_s: float, seconds: float) -> str:
@@ -81,15 +80,14 @@ def critical_path(plan: Plan, profile: MeshProfile) -> list[str]:
     while name is not None:
         node = nodes[name]
         if name in seen:
-            together = seen[seen.index(name) :]
-            by_window = any(_main_reason(nodes[own])[0] == GRANT for own in together)
-            busiest = max(
-                (nodes[own] for own in together), key=lambda own: (own.compute_s + own.transport_s) / own.seconds
-            )
-            window = f"the window of {plan.window} points holds them together; the busiest of them is '{busiest.node}'"
-            names = " and ".join(f"'{own}'" for own in together)
-            round_trip = f"{names} wait for each other: the messages between them set the pace"
-            lines.append(f"{window}: {_work(busiest)}" if by_window else round_trip)
+            together = [nodes[own] for own in seen[seen.index(name) :]]
+            if any(_main_reason(own)[0] == GRANT for own in together):
+                busiest = max(together, key=lambda own: (own.compute_s + own.transport_s) / own.seconds)
+                window = f"the window of {plan.window} points holds them together"
+                lines.append(f"{window}; the busiest of them is '{busiest.node}': {_work(busiest)}")
+            else:
+                names = " and ".join(f"'{own.node}'" for own in together)
+                lines.append(f"{names} wait for each other: the messages between them set the pace")
             break
         seen.append(name)
         reason, part_s = _main_reason(node)

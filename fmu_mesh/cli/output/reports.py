@@ -34,36 +34,21 @@ class ReportedFile(msgspec.Struct, frozen=True):
 
 
 class RunReport(msgspec.Struct, frozen=True):
-    """The output of `launch --json` and `run --json`.
+    """The output of `launch --json` and `run --json`."""
 
-    Attributes:
-        mesh: name of the mesh; None if the configuration cannot be read.
-        state: whether the run has ended well.
-        exit_code: that of the command.
-        point: the last point that all instances reached.
-        time: the simulation time of that point in s.
-        seconds: wall-clock time from the first grant to the last point in s.
-        rows: number of rows in the first result file.
-        file: the first result file; None if nothing was recorded.
-        restarts: how often the run was started again.
-        error: why it failed.
-        ended_by: what ended the simulation before its last point although nothing failed.
-        files: all result files, each with its number of rows.
-        warnings: what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended.
-    """
-
-    mesh: str | None
-    state: Literal["done", "failed"]
+    mesh: str | None  # name of the mesh; None if the configuration cannot be read
+    state: Literal["done", "failed"]  # whether the run has ended well
     exit_code: int
-    point: int = 0
-    time: float = 0.0
-    seconds: float = 0.0
-    rows: int = 0
-    file: str | None = None
-    restarts: int = 0
-    error: Failure | None = None
-    ended_by: ErrorReport | None = None
-    files: tuple[ReportedFile, ...] = ()
+    point: int = 0  # the last point that all instances reached
+    time: float = 0.0  # the simulation time of that point in s
+    seconds: float = 0.0  # wall-clock time from the first grant to the last point in s
+    rows: int = 0  # number of rows in the first result file
+    file: str | None = None  # the first result file; None if nothing was recorded
+    restarts: int = 0  # how often the run was started again
+    error: Failure | None = None  # why it failed
+    ended_by: ErrorReport | None = None  # what ended the simulation before its last point although nothing failed
+    files: tuple[ReportedFile, ...] = ()  # all result files, each with its number of rows
+    # what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended
     warnings: tuple[str, ...] = ()
 
 

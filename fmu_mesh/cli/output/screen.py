@@ -82,9 +82,7 @@ class Screen:
                 return False
             if self._keys in ready:
                 pressed = os.read(self._keys, 64) if self._keys is not None else b""
-                if not pressed:  # the terminal is gone
-                    return True
-                if any(key in _QUIT for key in pressed):
+                if not pressed or any(key in _QUIT for key in pressed):  # without any, the terminal is gone
                     return True
         return False
 
