@@ -35,6 +35,7 @@ class KeptModels:
     def __init__(self, folder: Path, *, resets: bool = False) -> None:
         self.folder = folder
         self.resets = resets
+        self.loads = 0  # how many models were not kept, and so are loaded
         self._models: dict[str, KeptModel] = {}
 
     def take(self, name: str, key: Hashable) -> KeptModel | None:
@@ -42,7 +43,8 @@ class KeptModels:
         found = self._models.pop(name, None)
         if found is not None and found.key != key:
             found.close()
-            return None
+            found = None
+        self.loads += found is None
         return found
 
     def keep(self, name: str, model: KeptModel) -> None:

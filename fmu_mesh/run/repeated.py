@@ -250,10 +250,10 @@ class _Run:
         with ExitStack() as stack:
             stack.callback(self._forget)
             memory = HostMemory.private(self._node.memory, _NODE)
-            threads.limit()
+            threads.limit(self._around.models.loads)
             self._open(memory, watch, stack)
             stack.push(self._tell_end)
-            threads.limit()  # with the libraries that a component has imported
+            threads.limit(self._around.models.loads)  # with the libraries that a component has imported
             stack.callback(self.writer.close)  # before the instances are closed
             engine = self._initialize(memory)
             self.writer.begin(self._plan, self._runners)

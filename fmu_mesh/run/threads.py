@@ -7,8 +7,8 @@ variables have to be set before numpy is imported.
 
 from __future__ import annotations
 
-import ctypes
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from threading import Lock
@@ -64,44 +64,21 @@ def one_thread_meanwhile() -> Iterator[None]:
 class LimitedThreads:
     """As `one_thread_meanwhile`, from the first `limit` to `close`, for many runs: to look for libraries takes long."""
 
+    # That there are new ones is told by who loads them: imports of Python, and models. The dynamic linker counts them
+    # as well (dl_iterate_phdr), but it calls back under its lock, and the callback would wait for the interpreter,
+    # whose lock another thread has that waits for the linker, as `ctypes.CDLL` does.
+
     def __init__(self) -> None:
         self._stack = ExitStack()
-        self._seen = -1
+        self._seen = -1, -1
 
-    def limit(self) -> None:
-        """Limit all libraries that are loaded by now, if there are new ones."""
-        if _libraries_loaded() != self._seen:
+    def limit(self, models: int) -> None:
+        """Limit all libraries that are loaded by now, if there are new ones; ``models`` have been loaded so far."""
+        if (len(sys.modules), models) != self._seen:
             self._stack.enter_context(one_thread_meanwhile())
-            self._seen = _libraries_loaded()
+            self._seen = len(sys.modules), models
 
     def close(self) -> None:
         """Lift the limits."""
         self._stack.close()
-        self._seen = -1
-
-
-class _Library(ctypes.Structure):
-    """The first fields of `dl_phdr_info` (dl_iterate_phdr(3))."""
-
-    _fields_ = (
-        ("address", ctypes.c_void_p),
-        ("name", ctypes.c_char_p),
-        ("headers", ctypes.c_void_p),
-        ("n_headers", ctypes.c_uint16),
-        ("loaded", ctypes.c_ulonglong),
-    )
-
-
-_Look = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(_Library), ctypes.c_size_t, ctypes.c_void_p)
-
-
-def _libraries_loaded() -> int:
-    """How many libraries this process has loaded since its start: the dynamic linker counts them."""
-    found: list[int] = []
-
-    def look(library: Any, _size: int, _data: int | None) -> int:  # noqa: ANN401  a pointer of ctypes
-        found.append(library.contents.loaded)
-        return 1  # the first one is enough: the count is that of the process
-
-    ctypes.CDLL(None).dl_iterate_phdr(_Look(look), None)
-    return found[0]
+        self._seen = -1, -1
