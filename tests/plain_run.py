@@ -27,7 +27,6 @@ from fmu_mesh.run.one_process import OneProcess
 from fmu_mesh.run.outcome import Outcome, outcome_at
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.plan import Plan
-from fmu_mesh.system.records import union_of
 from fmu_mesh.variables.value_types import DTYPES, Value
 
 __all__ = ["PlainRun"]
@@ -99,10 +98,9 @@ class PlainRun:
     def _save(self, files: RecordFiles, rows: list[list[Value]]) -> None:
         plan = self._plan
         layouts = {name: Layout.of(own.description.variables) for name, own in plan.system.instances.items()}
-        columns = union_of(plan.system.records)
+        columns = plan.system.recorded
         places = {column: place for place, column in enumerate(columns)}
         types = [layouts[instance].column(name).type for instance, name in columns]
-        assert columns == plan.system.recorded
         values = [np.array([row[i] for row in rows], dtype=DTYPES[type_]) for i, type_ in enumerate(types)]
 
         def column_of(instance: str, variable: str) -> ReadColumn:

@@ -17,10 +17,11 @@ from collections import deque
 import msgspec
 
 from ..errors import ErrorReport
+from ..instances.contract import LogMessage
 from ..wire.views import LogLine, MeshStatus
 from .outcome import Outcome
 
-__all__ = ["Event", "EventWriter", "Log", "OutputLine", "Reachable", "Restarted", "Status", "decode_event"]
+__all__ = ["Event", "EventWriter", "Log", "OutputLine", "Reachable", "Restarted", "Status", "decode_event", "log_line"]
 
 
 _MOST_WAITING = 10_000
@@ -71,6 +72,12 @@ def decode_event(line: bytes) -> Event:
         msgspec.DecodeError: the line is not an event.
     """
     return _decoder.decode(line)
+
+
+def log_line(message: LogMessage, step_points: int) -> LogLine:
+    """A message of an instance as others see it; its own step is so many points, and it begins at point 0."""
+    point = max(message.step, 0) * step_points
+    return LogLine(message.instance, message.status, message.category, message.message, point)
 
 
 class EventWriter:

@@ -33,8 +33,8 @@ from ..instances.contract import LogMessage
 from ..instances.process_end import end_process, process_ends
 from ..results.record_files import open_results
 from ..wire.runtime import remove_stale_folders, run_folder, run_name
-from ..wire.views import LogLine, MeshStatus
-from .events import Event, Log, Status
+from ..wire.views import MeshStatus
+from .events import Event, Log, Status, log_line
 from .outcome import Outcome, outcome_at
 from .repeated import RepeatedRuns
 from .run_plan import RunPlan
@@ -165,10 +165,7 @@ class InProcessRun:
         self._over.set()
 
     def _log(self, message: LogMessage) -> None:
-        plan = self._run.plan
-        points = plan.nodes[plan.node_of(message.instance)].instance(message.instance).step_points
-        point = max(message.step, 0) * points
-        self._on_event(Log(LogLine(message.instance, message.status, message.category, message.message, point)))
+        self._on_event(Log(log_line(message, self._run.plan.system.instances[message.instance].step_points)))
 
     def _progress(self, point: int) -> None:
         now = time.monotonic()

@@ -30,7 +30,7 @@ from ..wire.keys import Keys
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
-from .events import Event, EventWriter, Log, Reachable, Status
+from .events import Event, EventWriter, Log, Reachable, Status, log_line
 from .one_process import is_other_python
 from .outcome import Outcome, outcome_at
 from .process import RunProcess
@@ -146,10 +146,8 @@ class _NodeProcess:
         return self._guarded[-1]
 
     def _log(self, message: LogMessage) -> None:
-        point = max(message.step, 0) * self._plan.instance(message.instance).step_points
         if self._node is not None:
-            line = LogLine(message.instance, message.status, message.category, message.message, point)
-            self._node.server.log_message(line)
+            self._node.server.log_message(log_line(message, self._plan.instance(message.instance).step_points))
             if message.status in ("error", "fatal"):  # the FMU may end the process next
                 self._node.server.say_everything(heard=True)
 
