@@ -33,7 +33,7 @@ import fmu_mesh
 class Liar(fmu_mesh.Component):
     """\\x1b[2J\\nfmu-mesh: all is well"""
     u = fmu_mesh.Input(description="\\x1b]52;c;Zm9v\\a\\nfmu-mesh: all is well", unit="\\x1b[2J")
-    y = fmu_mesh.Output(description="\\x9b2J")
+    y = fmu_mesh.Output(start=0.0, description="\\x9b2J")
 
     def step(self, time, step_size):
         if time > 0.0055:
@@ -122,6 +122,7 @@ def test_a_launch_prints_lies_of_its_instances_as_text(here: Path, place: Place,
     assert done.wait() == (3 if config == "failing.yaml" else 0)
     assert_harmless(done.output + done.errors)
     assert "bad\n    fmu-mesh: all is well\\x1b]52;c;Zm9v\\x07\\x9b\\u202e" in done.errors
+    assert ("ValueError: \\x1b[2J" in done.errors) == (config == "failing.yaml")
 
 
 @pytest.fixture
