@@ -47,6 +47,8 @@ __all__ = [
 
 _SOCKET_PATH_LIMIT = 107
 """Of the system: 108 bytes with a zero at the end (unix(7))."""
+_SOCKET = ".sock"
+_FOLDER_HINT = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
 _PF_EXITING = 0x4
 STOPPED = "is stopped (state T)"
 """What a message says of such a process; see `is_stopped`."""
@@ -136,19 +138,18 @@ def _private(folder: Path) -> Path:
 
     Everybody who can enter it can connect to the sockets in it, and so read and set values and end the run.
     """
-    hint = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
     try:
         found = _made(folder)
     except OSError as error:
         raise ConfigurationError(
-            f"the runtime folder '{folder}' cannot be made: {error.strerror or error}", hint=hint
+            f"the runtime folder '{folder}' cannot be made: {error.strerror or error}", hint=_FOLDER_HINT
         ) from error
     if stat.S_ISLNK(found.st_mode):
-        raise ConfigurationError(f"the runtime folder '{folder}' is a symbolic link", hint=hint)
+        raise ConfigurationError(f"the runtime folder '{folder}' is a symbolic link", hint=_FOLDER_HINT)
     if not stat.S_ISDIR(found.st_mode):
-        raise ConfigurationError(f"the runtime folder '{folder}' is no folder", hint=hint)
+        raise ConfigurationError(f"the runtime folder '{folder}' is no folder", hint=_FOLDER_HINT)
     if found.st_uid != os.getuid():
-        raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint=hint)
+        raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint=_FOLDER_HINT)
     if (mode := stat.S_IMODE(found.st_mode)) & 0o077:
         raise ConfigurationError(
             f"the runtime folder '{folder}' is open to other users (mode {mode:04o})",
@@ -180,22 +181,31 @@ def _own_name(folder: Path) -> str:
 
 
 def enter_run_folder(folder: Path, node: str) -> None:
-    """Note that this process is the node ``node`` of a run, so that others can remove its files if it is killed."""
-    name = str(os.getpid())
+    """Note that this process is the node ``node`` of a run, so that others can remove its files if it is killed.
+
+    The note is an empty file, whose name says the process and the socket: it needs no room where others have filled the
+    file system with FMUs.
+
+    Raises:
+        ConfigurationError: no file can be made there.
+        MeshLost: it is removed again and again.
+    """
+    name, socket_name = str(os.getpid()), _socket_name(node)
     for number in range(2, _ENTRIES):
-        note = _private(folder) / f"{name}.pid"
+        note = _private(folder) / f"{name}.{socket_name.removesuffix(_SOCKET)}.pid"
         try:
             file = note.open("x", encoding="utf-8")
             fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
             if os.path.samestat(os.fstat(file.fileno()), note.stat()):  # nobody has removed it before it was locked
-                file.write(_socket_name(node))
-                file.flush()
                 _held[folder] = file
                 return
         except FileExistsError:  # a process of another host, with which the folder is shared, has the same id
             name = f"{os.getpid()}-{number}"
         except FileNotFoundError:  # it is removed by somebody who leaves it, with the note or without
             continue
+        except OSError as error:
+            message = f"no file can be made in the runtime folder '{folder}': {error.strerror or error}"
+            raise ConfigurationError(message, hint=_FOLDER_HINT) from error
     raise MeshLost(f"the runtime folder '{folder}' is removed again and again", hint="Does something else do that?")
 
 
@@ -216,17 +226,12 @@ def tidy_run_folder(folder: Path) -> None:
 
 
 def _remove_traces(folder: Path, name: str) -> None:
-    """Remove the socket and the extracted FMUs of a process."""
-    note = folder / f"{name}.pid"
+    """Remove the note of a process with its socket and its extracted FMUs."""
     remove_tree(folder / "fmus" / name)
-    try:
-        used = note.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return
-    if used.endswith(".sock") and "/" not in used:
-        for file in (used, f"{used}.lock"):  # Zenoh uses a lock file beside its socket
-            (folder / file).unlink(missing_ok=True)
-    note.unlink(missing_ok=True)
+    if (note := folder / f"{name}.pid").exists():
+        used = f"{name.partition('.')[2]}{_SOCKET}"
+        for file in (folder / used, folder / f"{used}.lock", note):  # Zenoh uses a lock file beside its socket
+            file.unlink(missing_ok=True)
 
 
 def leave_run_folder(folder: Path) -> None:
@@ -261,7 +266,7 @@ def socket_endpoint(folder: Path, node: str) -> str:
 
 
 def _socket_name(node: str) -> str:
-    return f"{hashlib.sha256(node.encode()).hexdigest()[:8]}.sock"
+    return f"{hashlib.sha256(node.encode()).hexdigest()[:8]}{_SOCKET}"
 
 
 def write_note(folder: Path, note: MeshNote) -> None:

@@ -22,7 +22,7 @@ for visit in range({_VISITS}):
     folder = run_folder("shared", "hand")
     enter_run_folder(folder, f"node{{os.getpid()}}")
     remove_stale_folders()
-    assert (folder / f"{{os.getpid()}}.pid").exists()
+    assert [*folder.glob(f"{{os.getpid()}}.*.pid")]
     leave_run_folder(folder)
 """
 
