@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 import os
 import socket
+import time
 from contextlib import ExitStack
 
 import msgspec
@@ -58,6 +59,9 @@ from .pacing import GrantWatch, Pacer, RunClock
 from .registrations import spoken
 
 __all__ = ["Master", "MasterSettings"]
+
+_LAST_WORDS_S = 1.0
+"""For how long a run that fails waits until its nodes have left: what they said before comes in this time."""
 
 
 class MasterSettings(msgspec.Struct, frozen=True):
@@ -167,9 +171,17 @@ class Master:
         finally:
             self._clock.stop()
             self._server.publish_status(at_once=True)
+            if states.failure is not None:
+                self._hear_last_words()
             self._tokens.close()
         if states.failure is not None:
             raise states.failure
+
+    def _hear_last_words(self) -> None:
+        """Take the log lines that nodes had said before they were told to end, until they have left."""
+        deadline = time.monotonic() + _LAST_WORDS_S
+        while not self._members.have_left and (left := deadline - time.monotonic()) > 0:
+            self._inbox.wait(left)
 
     def wait_for_followers(self) -> None:
         """Wait, because this process routes messages, until all followers have the last sample."""

@@ -15,6 +15,7 @@ import zenoh
 
 from ..errors import FmuMeshError
 from ..rings.host_memory import Offer
+from ..system.plan import RECORDER
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
@@ -47,6 +48,7 @@ class Members:
         self._waiting: dict[str, zenoh.Query] = {}
         self._shared: tuple[str, ...] = ()
         self._doubted: set[str] = set()
+        self._present: set[str] = set()
         self._grant_keys = keys.grants([*nodes.plan.nodes])
         self._grants = [
             session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
@@ -84,8 +86,17 @@ class Members:
     def token_changed(self, sample: zenoh.Sample) -> None:
         """A liveliness token appeared or seems to be gone. A lost token is a question; `lost` finds the answer."""
         node = RunKeys.node_in(str(sample.key_expr))
-        if sample.kind == zenoh.SampleKind.DELETE and node in self._nodes.admitted:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._present.add(node)
+            return
+        self._present.discard(node)
+        if node in self._nodes.admitted:
             self._doubted.add(node)
+
+    @property
+    def have_left(self) -> bool:
+        """Whether no node of a model has a token any more."""
+        return self._present <= {RECORDER}
 
     def lost(self, *, router_is_lost: Callable[[], bool]) -> list[str]:
         """The nodes whose processes are gone. On this host the process itself shows it, elsewhere its token."""

@@ -164,6 +164,8 @@ class Node:
             aborted = isinstance(error, _Aborted)
             if aborted or not self._membership.lost_master:  # its token may be gone before its last message arrives
                 self._send_last_rows()
+            if aborted:  # after the rows: the master ends when it has the log lines, or a second later
+                self.server.say_everything(heard=True)
             self.failure_is_known = aborted or self._report_failure(located)
             raise located from error
         finally:

@@ -121,7 +121,9 @@ def test_a_launch_prints_lies_of_its_instances_as_text(here: Path, place: Place,
 
     assert done.wait() == (3 if config == "failing.yaml" else 0)
     assert_harmless(done.output + done.errors)
-    assert "bad\n    fmu-mesh: all is well\\x1b]52;c;Zm9v\\x07\\x9b\\u202e" in done.errors
+    told = re.findall(r"bad\n    fmu-mesh: all is well\\x1b]52;c;Zm9v\\x07\\x9b\\u202e(?: \((\d+) more)?", done.errors)
+    steps = range(6, 11) if config == "failing.yaml" else [8]  # one may be ahead of the one that fails
+    assert sum(int(more or 1) for more in told) in steps
     assert ("ValueError: \\x1b[2J" in done.errors) == (config == "failing.yaml")
 
 
