@@ -131,7 +131,7 @@ class Report:
         measured = self._results[job.name][entry.label]
         if measured.cost is None:
             return (entry.label, *["-"] * (len(_header(job)) - 2), measured.failure or "not run")
-        values = measured.result + (f"; later: {measured.failure}" if measured.failure else "")
+        values = measured.result + (f"; {measured.failed} more: {measured.failure}" if measured.failed else "")
         ratio = self._ratio(job, entry, measured.cost)
         if job.timed == "commands":
             spread = f"{min(measured.costs):.2f}-{max(measured.costs):.2f}"

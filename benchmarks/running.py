@@ -27,6 +27,9 @@ RUN_S = 120.0
 """A run of a contestant that takes longer is ended."""
 
 _LEAST_S = 20.0
+_TRIES = 4
+"""So often a contestant may fail before its first result: one that crashes now and then is measured."""
+
 _WITH_CLOCK = {"multiplied": "", "summed": " (to a loop with a summed clock)"}
 
 
@@ -42,6 +45,7 @@ class Measured:
         started: of every watched command, its processes.
         result: how its values compare with the reference.
         failure: why it has none.
+        failed: how many of its runs failed; the others count.
     """
 
     instances: int
@@ -51,6 +55,7 @@ class Measured:
     started: list[Started] = field(default_factory=list)
     result: str = ""
     failure: str | None = None
+    failed: int = 0
 
     @property
     def cost(self) -> float | None:
@@ -145,13 +150,16 @@ class Bench:
 
     def _measure(self, job: Job, entry: Entry, about: str, timeout_s: float) -> None:
         measured = self.results[job.name][entry.label]
-        if measured.failure is not None or not any(self._only in name for name in (entry.module, entry.label)):
+        gives_up = measured.failed >= _TRIES and not measured.costs
+        missing = measured.failure is not None and not measured.failed
+        if missing or gives_up or not any(self._only in name for name in (entry.module, entry.label)):
             return
         print(f"{about}: {job.name}: {entry.label}", flush=True)
         try:
             self._run_once(job, entry, measured, timeout_s)
         except RunFailed as error:
             measured.failure = str(error)
+            measured.failed += 1
             self._note(job, entry, str(error))
 
     def _run_once(self, job: Job, entry: Entry, measured: Measured, timeout_s: float) -> None:
