@@ -234,6 +234,7 @@ class _Run:
         self._runners: dict[str, Runner] = {}
         self._engine: Engine | None = None
         self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
+        self._before: list[Runner] = []  # whose step to the point after the last one came before `_first`
 
     @property
     def names(self) -> str:
@@ -327,9 +328,10 @@ class _Run:
             self._around.progress(point)
             if self._stop is not None:
                 raise Interrupted(self._stop, point=point, time=self._node.grid.time(point))
-            if point >= self._last:
+            late = [runner for runner in self._before if runner.covered <= self._last]
+            if point >= self._last and not late:
                 return
-            granted, pause_s = pacer.limit(min(self._last, writer.written - 1 + window), point)
+            granted, pause_s = pacer.limit(min(self._last + bool(late), writer.written - 1 + window), point)
             memory.grant.raise_to(granted)
             try:
                 stepped = engine.run(min(pause_s, _LONGEST_SLEEP_S), eager=True)
@@ -344,7 +346,8 @@ class _Run:
     def _end_at(self, event: FmuError | TerminationRequested, engine: Engine, memory: HostMemory) -> None:
         """The run ends at the point of ``event``, unless another instance ends it before: all others go on to there.
 
-        Within a burst, an instance is ahead of those behind it; point by point, the first event would end the run.
+        Within a burst, an instance is ahead of those behind it; point by point, the first event would end the run. So
+        instances before it in the order also take the step in which it came, in which they may end the run themselves.
         """
         runner = self._runners.get(event.instance or "") or engine.current
         if runner is None:
@@ -359,6 +362,7 @@ class _Run:
         if self._first is None or place < self._first[0]:
             self._first = place, event
             self._last = point
+            self._before = [self._runners[name] for name in self._plan.order[: place[1]]]
             if native.library is not None:
                 memory.withdraw_grant()
             memory.grant.raise_to(point)

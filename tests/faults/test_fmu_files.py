@@ -80,7 +80,7 @@ def test_an_fmu_without_a_place_names_folder_reason_and_the_way_out(place: Place
 
 def test_path_that_is_too_long_for_socket_is_found_before_anything_starts(place: Place) -> None:
     config = write_config(place.folder)
-    place.environment |= {"FMU_MESH_RUNTIME_DIR": str(place.folder / ("x" * 60))}
+    place.environment |= {"FMU_MESH_RUNTIME_DIR": str(place.folder / ("x" * 80))}
 
     run = place.run("launch", config, "--no-progress")
 
@@ -88,7 +88,7 @@ def test_path_that_is_too_long_for_socket_is_found_before_anything_starts(place:
     assert run.errors.count("fmu-mesh: ") == 1
     assert "is too long for a socket (107 bytes). Set FMU_MESH_RUNTIME_DIR to a shorter path." in run.message
     assert not config.with_suffix(".csv").exists()
-    assert [*(place.folder / ("x" * 60)).iterdir()] == []
+    assert [*(place.folder / ("x" * 80)).iterdir()] == []
 
 
 @pytest.fixture

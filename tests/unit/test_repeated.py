@@ -628,3 +628,39 @@ def test_numeric_libraries_use_one_thread_until_the_end(tmp_path: Path) -> None:
 
             assert threads() == {1}
         assert threads() == before
+
+
+ENDER = """
+import fmu_mesh
+
+class Ender(fmu_mesh.Component):
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output(start=0.0)
+    end = fmu_mesh.Parameter(100.0)
+
+    def step(self, time, step_size):
+        if time >= self.end:
+            raise ValueError("it ends")
+"""
+
+
+@ENGINES
+@pytest.mark.usefixtures("_engine")
+def test_of_two_that_fail_in_one_step_first_in_order_is_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a slice for each step, the second one, whose step is two points long, takes it before the first one."""
+    (tmp_path / "ender.py").write_text(ENDER, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    mesh = fmu_mesh.Mesh("enders", stop_time=1.0, step_size=0.1, algorithm="jacobi")
+    mesh.add("first", python="ender.py:Ender", start_values={"end": 0.1})
+    mesh.add("second", python="ender.py:Ender", start_values={"end": 0.0}, step_size=0.2)
+    mesh.add("third", python="ender.py:Ender")
+    mesh.connect("third.y", "first.u")
+    mesh.connect("second.y", "third.u")
+    monkeypatch.setattr("fmu_mesh.node.engine._SLICE_S", 1e-7)
+
+    with pytest.raises(fmu_mesh.StepFailed, match="it ends") as failure:
+        mesh.run(processes=False)
+
+    assert (failure.value.instance, failure.value.point) == ("first", 1)
