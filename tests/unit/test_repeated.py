@@ -646,9 +646,7 @@ class Ender(fmu_mesh.Component):
 
 @ENGINES
 @pytest.mark.usefixtures("_engine")
-def test_of_two_that_fail_in_one_step_first_in_order_is_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_two_that_fail_in_one_step_the_first_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a slice for each step, the second one, whose step is two points long, takes it before the first one."""
     (tmp_path / "ender.py").write_text(ENDER, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
