@@ -32,7 +32,6 @@ from __future__ import annotations
 import math
 import os
 import socket
-import time
 from contextlib import ExitStack
 
 import msgspec
@@ -172,16 +171,11 @@ class Master:
             self._clock.stop()
             self._server.publish_status(at_once=True)
             if states.failure is not None:
-                self._hear_last_words()
+                # The log lines that nodes had said before they were told to end.
+                self._inbox.wait_until(lambda: self._members.have_left, _LAST_WORDS_S)
             self._tokens.close()
         if states.failure is not None:
             raise states.failure
-
-    def _hear_last_words(self) -> None:
-        """Take the log lines that nodes had said before they were told to end, until they have left."""
-        deadline = time.monotonic() + _LAST_WORDS_S
-        while not self._members.have_left and (left := deadline - time.monotonic()) > 0:
-            self._inbox.wait(left)
 
     def wait_for_followers(self) -> None:
         """Wait, because this process routes messages, until all followers have the last sample."""

@@ -7,7 +7,6 @@ All of it runs on the main thread: what arrives on threads of Zenoh is posted to
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 
 import msgspec
@@ -163,9 +162,5 @@ class Followers:
         """Wait until all followers have their last sample, for at most ``timeout_s`` seconds."""
         if self._lost:
             log.warning("a gateway was lost before the last point; ROS did not get the samples after it")
-        deadline = time.monotonic() + timeout_s
-        while self._there:
-            if (left := deadline - time.monotonic()) <= 0:
-                log.warning("a gateway did not receive its last samples within %g s", timeout_s)
-                return
-            self._inbox.wait(left)
+        if not self._inbox.wait_until(lambda: not self._there, timeout_s):
+            log.warning("a gateway did not receive its last samples within %g s", timeout_s)

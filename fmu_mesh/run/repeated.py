@@ -234,7 +234,6 @@ class _Run:
         self._runners: dict[str, Runner] = {}
         self._engine: Engine | None = None
         self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
-        self._before: list[Runner] = []  # whose step to the point after the last one came before `_first`
 
     @property
     def names(self) -> str:
@@ -328,10 +327,11 @@ class _Run:
             self._around.progress(point)
             if self._stop is not None:
                 raise Interrupted(self._stop, point=point, time=self._node.grid.time(point))
-            late = [runner for runner in self._before if runner.covered <= self._last]
+            before = self._plan.order[: self._first[0][1]] if self._first is not None else ()
+            late = any(self._runners[name].covered <= self._last for name in before)
             if point >= self._last and not late:
                 return
-            granted, pause_s = pacer.limit(min(self._last + bool(late), writer.written - 1 + window), point)
+            granted, pause_s = pacer.limit(min(self._last + late, writer.written - 1 + window), point)
             memory.grant.raise_to(granted)
             try:
                 stepped = engine.run(min(pause_s, _LONGEST_SLEEP_S), eager=True)
@@ -362,7 +362,6 @@ class _Run:
         if self._first is None or place < self._first[0]:
             self._first = place, event
             self._last = point
-            self._before = [self._runners[name] for name in self._plan.order[: place[1]]]
             if native.library is not None:
                 memory.withdraw_grant()
             memory.grant.raise_to(point)

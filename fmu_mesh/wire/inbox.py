@@ -6,6 +6,7 @@ host come through rings; a wait may also be for them. Every wait has a deadline.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
@@ -109,6 +110,15 @@ class Inbox:
             return message
         self._memory.sleep(seen, timeout_s, wishes)
         return self.poll()
+
+    def wait_until(self, is_so: Callable[[], bool], timeout_s: float) -> bool:
+        """Run what is posted, and drop messages, until something is so; whether it was within ``timeout_s`` seconds."""
+        deadline = time.monotonic() + timeout_s
+        while not is_so():
+            if (left := deadline - time.monotonic()) <= 0:
+                return False
+            self.wait(left)
+        return True
 
     def hand_on(
         self, message: Message, from_master: Callable[[Message], None], from_node: Callable[[Message], None]
