@@ -44,99 +44,17 @@
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fenv.h>
-#include <limits.h>
-#include <linux/futex.h>
 #include <sched.h>
-#include <stdatomic.h>
 #include <stddef.h>
-#include <stdint.h>
 #include <string.h>
-#include <sys/syscall.h>
-#include <time.h>
-#include <unistd.h>
 
-#include "burst.h"
-
-#define PUBLIC __attribute__((visibility("default")))
-#define NEVER INT64_MAX
-
-/* ---- shared memory */
-
-struct Counter {
-  _Atomic int64_t value;   /* rows of a ring, points that are known of a node, or points that are granted */
-  _Atomic int64_t wake_at; /* the lowest need of a sleeper */
-  _Atomic int64_t claimed; /* of a node: it may step below this point without another look at the grant */
-  int64_t unused[5];
-  _Atomic int64_t needs[]; /* one for each process: the value that it sleeps for; 0: it does not sleep */
-};
-
-struct Bell {
-  _Atomic uint32_t rung;
-  uint32_t unused[15];
-};
+#include "counters.h"
 
 enum { WARNING = 1, OUT_OF_RANGE = 100, WRONG_ROW = 101, STAGE_BITS = 24 }; /* statuses, and where the stage begins */
 
 /* ---- waiting */
 
-static int64_t now(void) {
-  struct timespec time;
-  clock_gettime(CLOCK_MONOTONIC, &time);
-  return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec;
-}
-
-static void relax(void) {
-#if defined(__x86_64__)
-  __builtin_ia32_pause();
-#elif defined(__aarch64__)
-  __asm__ volatile("yield");
-#endif
-}
-
-static void lower(_Atomic int64_t *place, int64_t value) {
-  int64_t seen = atomic_load(place);
-  while (value < seen && !atomic_compare_exchange_weak(place, &seen, value)) continue;
-}
-
-PUBLIC void ring_bell(Bell *bell) {
-  atomic_fetch_add(&bell->rung, 1);
-  syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
-}
-
-/* Wake everybody whose need is met; again if the value has grown meanwhile. */
-static void wake(const Place *place, Counter *counter) {
-  int64_t lowest;
-  do {
-    atomic_store(&counter->wake_at, NEVER);
-    int64_t value = atomic_load(&counter->value);
-    lowest = NEVER;
-    for (int64_t process = 0; process < place->processes; process++) {
-      int64_t need = atomic_load(&counter->needs[process]);
-      if (need == 0) continue;
-      if (need > value) {
-        if (need < lowest) lowest = need;
-      } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
-        ring_bell(&place->bells[process]);
-      }
-    }
-    if (lowest != NEVER) lower(&counter->wake_at, lowest);
-  } while (lowest != NEVER && atomic_load(&counter->value) >= lowest);
-}
-
-static inline void wake_if_needed(const Place *place, Counter *counter) {
-  if (atomic_load_explicit(&counter->wake_at, memory_order_relaxed) <=
-      atomic_load_explicit(&counter->value, memory_order_relaxed))
-    wake(place, counter);
-}
-
-static inline void raise_counter(const Place *place, Counter *counter, int64_t value) {
-  atomic_store_explicit(&counter->value, value, memory_order_release);
-  wake_if_needed(place, counter);
-}
-
-static inline int64_t value_of(const Counter *counter) {
-  return atomic_load_explicit(&counter->value, memory_order_acquire);
-}
+PUBLIC void ring_bell(Bell *bell) { ring(bell); }
 
 /* Raise a counter, and wake who needs it: for Python. */
 PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
@@ -446,10 +364,6 @@ PUBLIC int64_t member_step(Member *member, int64_t step) {
 }
 
 /* ---- a node */
-
-static inline _Atomic int64_t *stamp_of(const char *rows, int64_t stride, int64_t mask, int64_t row) {
-  return (_Atomic int64_t *)(uintptr_t)(rows + (row & mask) * stride);
-}
 
 static inline void stamp(Member *member, int64_t row, int64_t value) {
   const Output *own = &member->outputs[0];

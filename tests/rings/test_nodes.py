@@ -103,14 +103,14 @@ def test_a_forged_counter_ends_the_run_and_leaves_no_wrong_row(build: Build, job
 
 
 def changed(folder: Path, *lines: tuple[str, str]) -> Path:
-    """A copy of `burst.c` with other lines."""
-    text = BURST.read_text()
+    """A copy of `burst.c`, and of the header that it includes, with other lines."""
+    texts = {name: BURST.with_name(name).read_text() for name in ("burst.c", "counters.h")}
     for old, new in lines:
-        assert text.count(old) == 1
-        text = text.replace(old, new)
-    copy = folder / "burst.c"
-    copy.write_text(text)
-    return copy
+        assert sum(text.count(old) for text in texts.values()) == 1
+        texts = {name: text.replace(old, new) for name, text in texts.items()}
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    return folder / "burst.c"
 
 
 def test_a_node_that_claims_nothing_would_be_found_beyond_a_pause(build: Build, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_node_that_claims_nothing_would_be_found_beyond_a_pause(build: Build, 
 
 
 def test_a_lost_wake_up_would_be_found(build: Build, tmp_path: Path) -> None:
-    burst = changed(tmp_path, ("ring_bell(&place->bells[process]);", "(void)process;"))
+    burst = changed(tmp_path, ("ring(&place->bells[process]);", "(void)process;"))
 
     done = run(build("", burst), ("cycle", 4, 2), 3, "quiet")
 
