@@ -30,7 +30,14 @@ __all__ = ["SOURCES", "TARGETS", "BuildError", "WheelHook", "build", "library_pa
 ROOT: Final = Path(__file__).resolve().parent
 PACKAGE: Final = ROOT / "fmu_mesh"
 
-SOURCES: Final = ("rings/burst.c", "rings/burst.h", "rings/counters.h", "results/csv_rows.c", "instances/fmi/messages.c")
+SOURCES: Final = (
+    "rings/burst.c",
+    "rings/streams.c",
+    "rings/burst.h",
+    "rings/counters.h",
+    "results/csv_rows.c",
+    "instances/fmi/messages.c",
+)
 """The files of the library, below the package. A header stands here, too, so that its SHA-256 counts."""
 
 TARGETS: Final = {"linux-x86_64": "x86_64-linux-gnu.2.17", "linux-aarch64": "aarch64-linux-gnu.2.17"}

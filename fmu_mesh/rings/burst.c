@@ -42,7 +42,6 @@
  * tests/property/test_waiting.py explores it.
  */
 #define _GNU_SOURCE
-#include <errno.h>
 #include <fenv.h>
 #include <sched.h>
 #include <stddef.h>
@@ -78,42 +77,6 @@ PUBLIC int64_t grant_withdraw(Counter *grant, Counter *const *nodes, int64_t n) 
 }
 
 PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
-
-static int granted(const Wish *wishes, int64_t n) {
-  for (int64_t i = 0; i < n; i++)
-    if (wishes[i].counter != NULL && value_of(wishes[i].counter) >= wishes[i].need) return 1;
-  return 0;
-}
-
-/* Sleep until a wish is granted, the bell is rung, or the time is over; `seen` is the bell when the caller last looked
- * for other reasons to stay awake. Returns whether a wish is granted. */
-PUBLIC int64_t sleep_for(const Place *place, uint32_t seen, const Wish *wishes, int64_t n, int64_t limit_ns,
-                         int64_t *late) {
-  Bell *bell = &place->bells[place->own];
-  for (int64_t i = 0; i < n; i++) {
-    Counter *counter = wishes[i].counter;
-    if (counter == NULL) continue;
-    int64_t other = atomic_load_explicit(&counter->needs[place->own], memory_order_relaxed);
-    if (other == 0 || other > wishes[i].need) atomic_store(&counter->needs[place->own], wishes[i].need);
-    lower(&counter->wake_at, wishes[i].need);
-  }
-  atomic_thread_fence(memory_order_seq_cst);
-  int is_granted = granted(wishes, n);
-  if (!is_granted) {
-    struct timespec limit = {limit_ns / 1000000000, limit_ns % 1000000000};
-    int64_t end = now() + limit_ns;
-    syscall(SYS_futex, &bell->rung, FUTEX_WAIT, seen, &limit, NULL, 0);
-    is_granted = granted(wishes, n);
-    if (is_granted && late != NULL && now() >= end) {
-      /* The value came as the time was over. Its writer is about to ring; if it does not, this wake-up was lost. */
-      const struct timespec grace = {0, 10000000};
-      if (syscall(SYS_futex, &bell->rung, FUTEX_WAIT, seen, &grace, NULL, 0) != 0 && errno == ETIMEDOUT) *late += 1;
-    }
-  }
-  for (int64_t i = 0; i < n; i++)
-    if (wishes[i].counter != NULL) atomic_store(&wishes[i].counter->needs[place->own], 0);
-  return is_granted;
-}
 
 PUBLIC uint32_t bell_seen(const Place *place) { return atomic_load(&place->bells[place->own].rung); }
 
@@ -392,14 +355,15 @@ static void publish(Node *node) {
     raise_counter(&node->place, node->progress, least + 1);
 }
 
-/* Before this process waits or leaves: whoever waits for it is awake. */
-static void wake_all(Node *node) {
+/* Before this process waits or leaves: whoever waits for it is awake, and has what it needs. */
+static void wake_all(Node *node, int all) {
   publish(node);
   atomic_thread_fence(memory_order_seq_cst);
   wake_if_needed(&node->place, node->progress);
   for (int64_t i = 0; i < node->n_units; i++)
     for (int64_t j = 0; j < node->units[i].n_members; j++)
       wake_if_needed(&node->place, node->units[i].members[j].counter);
+  if (node->streams != NULL) streams_write(node->streams, all);
 }
 
 /* Claim the points of about one burst: the master may take the grant back, but not what is claimed. */
@@ -440,18 +404,22 @@ static int64_t allow(Node *node, int64_t point, Unit *unit) {
 
 /* A sleeper on another core takes up to this time to wake up. Who waits for it for a shorter time falls asleep itself, and
  * both wake each other for ever. */
+/* With at most so many ticks in a slice, rows are sent before each tick: nobody waits for a row until the next is done. */
+enum { LONG_STEPS = 16 };
+
 enum { SPINS = 60, YIELD_NS = 50000, PATIENCE = 3, REST = 30, QUICK_NS = 200000 };
 
 /* For a node with one unit: look a little longer before it sleeps, unless that was in vain the last times. */
 static int soon(Node *node, Counter *counter, int64_t need) {
   if (!node->spins || node->n_units != 1 || counter == node->ceiling) return 0;
-  wake_all(node);
+  wake_all(node, 0);
   if (node->patience < 0) {
     node->patience++;
     return value_of(counter) >= need;
   }
   int64_t end = 0;
   for (int i = 0;; i++) {
+    if (node->streams != NULL) streams_read(node->streams);
     if (value_of(counter) >= need) {
       if (node->patience < PATIENCE) node->patience++;
       return 1;
@@ -482,6 +450,7 @@ static inline void adapt(Node *node, int is_there, int64_t elapsed_ns) {
 
 /* Whether to sleep for a value; `points` is what one more of it stands for. */
 static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need, int64_t points) {
+  if (node->streams != NULL && streams_read(node->streams) && value_of(counter) >= need) return 0;
   const int64_t more = counter != node->ceiling ? node->stride / points : 0, last = node->last_point / points + 1;
   if (more > 1 ? value_of(counter) >= need : soon(node, counter, need)) {
     if (more == 1) adapt(node, 1, 0);
@@ -542,6 +511,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
     const int64_t point = unit->tick * unit->tick_points;
     while (unit->next == 0 && point >= node->allowed && (node->allowed = allow(node, point, unit)) <= point)
       if (blocked(node, unit, unit->blocked_by, unit->need, 1)) goto out;
+    if (node->streams != NULL && unit->burst <= LONG_STEPS) streams_write(node->streams, 0);
     for (; unit->next < unit->n_members; unit->next++) {
       Member *member = &unit->members[unit->next];
       if (member->every != 1 && (unit->tick + 1) % member->every != 0) continue;
@@ -607,7 +577,7 @@ out:
 static int64_t await(Node *node, int64_t limit_ns) {
   uint32_t seen = bell_seen(&node->place);
   if (atomic_load(&node->attention)) return 0;
-  wake_all(node);
+  wake_all(node, 0);
   Wish wishes[64]; /* of more units, the others look again when one of these may step, or the time is over */
   int64_t n = 0;
   for (int64_t i = 0; i < node->n_units; i++) {
@@ -620,7 +590,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
   }
   if (node->stride > 1 && limit_ns > node->slice_ns) limit_ns = node->slice_ns;
   int64_t start = now();
-  int64_t is_granted = sleep_for(&node->place, seen, wishes, n, limit_ns, &node->late), elapsed = now() - start;
+  int64_t is_granted = sleep_on(&node->place, node->streams, seen, wishes, n, limit_ns, &node->late), elapsed = now() - start;
   node->waited_ns += elapsed;
   if (n == 1 && wishes[0].counter != node->ceiling) adapt(node, is_granted != 0, elapsed);
   return is_granted || bell_seen(&node->place) != seen;
@@ -648,33 +618,33 @@ PUBLIC int64_t node_run(Node *node) {
           unit->burst = (ticks < unit->burst ? ticks : unit->burst) / 2 + (ticks < 2);
       }
       if (result != SLICE) {
-        wake_all(node);
+        wake_all(node, 0);
         return result;
       }
       left += unit->tick < unit->last_tick;
       /* Without a step it has not begun: else many units would be looked through in vain, each time from the first. */
       if (atomic_load_explicit(&node->attention, memory_order_relaxed) || (any && begin - start > 2 * node->slice_ns)) {
-        wake_all(node);
+        wake_all(node, 0);
         return ATTENTION;
       }
     }
     if (left == 0) {
       if (!any) await(node, node->wait_ns); /* for what Python has to do */
-      wake_all(node);
+      wake_all(node, 1);
       return DONE;
     }
     if (!stepped) {
       /* After a step only a little: its rows may be streamed, or sent. */
       int64_t limit_ns = !any ? node->wait_ns : node->eager ? 0 : node->slice_ns - (begin - start);
       if (limit_ns <= 0 || !await(node, limit_ns)) {
-        wake_all(node);
+        wake_all(node, 0);
         return BLOCKED;
       }
       begin = now();
       if (!any) start = begin; /* the slice begins with the first step */
     }
     if (any && begin - start > node->slice_ns) {
-      wake_all(node);
+      wake_all(node, 0);
       return SLICE;
     }
   }

@@ -119,6 +119,81 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   int64_t outcome;   /* stage and status of a call that Python has to look at */
 } Member;
 
+/* ---- streams: see streams.c */
+
+enum StreamState { OPEN, CUT, GAP, TWICE, LATE, REFUSED }; /* Stream.state */
+enum Last { GOES_ON, UNSAID, SAID };                       /* Outgoing.last: whether more rows come */
+
+typedef struct { /* bytes of a row that go over the wire */
+  int64_t place, size;
+  int64_t truths; /* whether they are Booleans */
+} Piece;
+
+typedef struct { /* the rows of one link for the other process */
+  int64_t link;
+  Counter *counter;
+  const char *rows;
+  int64_t stride, mask;
+  Piece *pieces;
+  int64_t n_pieces;
+  int64_t row_bytes; /* of all pieces */
+  int64_t sent;      /* rows that are on their way */
+  int64_t lazy;      /* they may wait for a while: nobody steps with them */
+  _Atomic int64_t last;
+} Outgoing;
+
+typedef struct { /* the rows of one link from the other process */
+  int64_t link;
+  Counter *counter;
+  char *rows;
+  int64_t stride, mask;
+  Piece *pieces;
+  int64_t n_pieces;
+  int64_t row_bytes;
+  int64_t most;  /* rows of the whole run */
+  int64_t ended; /* no more come */
+} Incoming;
+
+typedef struct { /* a counter of this process that the other one has, too */
+  int64_t kind, number; /* of its frames: GRANT or PROGRESS, and of which process */
+  Counter *counter;
+  int64_t sent;
+  int64_t stride; /* by how much it grows before it is sent without need */
+} Told;
+
+typedef struct { /* a counter of the other process */
+  int64_t kind, number;
+  Counter *counter;
+  int64_t most;
+} Heard;
+
+typedef struct { /* one socket to another process */
+  int64_t fd;
+  Outgoing *outgoing;
+  Incoming *incoming;
+  Told *told;
+  Heard *heard;
+  int64_t n_outgoing, n_incoming, n_told, n_heard;
+  char *to_send, *received;
+  int64_t send_size, send_from, send_to;
+  int64_t receive_size, used, filled;
+  int64_t frame, row, rows_left; /* of the frame that is being read: its number in `incoming`, and the next row */
+  int64_t flushed_ns, heard_ns;
+  int64_t about, about_row; /* why `state` is not OPEN: the link or kind, and the row or number */
+  int64_t has_ended, is_known; /* what `streams_serve` has told Python */
+  _Atomic int64_t state, sending;
+} Stream;
+
+typedef struct { /* all streams of a process */
+  Place place;
+  Stream *streams;
+  int64_t n_streams;
+  void *polled, *wishes; /* room for a pollfd for each stream and one more; for a wish for each of `told` */
+  int64_t bell_pipe;     /* the end that is read */
+  int64_t lazy_ns;       /* how long rows may wait that are lazy */
+  _Atomic int64_t attention;
+} Streams;
+
 /* ---- a node */
 
 typedef struct { /* members that step together, tick by tick: a tick of a single member is its own step */
@@ -139,6 +214,7 @@ typedef struct { /* a process that may be some points behind, and no more */
 
 typedef struct { /* all units of a process */
   Place place;
+  Streams *streams; /* NULL: all others share its memory, or send frames */
   Unit *units;
   int64_t n_units;
   Peer *peers;

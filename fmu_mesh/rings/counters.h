@@ -1,11 +1,15 @@
-/* What processes share: counters, the bells of sleepers, and who wakes whom. `burst.c` explains the protocol. */
+/* What processes share: counters, the bells of sleepers, and who wakes whom. `burst.c` explains the protocol; it and
+ * `streams.c` include this. */
 #ifndef FMU_MESH_COUNTERS_H
 #define FMU_MESH_COUNTERS_H
 
+#include <errno.h>
+#include <fcntl.h>
 #include <limits.h>
 #include <linux/futex.h>
 #include <stdatomic.h>
 #include <stdint.h>
+#include <stdio.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
@@ -25,7 +29,9 @@ struct Counter {
 
 struct Bell {
   _Atomic uint32_t rung;
-  uint32_t unused[15];
+  _Atomic uint32_t polls;         /* its process waits for file descriptors, too: then it is rung by a pipe */
+  _Atomic int32_t process, pipe;  /* the pipe: who has it, and the descriptor there */
+  uint32_t unused[12];
 };
 
 /* ---- waiting */
@@ -49,9 +55,24 @@ static inline void lower(_Atomic int64_t *place, int64_t value) {
   while (value < seen && !atomic_compare_exchange_weak(place, &seen, value)) continue;
 }
 
+/* Of another process, the end of the pipe to write to is opened as its memory was: through /proc. */
+static inline void ring_pipe(const Bell *bell) {
+  const int32_t process = atomic_load(&bell->process), pipe = atomic_load(&bell->pipe);
+  char path[64];
+  snprintf(path, sizeof path, "/proc/%d/fd/%d", process, pipe);
+  const int fd = open(path, O_WRONLY | O_NONBLOCK | O_CLOEXEC);
+  if (fd < 0) return; /* it was killed, or it is about to end */
+  ssize_t written = write(fd, "", 1); /* a full pipe wakes, too */
+  (void)written;
+  close(fd);
+}
+
 static inline void ring(Bell *bell) {
   atomic_fetch_add(&bell->rung, 1);
-  syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
+  if (atomic_load(&bell->polls))
+    ring_pipe(bell);
+  else
+    syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
 }
 
 /* Wake everybody whose need is met; again if the value has grown meanwhile. */
@@ -93,5 +114,18 @@ static inline int64_t value_of(const Counter *counter) {
 static inline _Atomic int64_t *stamp_of(const char *rows, int64_t stride, int64_t mask, int64_t row) {
   return (_Atomic int64_t *)(uintptr_t)(rows + (row & mask) * stride);
 }
+
+/* ---- streams: see streams.c */
+
+/* Sleep until a wish is granted, something came by a stream, the bell is rung, or the time is over; `seen` is the bell
+ * when the caller last looked for other reasons to stay awake. Returns whether a wish is granted. */
+int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish *wishes, int64_t n, int64_t limit_ns,
+                 int64_t *late);
+
+/* Take what has come; whether there was anything. */
+int streams_read(Streams *streams);
+
+/* Send what is new; with `all`, also what may wait for a while. */
+void streams_write(Streams *streams, int all);
 
 #endif

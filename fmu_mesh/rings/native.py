@@ -33,19 +33,28 @@ __all__ = [
     "Change",
     "Entry",
     "Gate",
+    "HeardTable",
+    "IncomingTable",
+    "Last",
     "Lookup",
     "MemberTable",
     "Move",
     "NativeStep",
     "NodeTable",
+    "OutgoingTable",
     "OutputTable",
     "Participant",
     "Peer",
+    "Piece",
     "RowBase",
     "Said",
     "Span",
     "Stage",
     "StepKind",
+    "StreamState",
+    "StreamTable",
+    "StreamsTable",
+    "ToldTable",
     "Track",
     "UnitTable",
     "Wish",
@@ -86,6 +95,18 @@ class Change(IntEnum):
     """What a `Move` makes of a value."""
 
     UNCHANGED, SCALED, LOOKED_UP = range(3)
+
+
+class StreamState(IntEnum):
+    """Whether a stream can be used, or why not."""
+
+    OPEN, CUT, GAP, TWICE, LATE, REFUSED = range(6)
+
+
+class Last(IntEnum):
+    """Whether more rows of a link come."""
+
+    GOES_ON, UNSAID, SAID = range(3)
 
 
 class BurstEnd(IntEnum):
@@ -236,16 +257,18 @@ class Track(Structure):
     """An input with a value for each own step that the burst takes before `MemberTable.python_at`."""
 
 
-@_declared("Member")
-class MemberTable(Structure):
-    """One instance: how it gets its inputs, steps, and gives its outputs."""
-
+class _WithArrays(Structure):
     def give(self, **arrays: Sequence[Structure]) -> None:
         """Give it arrays, by the names of their fields, and their lengths; it keeps them."""
         kinds: dict[str, Any] = {field: kind for field, kind, *_ in self._fields_}
         for name, items in arrays.items():
             setattr(self, name, table(kinds[name]._type_, items))
             setattr(self, f"n_{name}", len(items))
+
+
+@_declared("Member")
+class MemberTable(_WithArrays):
+    """One instance: how it gets its inputs, steps, and gives its outputs."""
 
 
 @_declared("Unit")
@@ -256,6 +279,96 @@ class UnitTable(Structure):
 @_declared("Peer")
 class Peer(Structure):
     """A process that may be some points behind, and no more."""
+
+
+@_declared("Piece")
+class Piece(Structure):
+    """Bytes of a row that go over the wire, and whether they are Booleans."""
+
+
+@_declared("Outgoing")
+class OutgoingTable(_WithArrays):
+    """The rows of one link for another process."""
+
+    last: int
+    sent: int
+
+    def go_on(self, received: int) -> None:
+        """While nobody sends: send all rows from here on, and once more that they are the last."""
+        self.sent = received
+        if self.last == Last.SAID:
+            self.last = Last.UNSAID
+
+    def end(self) -> bool:
+        """No more rows come; whether that is news."""
+        goes_on = self.last == Last.GOES_ON
+        if goes_on:
+            self.last = Last.UNSAID
+        return goes_on
+
+
+@_declared("Incoming")
+class IncomingTable(_WithArrays):
+    """The rows of one link from another process."""
+
+    ended: int
+
+    @property
+    def known(self) -> int:
+        """How many of them are here."""
+        return int(library.counter_value(self.counter)) if library is not None else 0
+
+    def take_end(self) -> bool:
+        """Whether no more rows come, and nobody knows that yet."""
+        if is_news := self.ended == 1:
+            self.ended = 2
+        return is_news
+
+
+@_declared("Told")
+class ToldTable(Structure):
+    """A counter of this process that another one has, too."""
+
+
+@_declared("Heard")
+class HeardTable(Structure):
+    """A counter of another process."""
+
+
+@_declared("Stream")
+class StreamTable(_WithArrays):
+    """One socket to another process."""
+
+    has_ended: int
+    is_known: int
+
+    def take_state(self) -> StreamState | None:
+        """Why it cannot be used, if it cannot, and nobody knows that yet."""
+        if self.state == StreamState.OPEN or self.is_known:
+            return None
+        self.is_known = True
+        return StreamState(self.state)
+
+    def take_ended(self) -> list[int]:
+        """The links of which no more rows come, if nobody knows that yet."""
+        if not self.has_ended:
+            return []
+        self.has_ended = False
+        return [rows.link for rows in self.incoming[: self.n_incoming] if rows.take_end()]
+
+    @property
+    def is_sent(self) -> bool:
+        """Whether the kernel has all that was to be sent."""
+        return not self.sending and bool(self.send_to == self.send_from)
+
+
+@_declared("Streams")
+class StreamsTable(_WithArrays):
+    """All streams of a process."""
+
+    def attend(self) -> None:
+        """Who serves them has something else to do."""
+        self.attention = 1
 
 
 @_declared("Node")
@@ -306,6 +419,11 @@ class _Library:
         self.bell_seen = PYFUNCTYPE(c_uint32, address)(("bell_seen", quick))
         self.counter_raise = PYFUNCTYPE(None, address, address, c_int64)(("counter_raise", quick))
         self.counter_value = PYFUNCTYPE(c_int64, address)(("counter_value", quick))
+        self.stream_open = PYFUNCTYPE(None, address, c_int64)(("stream_open", quick))
+        self.stream_hold = CFUNCTYPE(None, address)(("stream_hold", slow))
+        self.stream_beat = PYFUNCTYPE(None, address)(("stream_beat", quick))
+        self.streams_serve = CFUNCTYPE(None, address, c_int64)(("streams_serve", slow))
+        self.streams_listen = PYFUNCTYPE(None, address, c_int64, c_int64)(("streams_listen", quick))
         self.grant_withdraw = PYFUNCTYPE(c_int64, address, address, c_int64)(("grant_withdraw", quick))
 
 

@@ -1,4 +1,6 @@
-"""All orders of events of the waiting protocol of `burst.c`, at small sizes (docs/rings.md has the protocol in words).
+"""All orders of events of the waiting protocol of `burst.c` and `streams.c`, at small sizes.
+
+docs/rings.md has the protocol in words.
 
 `Protocol` has the C functions with the same names; each ``yield`` is one access to shared memory. In each run all
 threads have to come to their end, and no sleep ends by its time limit: a run that stops before is a lost wake-up or a
@@ -33,23 +35,25 @@ from tests.explorer import (
     wait,
 )
 
-SOURCES = [Path("fmu_mesh/rings") / name for name in ("counters.h", "burst.c")]
+SOURCES = [Path("fmu_mesh/rings") / name for name in ("counters.h", "streams.c", "burst.c")]
 FUNCTIONS = (
     "lower",
+    "ring_pipe",
     "ring",
     "wake",
     "wake_if_needed",
     "raise_counter",
     "counter_raise",
     "granted",
-    "sleep_for",
+    "poll_streams",
+    "sleep_on",
     "wake_all",
     "await",
     "node_attend",
     "claim",
     "grant_withdraw",
 )
-DIGEST = "733d46337f672159"
+DIGEST = "e48f7909ece08379"
 """Of these functions, when `Protocol` was last compared with them."""
 
 NEVER = 99
@@ -76,18 +80,23 @@ class Wish(NamedTuple):
 A, B = Counter.at(0), Counter.at(2 + PROCESSES)
 BELLS = range(2 * (2 + PROCESSES), 2 * (2 + PROCESSES) + PROCESSES)
 ATTENTION = BELLS.stop
-MEMORY = [NEVER if place in {A.wake_at, B.wake_at} else 0 for place in range(ATTENTION + 1)]
+POLLS = range(ATTENTION + 1, ATTENTION + 1 + PROCESSES)
+PIPES = range(POLLS.stop, POLLS.stop + PROCESSES)
+"""How many bytes were written; what was there when a process began to wait, it has read."""
+MEMORY = [NEVER if place in {A.wake_at, B.wake_at} else 0 for place in range(PIPES.stop)]
 NAMES = [
     f"{name}.{part}" for name in "AB" for part in ("value", "wake_at", *(f"needs[{at}]" for at in range(PROCESSES)))
 ]
 NAMES += [*(f"bells[{at}]" for at in range(PROCESSES)), "attention"]
+NAMES += [f"{name}[{at}]" for name in ("polls", "pipe") for at in range(PROCESSES)]
 
 
 class Protocol:
-    """The protocol of `burst.c`, or a wrong one without one of its parts."""
+    """The protocol of `burst.c`, or a wrong one without one of its parts; who ``polls`` has streams."""
 
-    def __init__(self, without: str = "") -> None:
+    def __init__(self, without: str = "", polls: frozenset[int] = frozenset()) -> None:
         self._without = without
+        self._polls = polls
 
     def has(self, part: str) -> bool:
         return part != self._without
@@ -102,8 +111,18 @@ class Protocol:
             seen = found
 
     def ring_bell(self, process: int) -> Steps[None]:
+        polls = 0
+        if not self.has("polls is read after the bell is counted"):
+            polls = yield load(POLLS[process])
         if self.has("the bell is counted"):
             yield add(BELLS[process])
+        if process in self._polls:  # of all others, `polls` is never anything else than 0
+            if self.has("polls is read after the bell is counted"):
+                polls = yield load(POLLS[process])
+            if polls:
+                yield add(PIPES[process])
+                yield ring(PIPES[process])
+                return
         yield ring(BELLS[process])
 
     def wake(self, counter: Counter) -> Steps[None]:
@@ -166,6 +185,8 @@ class Protocol:
                 yield store(counter.needs[own], need)
             del other
             yield from self.lower(counter.wake_at, need)
+        if own in self._polls:
+            return (yield from self.poll(own, seen, wishes))
         if self.has("the fence of sleep_for"):
             yield FENCE
         is_granted = (yield from self.granted(wishes)) if self.has("the look before sleep") else False
@@ -174,6 +195,26 @@ class Protocol:
                 seen = yield load(BELLS[own])
             yield wait(BELLS[own], seen, [(wish.counter.value, wish.need) for wish in wishes])
             is_granted = yield from self.granted(wishes)
+        for counter, _ in wishes:
+            yield store(counter.needs[own], 0)
+        return is_granted
+
+    def poll(self, own: int, seen: int, wishes: tuple[Wish, ...]) -> Steps[bool]:
+        """`sleep_on` of a process with streams, and `poll_streams`."""
+        drained = yield load(PIPES[own], Order.RELAXED)
+        if self.has("polls is set before the look"):
+            yield store(POLLS[own], 1)
+        if self.has("the fence of sleep_on"):
+            yield FENCE
+        is_granted = (yield from self.granted(wishes)) if self.has("the look before poll") else False
+        if not is_granted:
+            rung = (yield load(BELLS[own])) if self.has("the bell is read again") else seen
+            if not self.has("polls is set before the look"):
+                yield store(POLLS[own], 1)
+            if rung == seen:
+                yield wait(PIPES[own], drained, [(wish.counter.value, wish.need) for wish in wishes])
+            is_granted = yield from self.granted(wishes)
+        yield store(POLLS[own], 0)
         for counter, _ in wishes:
             yield store(counter.needs[own], 0)
         return is_granted
@@ -302,6 +343,16 @@ THREADS: dict[str, list[Program]] = {
         thread(bursting, A, (1, 2, 3)),
     ],
 }
+POLLING = {
+    "a burst and two sleepers": {1, 2},
+    "Python raises for two sleepers": {1},
+    "a cycle of two": {0},
+    "a sleeper with two wishes": {2},
+    "attention": {0},
+    "a writer is killed": {1},
+}
+"""Who has streams in some more runs of these."""
+
 RESTARTS = {
     "a writer is killed": thread(restarted, A, 2),
     "a sleeper is killed": thread(waiting, 1, Wish(A, 2), Wish(A, 3)),
@@ -333,7 +384,13 @@ MISSING = {
     "wake_at is reset before the scan": ("a cycle of two", Machine.TSO),
     "the lowest need that is left": ("Python raises for two sleepers", Machine.TSO),
     "the look at the value after the scan": ("two threads wake", Machine.TSO),
+    "polls is set before the look": ("attention", Machine.TSO),
+    "polls is read after the bell is counted": ("attention", Machine.TSO),
+    "the fence of sleep_on": ("a cycle of two", Machine.WEAK),
+    "the look before poll": ("a cycle of two", Machine.TSO),
+    "the bell is read again": ("attention", Machine.TSO),
 }
+_OF_POLL = [*MISSING][-5:]
 
 
 @cache
@@ -349,11 +406,20 @@ def test_in_every_order_of_events_all_sleepers_are_woken(name: str, machine: Mac
     assert not found.lost, found.lost
 
 
+@pytest.mark.parametrize("machine", Machine, ids=lambda machine: machine.name)
+@pytest.mark.parametrize("name", POLLING)
+def test_who_polls_is_woken_by_a_pipe_in_every_order_of_events(name: str, machine: Machine) -> None:
+    found = explore(name, machine, Protocol(polls=frozenset(POLLING[name])))
+
+    assert not found.lost, found.lost
+
+
 @pytest.mark.parametrize("part", MISSING)
 def test_without_one_of_its_parts_the_protocol_loses_a_wake_up(part: str) -> None:
     name, machine = MISSING[part]
 
-    found = explore(name, machine, Protocol(without=part))
+    polls = POLLING[name] if part in _OF_POLL else ()
+    found = explore(name, machine, Protocol(part, frozenset(polls)))
 
     assert "sleeps" in found.lost
 

@@ -7,7 +7,8 @@
  *           before. jacobi: a cycle in which all read one point before
  *   MODE    quiet: threads, nothing else happens. disturbed: a master that grants little, attention, bells that nobody
  *           needs, needs that a killed sleeper has left. forged: threads, and somebody writes wrong counters. killed:
- *           processes that are stopped, or killed and started again, at random moments
+ *           processes that are stopped, or killed and started again, at random moments. streamed: threads of which each has a
+ *           memory of its own, and streams to its neighbours with small buffers
  *
  * Runs of POINTS points follow each other for SECONDS. The rings are as small as the window allows. Each float is
  * compared with those of a plain loop. Prints `runs R late L wrong W us U best B`: lost wake-ups, runs with a wrong
@@ -16,6 +17,8 @@
 #define BURST "../../fmu_mesh/rings/burst.c"
 #endif
 #include BURST
+
+#include "../../fmu_mesh/rings/streams.c"
 
 #include <math.h>
 #include <pthread.h>
@@ -55,7 +58,8 @@ static int get_real(void *model, const void *references, size_t n, void *values)
 /* ---- the memory */
 
 static int64_t n_nodes, window, points, rows, is_chain, is_jacobi;
-static char *memory;
+static char *memory; /* streamed: that of the node which is being looked at */
+static char *memories[MAX_NODES];
 static double *expected; /* all rows of all nodes */
 static double times[MAX_RUNS];     /* of the runs, in us per point */
 
@@ -180,7 +184,7 @@ static void leave_need(Participant *p) {
 }
 
 static uint64_t seed = 88172645463325252u;
-static enum { QUIET, DISTURBED, FORGING, KILLED } mode;
+static enum { QUIET, DISTURBED, FORGING, KILLED, STREAMED } mode;
 static _Atomic int64_t is_over, n_forged;
 static int64_t master_late, n_pauses, n_overrun;
 static Participant participants[MAX_NODES];
@@ -255,6 +259,99 @@ static void *disturb(void *argument) {
       ring_bell(&bells()[p->own]);
   }
   return NULL;
+}
+
+/* ---- a memory for each node, and streams */
+
+enum { PER_NODE = 2, MOST_BYTES = 4096 };
+
+typedef struct {
+  Stream streams[PER_NODE];
+  Streams all;
+  Outgoing out[PER_NODE];
+  Incoming in[PER_NODE];
+  Told told[PER_NODE];
+  Heard heard[PER_NODE];
+  char buffers[2 * PER_NODE][MOST_BYTES];
+  struct pollfd polled[PER_NODE + 1];
+  int bell[2];
+} Ends;
+
+static Ends ends[MAX_NODES];
+static Piece piece = {8, 8, 0};
+
+/* One end of a stream: of the node that writes the rows, or of the one that reads them. */
+static void add_end(int64_t own, int64_t source, int64_t reader, int fd) {
+  Ends *e = &ends[own];
+  const int64_t k = e->all.n_streams++, other = own == source ? reader : source;
+  const int small = 4096;
+  memory = memories[own];
+  setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &small, sizeof small);
+  e->out[k] = (Outgoing){source, rows_of(source), ring_of(source), ROW_BYTES, rows - 1, &piece, 1, 8, 0, 0, GOES_ON};
+  e->in[k] = (Incoming){source, rows_of(source), ring_of(source), ROW_BYTES, rows - 1, &piece, 1, 8, points + 1, 0};
+  e->told[k] = (Told){PROGRESS, own, progress_of(own), -1, window / 4 > 0 ? window / 4 : 1};
+  e->heard[k] = (Heard){PROGRESS, other, progress_of(other), points + 1};
+  const int64_t size = 64 + (int64_t)(draw(&seed) % (MOST_BYTES - 64));
+  e->streams[k] = (Stream){.outgoing = &e->out[k], .incoming = &e->in[k], .told = &e->told[k], .heard = &e->heard[k],
+                           .n_outgoing = own == source, .n_incoming = own != source, .n_told = 1, .n_heard = 1,
+                           .to_send = e->buffers[2 * k], .received = e->buffers[2 * k + 1], .send_size = size,
+                           .receive_size = size, .state = CUT};
+  stream_open(&e->streams[k], fd);
+}
+
+static void connect_nodes(void) {
+  for (int64_t i = 0; i < n_nodes; i++) {
+    ends[i].all = (Streams){.place = participants[i].node.place, .streams = ends[i].streams, .polled = ends[i].polled,
+                            .lazy_ns = 5000000};
+    if (pipe(ends[i].bell) != 0) abort();
+    fcntl(ends[i].bell[0], F_SETFL, O_NONBLOCK);
+    fcntl(ends[i].bell[1], F_SETFL, O_NONBLOCK);
+    ends[i].all.bell_pipe = ends[i].bell[0];
+    streams_listen(&ends[i].all, getpid(), ends[i].bell[1]);
+    participants[i].node.streams = &ends[i].all;
+  }
+  for (int64_t i = 0; i < n_nodes; i++) {
+    int both[2];
+    if (source_of(i) < 0) continue;
+    if (socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK, 0, both) != 0) abort();
+    add_end(source_of(i), source_of(i), i, both[0]);
+    add_end(i, source_of(i), i, both[1]);
+  }
+}
+
+/* Nobody's row or counter is on its way any more. */
+static void disconnect_nodes(void) {
+  for (int64_t i = 0; i < n_nodes; i++) {
+    for (int64_t k = 0; k < ends[i].all.n_streams; k++) stream_hold(&ends[i].streams[k]);
+  }
+  for (int64_t i = 0; i < n_nodes; i++) {
+    for (int64_t k = 0; k < ends[i].all.n_streams; k++) close((int)ends[i].streams[k].fd);
+    close(ends[i].bell[0]);
+    close(ends[i].bell[1]);
+  }
+}
+
+static int run_streamed(int64_t *late) {
+  pthread_t threads[MAX_NODES];
+  int right = 1;
+  for (int64_t i = 0; i < n_nodes; i++) {
+    memory = memories[i];
+    prepare(points);
+    set_up(&participants[i], i, 1000000000, draw(&seed) % 4 != 0);
+  }
+  connect_nodes();
+  for (int64_t i = 0; i < n_nodes; i++) pthread_create(&threads[i], NULL, run_node, &participants[i]);
+  for (int64_t i = 0; i < n_nodes; i++) {
+    pthread_join(threads[i], NULL);
+    *late += participants[i].node.late;
+  }
+  disconnect_nodes();
+  for (int64_t i = 0; i < n_nodes; i++) {
+    memory = memories[i];
+    right &= is_right() && value_of(rows_of(i)) == points + 1 && value_of(progress_of(i)) == points + 1;
+    if (source_of(i) >= 0) right &= value_of(rows_of(source_of(i))) >= points;
+  }
+  return right;
 }
 
 static int run_threads(int64_t *late) {
@@ -333,19 +430,21 @@ int main(int n, char **arguments) {
   is_jacobi = strcmp(arguments[1], "jacobi") == 0;
   n_nodes = atoll(arguments[2]), window = atoll(arguments[3]), points = atoll(arguments[4]);
   const int64_t seconds = atoll(arguments[5]), end = now() + seconds * 1000000000;
-  const char *modes[] = {"quiet", "disturbed", "forged", "killed"};
-  while (mode <= KILLED && strcmp(arguments[6], modes[mode]) != 0) mode++;
-  if (mode > KILLED || n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
+  const char *modes[] = {"quiet", "disturbed", "forged", "killed", "streamed"};
+  while (mode <= STREAMED && strcmp(arguments[6], modes[mode]) != 0) mode++;
+  if (mode > STREAMED || n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
   for (rows = 1; rows < window + 1; rows *= 2) continue;
   expected = malloc((size_t)((points + 1) * n_nodes) * 8);
   memory = mmap(NULL, memory_bytes(), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
   if (memory == MAP_FAILED || expected == NULL) return 2;
+  for (int64_t i = 0; i < n_nodes; i++)
+    memories[i] = mmap(NULL, memory_bytes(), PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
   compute_expected();
   int64_t runs = 0, late = 0, wrong = 0, kills = 0;
   alarm((unsigned)seconds + 120);
   do {
     int64_t begin = now();
-    wrong += !(mode == KILLED ? run_processes(&kills) : run_threads(&late));
+    wrong += !(mode == KILLED ? run_processes(&kills) : mode == STREAMED ? run_streamed(&late) : run_threads(&late));
     times[runs++] = (double)(now() - begin) / 1e3 / (double)points;
   } while (now() < end && runs < MAX_RUNS);
   qsort(times, (size_t)runs, 8, by_size);

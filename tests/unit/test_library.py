@@ -121,7 +121,7 @@ def test_the_library_needs_nothing_but_a_c_library_of_2014_or_later() -> None:
     versions = {tuple(map(int, version.split(b"."))) for version in re.findall(rb"GLIBC_([\d.]+)\0", content)}
 
     assert max(versions) <= (2, 17)
-    assert set(re.findall(rb"\0([\w.-]+\.so[\w.]*)\0", content)) <= {b"libc.so.6", b"libm.so.6"}
+    assert set(re.findall(rb"\0([\w.-]+\.so[\w.]*)\0", content)) <= {b"libc.so.6", b"libm.so.6", b"libpthread.so.0"}
 
 
 def test_the_library_beside_its_module_is_the_one_that_is_loaded() -> None:

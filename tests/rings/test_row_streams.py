@@ -1,0 +1,285 @@
+"""Row streams: two ends in one process, over a socket pair; what one writes into its rings, the other one finds."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fmu_mesh.rings import native
+from fmu_mesh.rings.host_memory import Counter, HostMemory
+from fmu_mesh.rings.native import StreamState
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.rings.row_streams import CounterEnd, RowsEnd, RowStreams, StreamEnd
+from fmu_mesh.system.layout import Layout
+from fmu_mesh.system.memory_map import map_memory
+from fmu_mesh.wire.messages import ALIVE, FRAME, GRANT, HEADER, LAST, PROGRESS
+
+pytestmark = pytest.mark.skipif(native.library is None, reason="there is no library of C")
+
+LAST_POINT = 1_000_000
+LINK = 7
+SENT = Layout.of([("flag", "Boolean"), ("x", "Float64"), ("n", "Int32"), ("y", "Float64"), ("z", "Float64")])
+COLUMNS = ("flag", "n", "x", "z")
+
+
+class End(NamedTuple):
+    """One process: its memory, the ring of the rows, and its stream."""
+
+    memory: HostMemory
+    ring: Ring
+    counter: Counter
+    streams: RowStreams
+    socket: socket.socket
+
+    def write(self, first: int, end: int) -> None:
+        for row in range(first, end):
+            self.ring.put(row, "flag", row % 3 == 0)
+            self.ring.put(row, "n", -row)
+            self.ring.put(row, "x", row / 3)
+            self.ring.put(row, "y", float("nan"))
+            self.ring.put(row, "z", row * 1e300)
+            self.ring.stamp(row)
+        self.counter.raise_to(end)
+
+    def values(self, row: int) -> list[object]:
+        assert self.ring.has_row(row)
+        return [self.ring.value(row, name) for name in COLUMNS]
+
+
+def layout_of(names: tuple[str, ...]) -> Layout:
+    return Layout(tuple(column for column in SENT.columns if column.name in names))
+
+
+def ends(rows: int = 64, wide: int = 0) -> tuple[End, End]:
+    """The source of the rows, and their target; with ``wide``, a row has an array of so many bytes."""
+    sent = SENT if not wide else Layout.of([("wide", "UInt8", (wide,))])
+    got = layout_of(COLUMNS) if not wide else sent
+    map_, places = map_memory(["source", "target"], {"i": ("source", 1, sent, rows)})
+    both = socket.socketpair()
+    made = []
+    for name, layout, own in zip(("source", "target"), (sent, got), both, strict=True):
+        memory = HostMemory.private(map_, name)
+        ring, counter = Ring(layout, rows), memory.counter(places["i"].counter)
+        here = [RowsEnd(LINK, ring, counter, got, LAST_POINT + 1)]
+        progress = [
+            CounterEnd(PROGRESS, number, memory.progress[other]) for number, other in enumerate(("source", "target"))
+        ]
+        told, heard = (progress[0], progress[1]) if name == "source" else (progress[1], progress[0])
+        end = StreamEnd(
+            "target" if name == "source" else "source",
+            own,
+            outgoing=here if name == "source" else (),
+            incoming=here if name == "target" else (),
+            told=[told],
+            heard=[heard],
+        )
+        made.append(End(memory, ring, counter, RowStreams(memory, [end], LAST_POINT), own))
+    return made[0], made[1]
+
+
+@pytest.fixture
+def both() -> Iterator[tuple[End, End]]:
+    source, target = ends()
+    yield source, target
+    for end in (source, target):
+        end.streams.close(0.0)
+
+
+def turn(*every: End, until: Callable[[], bool], limit_s: float = 10.0) -> None:
+    deadline = time.monotonic() + limit_s
+    while not until():
+        assert time.monotonic() < deadline
+        for end in every:
+            end.streams.serve(0.001)
+
+
+def state_of(end: End) -> StreamState:
+    [(_, state, *_)] = end.streams.states()
+    return state
+
+
+def test_rows_arrive_with_their_columns_and_bits(both: tuple[End, End]) -> None:
+    source, target = both
+
+    source.write(0, 40)
+    turn(*both, until=lambda: target.counter.value == 40)
+    source.write(40, 100)
+    turn(*both, until=lambda: target.counter.value == 100)
+
+    assert [target.values(row) for row in range(60, 100)] == [source.values(row) for row in range(60, 100)]
+
+
+def test_counters_go_both_ways_and_only_grow(both: tuple[End, End]) -> None:
+    source, target = both
+
+    source.memory.progress["source"].raise_to(5)
+    target.memory.progress["target"].raise_to(3)
+    turn(
+        *both, until=lambda: target.memory.progress["source"].value == 5 and source.memory.progress["target"].value == 3
+    )
+    target.socket.send(HEADER.pack(PROGRESS, 1, 0, 2))
+    target.memory.progress["target"].raise_to(9)
+
+    turn(*both, until=lambda: source.memory.progress["target"].value == 9)
+
+
+def test_rows_larger_than_the_kernel_takes_are_sent_while_nobody_looks() -> None:
+    source, target = ends(rows=8, wide=8_000_000)
+    values = np.frombuffer(os.urandom(8_000_000), np.uint8)
+    for row in range(4):
+        source.ring.put(row, "wide", values)
+        source.ring.stamp(row)
+    source.counter.raise_to(4)
+
+    source.streams.serve(0.0)
+    turn(target, until=lambda: target.counter.value == 4)
+
+    assert all((target.ring.array("wide")[row] == values).all() for row in range(4))
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+def test_the_last_rows_come_before_that_no_more_come(both: tuple[End, End]) -> None:
+    source, target = both
+    source.write(0, 30)
+
+    source.streams.say_last(LINK)
+    turn(target, until=lambda: [*target.streams.ended_links()] == [LINK])
+
+    assert target.counter.value == 30
+    assert [*target.streams.ended_links()] == []
+
+
+def test_a_closed_end_has_sent_everything_and_the_other_one_knows() -> None:
+    source, target = ends()
+    source.write(0, 50)
+
+    source.streams.close(0.1)
+    turn(target, until=lambda: state_of(target) == StreamState.CUT if target.counter.value == 50 else False)
+
+    target.streams.close(0.0)
+
+
+@given(cuts=st.lists(st.tuples(st.integers(1, 9), st.integers(0, 2000)), min_size=1, max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_after_each_cut_rows_go_on_where_the_reader_is(cuts: list[tuple[int, int]]) -> None:
+    """The window is 16 rows: the writer keeps what the reader lacks. A cut may be at any byte."""
+    source, target = ends(rows=64)
+    written = 0
+    for count, taken in cuts:
+        source.write(written, written := written + count)
+        source.streams.serve(0.0)
+        pair = socket.socketpair()
+        rest = target.socket.recv(taken, socket.MSG_DONTWAIT | socket.MSG_PEEK) if taken else b""
+        pair[0].send(rest)
+        target.streams.resume("source", pair[1], {})
+        target.streams.serve(0.0)  # it gets this much of what was sent
+        here, there = socket.socketpair()
+        received = target.streams.received("source")
+        source.streams.resume("target", here, received)
+        target.streams.resume("source", there, {})
+        pair[0].close()
+        source = source._replace(socket=here)
+        target = target._replace(socket=there)
+
+        turn(source, target, until=lambda: target.counter.value == written)  # noqa: B023  used here
+
+    assert [target.values(row) for row in range(max(0, written - 64), written)] == [
+        source.values(row) for row in range(max(0, written - 64), written)
+    ]
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+def test_a_silent_peer_is_noticed_and_what_was_not_read_is_a_sign_of_life(both: tuple[End, End]) -> None:
+    source, target = both
+    assert target.streams.silent_s("source") < 0.5
+
+    end = time.monotonic() + 0.6
+    turn(target, until=lambda: time.monotonic() > end)
+    assert target.streams.silent_s("source") > 0.5
+    source.streams.beat()
+
+    assert target.streams.silent_s("source") == 0.0
+    turn(target, until=lambda: 0.0 < target.streams.silent_s("source") < 0.5)
+
+
+ROW = struct.Struct("<ddi?")
+
+
+def frame(first: int, count: int, *, flag: int = 1, shift: float = 0.0) -> bytes:
+    rows = (ROW.pack(row / 3 + shift, row * 1e300, -row, flag == 1) for row in range(first, first + count))
+    return HEADER.pack(FRAME, LINK, count, first) + b"".join(row[:-1] + bytes([flag]) for row in rows)
+
+
+FORGED = {
+    "a gap": (frame(3, 1), StreamState.GAP),
+    "a Boolean of 2": (frame(0, 1, flag=2), StreamState.REFUSED),
+    "no rows": (HEADER.pack(FRAME, LINK, 0, 0), StreamState.REFUSED),
+    "too many rows": (HEADER.pack(FRAME, LINK, 2**32 - 1, 0), StreamState.REFUSED),
+    "a negative row": (HEADER.pack(FRAME, LINK, 1, -1), StreamState.REFUSED),
+    "another link": (HEADER.pack(FRAME, LINK + 1, 1, 0), StreamState.REFUSED),
+    "another kind": (HEADER.pack(77, LINK, 1, 0), StreamState.REFUSED),
+    "a grant that nobody expects": (HEADER.pack(GRANT, 0, 0, 5), StreamState.REFUSED),
+    "progress of another node": (HEADER.pack(PROGRESS, 5, 0, 5), StreamState.REFUSED),
+    "progress beyond the run": (HEADER.pack(PROGRESS, 0, 0, LAST_POINT + 2), StreamState.REFUSED),
+    "negative progress": (HEADER.pack(PROGRESS, 0, 0, -5), StreamState.REFUSED),
+    "other values": (frame(0, 2) + frame(1, 1, shift=1.0), StreamState.TWICE),
+    "the end of a link of another": (HEADER.pack(LAST, LINK + 1, 0, 0), StreamState.REFUSED),
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_what_is_no_part_of_the_run_ends_the_stream(both: tuple[End, End], name: str) -> None:
+    source, target = both
+    data, state = FORGED[name]
+    before = target.counter.value
+
+    source.socket.send(data)
+    turn(target, until=lambda: [own[1] for own in target.streams.states()] == [state])
+
+    assert target.counter.value in (before, 2)  # of "other values", the first two are right
+
+
+@given(cuts=st.lists(st.integers(0, 2000), max_size=30), repeated=st.integers(0, 20))
+@settings(max_examples=60, deadline=None)
+def test_rows_may_come_in_any_pieces_and_twice(cuts: list[int], repeated: int) -> None:
+    source, target = ends()
+    data = frame(0, 20) + HEADER.pack(ALIVE, 0, 0, 0) + frame(20 - repeated, 30) + HEADER.pack(PROGRESS, 0, 0, 11)
+    places = sorted({0, len(data), *(cut % len(data) for cut in cuts)})
+
+    for first, end in pairwise(places):
+        source.socket.send(data[first:end])
+        target.streams.serve(0.0)
+
+    assert target.counter.value == 50 - repeated
+    assert target.memory.progress["source"].value == 11
+    assert [target.values(row)[2] for row in range(50 - repeated)] == [row / 3 for row in range(50 - repeated)]
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+@given(data=st.binary(max_size=400), cut=st.integers(0, 400))
+@settings(max_examples=200, deadline=None)
+def test_any_bytes_are_refused_or_wait_for_more(data: bytes, cut: int) -> None:
+    source, target = ends()
+
+    source.socket.send(data[:cut])
+    target.streams.serve(0.0)
+    source.socket.send(data[cut:])
+    target.streams.serve(0.0)
+
+    states = [state for _, state, _, _ in target.streams.states()]
+    assert states in ([], [StreamState.REFUSED], [StreamState.GAP])
+    source.streams.close(0.0)
+    target.streams.close(0.0)
