@@ -30,6 +30,8 @@ import zenoh
 from fmu_mesh.wire.runtime import MeshNote
 
 __all__ = [
+    "BY_STREAMS",
+    "BY_ZENOH",
     "DEADLINE_S",
     "FMUS",
     "PAIR",
@@ -51,6 +53,10 @@ PAIR: Mapping[str, Mapping[str, Any]] = {
     "delay": {"fmu": "TransportDelay", "start_values": {"d": 0.1}},
 }
 """The instances that `write_config` writes by default."""
+
+BY_STREAMS: Mapping[str, bool] = {"shared_memory": False}
+BY_ZENOH: Mapping[str, bool] = {"shared_memory": False, "row_streams": False}
+"""The section `zenoh` of a mesh whose processes use the ways between hosts."""
 
 DEADLINE_S = 100.0
 """Longer than anything takes on a busy machine, shorter than the timeout of a test."""

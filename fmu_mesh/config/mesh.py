@@ -249,7 +249,14 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
         bool,
         Meta(
             description="true: processes on the same host read values, grants and progress in shared memory; false: "
-            "they exchange them through Zenoh, as processes of different hosts do."
+            "they exchange them as processes of different hosts do."
+        ),
+    ] = True
+    row_streams: Annotated[
+        bool,
+        Meta(
+            description="true: processes that share no memory exchange values, grants and progress through sockets of "
+            "their own, where they can reach each other; false: through Zenoh."
         ),
     ] = True
     config: Annotated[

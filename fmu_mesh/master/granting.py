@@ -11,8 +11,9 @@ import operator
 from collections.abc import Iterable, Sequence
 
 from ..errors import DeadlineExceeded, ProtocolBroken
-from ..system.plan import RECORDER, Plan
+from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.runtime import STOPPED
+from ..wire.ways import Ways
 from .pacing import CLOCK, PAUSE, Reach
 from .registrations import spoken
 
@@ -27,7 +28,10 @@ class Granting:
         slowest: the last point that all nodes know.
         grant: the point up to which all may step.
         last_point: the last point of the run, which may end early.
+        ways: how rows go, from `go` on.
         sharing: the nodes that share the memory of the master's host.
+        seen: the nodes whose progress is in that memory: these, and those that have a row stream.
+        messages: whether some nodes get their grant by Zenoh.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -35,7 +39,11 @@ class Granting:
         self.slowest = -1
         self.grant = 0
         self.last_point = plan.grid.last_point
+        self.ways = Ways()
         self.sharing: tuple[str, ...] = ()
+        self.seen: tuple[str, ...] = ()
+        self.messages = True
+        self._keep_windows = True
         self._plan = plan
         self._windows = [node.window for node in plan.nodes.values()]
         # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
@@ -43,9 +51,19 @@ class Granting:
         self._sent = 0
         self._reach = Reach(plan.window)
 
-    def share(self, nodes: tuple[str, ...]) -> None:
-        """From now on, these nodes read the grant in the memory."""
-        self.sharing = nodes
+    def go(self, ways: Ways) -> None:
+        """From now on, the nodes read the grant and tell their progress in these ways."""
+        nodes = self._plan.nodes
+        self.ways, self.sharing = ways, ways.shared
+        self.seen = tuple(name for name in nodes if ways.way(name, MASTER) != "zenoh")
+        self.messages = len(self.seen) < len(nodes)
+        links = {
+            (own.source_node, own.target_node)
+            for node in nodes.values()
+            for own in node.links_in
+            if not own.initial_only
+        }
+        self._keep_windows = self.messages or not ways.all_but_zenoh(links)
 
     def end_at(self, point: int) -> None:
         """End the run at a point before its last one."""
@@ -112,7 +130,7 @@ class Granting:
         """The grant for nodes that cannot read it, and whether it has grown since the last call; ``now`` is in s."""
         if self._all_share:
             return 0, False
-        credit = min(map(operator.add, self.progress.values(), self._windows))
+        credit = min(map(operator.add, self.progress.values(), self._windows)) if self._keep_windows else self.grant
         ahead = min(point for node, point in self.progress.items() if node != RECORDER)
         owed = min(self.grant, credit, ahead + self._reach.points(ahead, now))
         grown = owed > self._sent
@@ -121,9 +139,9 @@ class Granting:
 
     def wake_at(self) -> tuple[str, int] | None:
         """The slowest node of this host, and its point from which on there is something to do for the master."""
-        if not self.sharing:
+        if not self.seen:
             return None
-        slowest = min(self.sharing, key=self.progress.__getitem__)
+        slowest = min(self.seen, key=self.progress.__getitem__)
         reached = self.progress[slowest]
         if reached >= self.reaches_all and reached >= 0:
             return None

@@ -29,6 +29,7 @@ does not share this memory gets grants and reports its progress by messages.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import socket
@@ -39,11 +40,21 @@ import zenoh
 
 from .. import __version__
 from ..awake import AwakeClock
-from ..errors import ConfigurationError, Interrupted, MessageRefused, NotFinite, TerminationRequested
+from ..errors import (
+    ConfigurationError,
+    FmuMeshError,
+    Interrupted,
+    MeshLost,
+    MessageRefused,
+    NotFinite,
+    TerminationRequested,
+)
 from ..rings.host_memory import HostMemory, can_share
-from ..system.plan import MASTER, Plan
+from ..system.memory_map import STREAMS
+from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
+from ..wire.meeting import Meeting
 from ..wire.messages import PROGRESS, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
 from ..wire.runtime import this_host
@@ -51,13 +62,16 @@ from ..wire.session import RouterLink, tokens
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import Command, MeshInfo, MeshStatus
-from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, SendToAll
+from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
+from .master_streams import MasterStreams
 from .members import Followers, Members
 from .mesh_server import STATUS_S, Events, MasterServer
 from .pacing import GrantWatch, Pacer, RunClock
 from .registrations import spoken
 
 __all__ = ["Master", "MasterSettings"]
+
+log = logging.getLogger(__name__)
 
 _LAST_WORDS_S = 1.0
 """For how long a run that fails waits until its nodes have left: what they said before comes in this time."""
@@ -87,17 +101,19 @@ class Master:
     Args:
         session: the session of this process; the caller closes it.
         router: the link to the router that connects the nodes, if there is one.
+        meeting: where it meets nodes for row streams; the caller closes it.
 
     Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one run and its surroundings
         self,
         plan: Plan,
         session: zenoh.Session,
         events: Events,
         settings: MasterSettings,
         router: RouterLink | None = None,
+        meeting: Meeting | None = None,
     ) -> None:
         config = plan.system.config
         self._session = session
@@ -111,17 +127,22 @@ class Master:
         self._watch = GrantWatch() if settings.profile else None
         memory_of = HostMemory.create if self._shares else HostMemory.private
         self._memory = memory_of(next(iter(plan.nodes.values())).memory, MASTER)
+        self._meeting = meeting
+        self.streams = None
+        if meeting is not None:
+            self.streams = MasterStreams(plan, self._memory.participant(STREAMS), meeting, self._fail_later)
         self._inbox = Inbox(self._memory)
         self._inbox.open(session, self._run_keys, MASTER, {self._run_keys.progress(node): node for node in plan.nodes})
         self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
         offer = self._memory.offer if self._shares else None
-        self._members = Members(self._states.registrations, session, self._run_keys, offer, settings.launch)
+        registrations = self._states.registrations
+        self._members = Members(registrations, session, self._run_keys, offer, settings.launch, meeting)
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._tokens = ExitStack()
 
     def memory_for(self, participant: str) -> HostMemory | None:
-        """The memory of the host for a participant in this process; None if nothing is shared."""
-        return self._memory.participant(participant) if self._shares else None
+        """The memory of this process for a participant in it; None if it neither shares any nor has row streams."""
+        return self._memory.participant(participant) if self._shares or self.streams is not None else None
 
     @property
     def _shares(self) -> bool:
@@ -186,8 +207,14 @@ class Master:
         """Undeclare everything."""
         self._server.close()
         self._members.close()
+        if self.streams is not None:
+            self.streams.close()
         self._inbox.close()
         self._memory.close()
+
+    def _fail_later(self, error: FmuMeshError) -> None:
+        """From any thread."""
+        self._inbox.post(lambda: self._states.fail(error))
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted`."""
@@ -198,6 +225,7 @@ class Master:
     def _decide(self, now: float) -> float:
         """Do what there is to do; return for how long there is nothing more if nothing arrives, in s."""
         states, pause_s = self._states, math.inf
+        self._look_at_streams()
         while True:
             paced = states.wanted
             if states.takes_commands:
@@ -218,15 +246,36 @@ class Master:
             self._watch.note(states.granting.holder(hold=states.hold, paced=paced))
         return pause_s
 
+    def _look_at_streams(self) -> None:
+        """Note who was met, and that a cut link is no fault of a node until it has been silent for too long."""
+        states = self._states
+        if self._meeting is None or self.streams is None:
+            return
+        states.meet(tuple(self._meeting.sockets))
+        try:
+            if self.streams.check():
+                states.excuse()
+        except MeshLost as error:
+            states.fail(error)
+
     def _do(self, action: Action) -> None:
         match action:
-            case AnswerAll(shared):
+            case AnswerAll(ways):
+                states = self._states
+                if self.streams is not None and self._meeting is not None:
+                    self.streams.start(ways)
+                    for both in states.registrations.unmet(ways):
+                        log.warning("%s cannot reach each other: their rows go by Zenoh", spoken(*both))
+                    if not ways.streams_of(MASTER):
+                        self._meeting.close()  # nobody needs its door
                 entries = TIME_LINE_ENTRIES // len(self._states.plan.nodes) if self._watch is not None else 0
-                self._members.welcome(entries, shared)
+                self._members.welcome(entries, ways)
             case FollowClock(point):
                 self._pacer.start(point)
             case RaiseGrant(point):
                 self._memory.grant.raise_to(point)
+            case RaiseSent(point):
+                self._memory.sent.raise_to(point)
             case SendToAll(kind, point):
                 self._members.send(kind, point)
             case EndAll(error):
@@ -235,7 +284,7 @@ class Master:
     def _turn(self, timeout_s: float) -> None:
         """Report all that has arrived; wait up to ``timeout_s`` seconds for the first of it."""
         states, memory = self._states, self._memory
-        sharing, wake_at = states.granting.sharing, states.granting.wake_at()
+        seen, wake_at = states.granting.seen, states.granting.wake_at()
         wishes = []
         if wake_at is not None and states.state != "stopping":
             node, point = wake_at
@@ -246,12 +295,12 @@ class Master:
             node, kind, _, _, point, _ = message
             if kind != PROGRESS:
                 self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
-            elif node not in sharing:
+            elif node not in seen:
                 reported.append((node, point))
             message = self._inbox.poll()
         for node, point in states.progress(reported):
             memory.progress[node].raise_to(point + 1)
-        states.progress((node, memory.progress[node].value - 1) for node in sharing)
+        states.progress((node, memory.progress[node].value - 1) for node in seen)
         self._server.publish_status()
         for node in self._members.lost(router_is_lost=lambda: self._router.is_lost):
             states.lose(node, self._router.loss())
@@ -334,7 +383,8 @@ class Master:
             endpoints=self._settings.endpoints,
             pid=os.getpid(),
             host=socket.gethostname(),
-            shared_memory=(*shared, MASTER) if shared else (),
+            shared_memory=(*shared, MASTER) if {*shared} - {RECORDER} else (),
+            row_streams=self._states.granting.ways.streams,
             host_id=this_host(),
         )
 

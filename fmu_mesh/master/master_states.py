@@ -33,7 +33,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import msgspec
 
@@ -51,16 +51,17 @@ from ..errors import (
 from ..system.plan import RECORDER, Plan
 from ..wire.messages import FINISH, GRANT, NodeReport
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
+from ..wire.ways import Ways
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "SendToAll"]
+__all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "RaiseSent", "SendToAll"]
 
 
 class AnswerAll(msgspec.Struct, frozen=True):
-    """All nodes are ready and wait for an answer: who shares the memory."""
+    """All nodes are ready and wait for an answer: how rows go."""
 
-    shared: tuple[str, ...]
+    ways: Ways
 
 
 class FollowClock(msgspec.Struct, frozen=True):
@@ -71,6 +72,12 @@ class FollowClock(msgspec.Struct, frozen=True):
 
 class RaiseGrant(msgspec.Struct, frozen=True):
     """Write the grant into the memory of the host."""
+
+    point: int
+
+
+class RaiseSent(msgspec.Struct, frozen=True):
+    """Write into the memory of the host what the row streams grant to others."""
 
     point: int
 
@@ -88,7 +95,7 @@ class EndAll(msgspec.Struct, frozen=True):
     error: FmuMeshError
 
 
-Action = AnswerAll | FollowClock | RaiseGrant | SendToAll | EndAll
+Action = AnswerAll | FollowClock | RaiseGrant | RaiseSent | SendToAll | EndAll
 
 
 class MasterStates:
@@ -114,6 +121,7 @@ class MasterStates:
             plan.system.config.timeouts, max(len(node.instances) for node in plan.nodes.values())
         )
         self.registrations = Registrations(plan)
+        self._met: Collection[str] = ()
         self.granting = Granting(plan)
         self.hold = 0 if paused else None
         self.reports: dict[str, NodeReport] = {}
@@ -153,6 +161,10 @@ class MasterStates:
 
     # --- events
 
+    def meet(self, nodes: Collection[str]) -> None:
+        """The master has met these nodes for row streams."""
+        self._met = nodes
+
     def progress(self, reported: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
         """Nodes, by name, know all outputs up to a point; returns those of which it is news."""
         try:
@@ -163,6 +175,10 @@ class MasterStates:
         if news:
             self._moved_at = None
         return news
+
+    def excuse(self) -> None:
+        """A link is cut: that nobody moves is no fault, until the link has been silent for too long."""
+        self._moved_at = None
 
     def report(self, report: NodeReport) -> None:
         """A node reports its end, or that an FMU ends the simulation."""
@@ -275,8 +291,9 @@ class MasterStates:
     def _wait_for_nodes(self, now: float) -> None:
         registrations = self.registrations
         if not registrations.missing:
-            self.granting.share(registrations.shared)
-            self._actions.append(AnswerAll(registrations.shared))
+            ways = registrations.ways(self._met)
+            self.granting.go(ways)
+            self._actions.append(AnswerAll(ways))
             self._enter("initializing", now)
         elif now - self._entered_at > self.deadlines.start:
             self.fail(registrations.absence(self.deadlines.start))
@@ -320,7 +337,9 @@ class MasterStates:
     def _send_grant(self, now: float) -> None:
         """Send the grant to nodes that cannot read it, and to all as a sign that the master lives."""
         owed, grown = self.granting.owed(now)
-        if grown or now - self._sent_at >= self.deadlines.heartbeat:
+        if grown:
+            self._actions.append(RaiseSent(owed))
+        if (grown and self.granting.messages) or now - self._sent_at >= self.deadlines.heartbeat:
             self._sent_at = now
             self._actions.append(SendToAll(GRANT, owed))
 

@@ -17,11 +17,13 @@ from ..rings.host_memory import Offer
 from ..system.plan import RECORDER
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
+from ..wire.meeting import Meeting
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import ABORT, HEADER, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import tokens, undeclare_all
+from ..wire.ways import Ways
 from .registrations import Registrations
 
 __all__ = ["Followers", "Members"]
@@ -36,14 +38,21 @@ class Members:
     `send`, and `lost` now and then. `abort` may be called at any time, `close` at the end.
     """
 
-    def __init__(
-        self, nodes: Registrations, session: zenoh.Session, keys: RunKeys, offer: Offer | None, launch: str | None
+    def __init__(  # noqa: PLR0913, PLR0917  one run and how it is reached
+        self,
+        nodes: Registrations,
+        session: zenoh.Session,
+        keys: RunKeys,
+        offer: Offer | None,
+        launch: str | None,
+        meeting: Meeting | None = None,
     ) -> None:
         self._nodes = nodes
         self._session = session
         self._keys = keys
         self._offer = offer
         self._launch = launch
+        self._meeting = meeting
         self._waiting: dict[str, zenoh.Query] = {}
         self._shared: tuple[str, ...] = ()
         self._doubted: set[str] = set()
@@ -60,7 +69,11 @@ class Members:
         if registration.launch == self._launch:
             reason = self._nodes.register(registration)
             if reason is None:
-                admission = Admission(self._keys.run, self._grant_keys[registration.node], self._offer)
+                door = None
+                if self._meeting is not None and registration.door is not None:
+                    self._meeting.knows(registration.node, registration.door)
+                    door = self._meeting.door_for(registration.node)
+                admission = Admission(self._keys.run, self._grant_keys[registration.node], self._offer, door)
                 query.reply(query.key_expr, msgspec.json.encode(admission))
             else:
                 log.info("node_refused", extra={"reason": reason})
@@ -74,11 +87,11 @@ class Members:
         self._nodes.take_ready(node, decode_json(payload_of(query), NodeReady))
         self._waiting[node] = query
 
-    def welcome(self, profile_entries: int, shared: tuple[str, ...]) -> None:
+    def welcome(self, profile_entries: int, ways: Ways) -> None:
         """Answer all nodes, as `Welcome` says."""
-        self._shared = shared
+        self._shared = ways.shared
         for query in self._waiting.values():
-            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, shared)))
+            query.reply(query.key_expr, msgspec.json.encode(Welcome(profile_entries, ways)))
             query.drop()
         self._waiting.clear()
 

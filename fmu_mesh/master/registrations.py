@@ -5,18 +5,22 @@ Decides only, from what has arrived. How nodes are answered is in `fmu_mesh.mast
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from ..errors import DeadlineExceeded, MessageRefused
 from ..system.digest import difference
-from ..system.plan import RECORDER, Plan
+from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.membership import NodeReady, Registration
 from ..wire.messages import sealed
+from ..wire.ways import Ways, pair
 
 __all__ = ["Registrations", "spoken"]
 
 
 def spoken(*nodes: str) -> str:
-    """The names of nodes as text for a message."""
-    return ", ".join("the recorder" if node == RECORDER else f"node '{node}'" for node in nodes)
+    """The names of participants as text for a message."""
+    others = {RECORDER: "the recorder", MASTER: "the master"}
+    return ", ".join(others.get(node, f"node '{node}'") for node in nodes)
 
 
 class Registrations:
@@ -57,10 +61,21 @@ class Registrations:
             raise MessageRefused("its sender is not the process that has registered")
         self.ready[node] = ready
 
-    @property
-    def shared(self) -> tuple[str, ...]:
-        """The ready nodes that use the memory of the master's host, and the recorder."""
-        return tuple(node for node in self.plan.nodes if node in self.ready and self.ready[node].shared)
+    def ways(self, met: Collection[str]) -> Ways:
+        """How rows go between the ready nodes, of which the master has ``met`` these for row streams."""
+        ready = {node: self.ready[node] for node in self.plan.nodes if node in self.ready}
+        shared = tuple(node for node, own in ready.items() if own.shared)
+        met = {MASTER: set(met)} | {node: set(own.streams) for node, own in ready.items()}
+        pairs = {pair(one, other) for one, others in met.items() for other in others if one in met.get(other, ())}
+        return Ways(shared, tuple(sorted(pairs)))
+
+    def unmet(self, ways: Ways) -> list[tuple[str, str]]:
+        """The pairs that exchange rows by Zenoh although both have a door for a row stream."""
+        doors = {MASTER, *(node for node, own in self.admitted.items() if own.door is not None)}
+        links = [link for node in self.plan.nodes.values() for link in node.links_in if not link.initial_only]
+        ends = [(link.source_node, link.target_node) for link in links]
+        pairs = {pair(*(MASTER if name == RECORDER else name for name in both)) for both in ends}
+        return sorted(both for both in pairs if ways.way(*both) == "zenoh" and doors.issuperset(both))
 
     @property
     def missing(self) -> list[str]:

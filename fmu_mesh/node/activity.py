@@ -89,8 +89,7 @@ class Activity:
         if under_way_s > 0.0:
             try:
                 with engine.sending:
-                    for own in engine.runners:
-                        own.flush()
+                    engine.send()
             except FmuMeshError as unreachable:  # the main thread will get the same error
                 log.info("rows_not_sent", extra={"error": str(unreachable)})
         else:

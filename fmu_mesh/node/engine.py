@@ -19,13 +19,14 @@ from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.contract import StepsNatively
 from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
-from ..rings.host_memory import HostMemory
+from ..rings.host_memory import Counter, HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
+from ..rings.row_streams import RowStreams
 from ..system.plan import NodePlan
 from .inputs import TimedInputs
 from .stepping import Runner
 
-__all__ = ["BurstEngine", "Engine", "PlainEngine", "make_engine"]
+__all__ = ["BurstEngine", "Engine", "PlainEngine", "Windows", "make_engine"]
 
 # Threads: `run` belongs to the main thread, because an FMU is called from one thread only (ADR 12). From other
 # threads come: `ring_bell` (threads of Zenoh with a message, the server with a query), `current` and `spent_s` (the
@@ -54,6 +55,9 @@ _STATE_CHECK_S: Final = 0.05
 """How often in s, at the end of a burst, a changed state of the process is looked for, which takes 10 us. Models that
 are known to change it are looked after in each step."""
 
+Windows = Sequence[tuple[str, Counter, int]]
+"""Others, their progress, and how many points each of them may be behind."""
+
 _BUSY: Final = (Stage.SETTING, Stage.STEPPING, Stage.GETTING, Stage.IN_PYTHON)
 
 
@@ -63,13 +67,15 @@ class Engine(ABC):
     Args:
         units: the runners of each unit, in the order of the plan.
         memory: with the grant and the progress of all nodes.
-        shared: whether the other nodes of the run write their progress there, so that the windows are kept here.
+        windows: the progress of those whose windows are kept here, and how far each may be behind.
 
     Attributes:
         sending: held by whoever sends rows: the main thread between bursts, or another one during a long step.
     """
 
-    def __init__(self, plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory, *, shared: bool) -> None:
+    def __init__(
+        self, plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory, windows: Windows = ()
+    ) -> None:
         self.units = units
         self.runners = [runner for unit in units for runner in unit]
         self.waited_s = 0.0
@@ -77,7 +83,7 @@ class Engine(ABC):
         self._plan = plan
         self._memory = memory
         self._progress = memory.progress[plan.node]
-        self._windows = [(memory.progress[name], window) for name, window in plan.windows] if shared else []
+        self._windows = windows
         self._last_point = plan.grid.last_point
         self._looked_after: ProcessState | None = None
         self._look_at = 0.0
@@ -128,6 +134,11 @@ class Engine(ABC):
     def ring_bell(self) -> None:
         """From any thread: let `run` return after the current step."""
 
+    def send(self) -> None:
+        """While a step is under way, by another thread that holds `sending`: send all rows before it."""
+        for runner in self.runners:
+            runner.flush()
+
     @property
     def covered(self) -> int:
         """The last point for which all outputs of this node are known."""
@@ -155,29 +166,44 @@ class Engine(ABC):
         return unit[0].plan.step_points if len(unit) == 1 else 1
 
 
-def make_engine(
-    plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory, *, shared: bool, spins: bool
+def make_engine(  # noqa: PLR0913  one node and how it is connected
+    plan: NodePlan,
+    units: Sequence[Sequence[Runner]],
+    memory: HostMemory,
+    windows: Windows = (),
+    *,
+    spins: bool,
+    streams: RowStreams | None = None,
 ) -> Engine:
     """The engine for this machine."""
     if native.library is None:
-        return PlainEngine(plan, units, memory, shared=shared)
-    return BurstEngine(plan, units, memory, shared=shared, spins=spins)
+        return PlainEngine(plan, units, memory, windows)
+    return BurstEngine(plan, units, memory, windows, spins=spins, streams=streams)
 
 
 class BurstEngine(Engine):
     """Steps with the burst in C."""
 
-    def __init__(
-        self, plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory, *, shared: bool, spins: bool
+    def __init__(  # noqa: PLR0913  one node and how it is connected
+        self,
+        plan: NodePlan,
+        units: Sequence[Sequence[Runner]],
+        memory: HostMemory,
+        windows: Windows = (),
+        *,
+        spins: bool,
+        streams: RowStreams | None = None,
     ) -> None:
-        super().__init__(plan, units, memory, shared=shared)
+        super().__init__(plan, units, memory, windows)
+        self._streams = streams
         assert native.library is not None
         self._library = native.library
         self._kept: dict[str, list[object]] = {}
         self._tracks: dict[str, list[object]] = {}
-        self._peers = table(native.Peer, [native.Peer(counter.address, window) for counter, window in self._windows])
+        self._peers = table(native.Peer, [native.Peer(counter.address, window) for _, counter, window in self._windows])
         self._node = native.NodeTable(
             place=memory.place,
+            streams=streams.address if streams is not None else None,
             units=self._units,
             n_units=len(units),
             peers=self._peers,
@@ -214,6 +240,12 @@ class BurstEngine(Engine):
         self.waited_s = node.waited_ns / 1e9
         return self._ticks != before
 
+    def send(self) -> None:
+        """See `Engine`."""
+        super().send()
+        if self._streams is not None:
+            self._streams.beat()
+
     def ring_bell(self) -> None:
         """See `Engine`."""
         self._library.attend(self._address)
@@ -222,7 +254,7 @@ class BurstEngine(Engine):
     def awaited(self) -> str | None:
         """See `Engine`."""
         names = {source.counter.address: source.instance for runner in self.runners for source in runner.sources}
-        names |= {counter.address: name for name, counter in self._memory.progress.items()}
+        names |= {counter.address: name for name, counter, _ in self._windows}
         unfinished = (unit for unit in self._units if unit.tick < unit.last_tick and not unit.stopped)
         return next((names.get(unit.blocked_by) for unit in unfinished if unit.blocked_by is not None), None)
 
@@ -361,7 +393,7 @@ class PlainEngine(Engine):
         try:
             while not place.stopped and place.tick < place.last_tick and not self._attention:
                 if not place.next:
-                    limits = [counter.value - 1 + window for counter, window in self._windows]
+                    limits = [counter.value - 1 + window for _, counter, window in self._windows]
                     if place.tick * place.tick_points >= min(self._memory.grant.value, self._last_point, *limits):
                         break
                 for index in range(place.next, len(unit)):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 
 import zenoh
@@ -36,9 +36,11 @@ from ..errors import (
 )
 from ..instances.contract import Instance
 from ..rings.host_memory import ONE_CORE, HostMemory
-from ..system.plan import RECORDER, Link, NodePlan
-from ..wire.frames import FrameReceiver, of_text
+from ..rings.row_streams import RowStreams
+from ..system.plan import MASTER, RECORDER, Link, NodePlan
+from ..wire.frames import FrameReceiver, SourceRows, of_text
 from ..wire.inbox import Inbox, Message
+from ..wire.meeting import Meeting
 from ..wire.membership import Membership, Welcome
 from ..wire.messages import (
     ABORT,
@@ -55,13 +57,17 @@ from ..wire.messages import (
     encode_json,
 )
 from ..wire.session import RouterLink
+from ..wire.stream_keeper import StreamKeeper
+from ..wire.streamed_rows import why_not
+from ..wire.ways import Ways
 from .activity import Activity
-from .engine import Engine, make_engine
+from .engine import Engine, Windows, make_engine
 from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
 from .stepping import Runner, connect
+from .stream_ends import streams_of
 from .streams import PRIORITY
 from .time_measurement import Profiler
 
@@ -100,6 +106,7 @@ class Node:
         open_instance: opens an instance of the plan by name; the caller closes the instances too.
         on_hang: called on another thread if a step does not return in time.
         launch: the launcher that started this process; None if it was started manually.
+        meeting: where it meets others for row streams; the caller closes it.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -116,6 +123,7 @@ class Node:
         on_hang: Callable[[FmuError], None] = lambda _error: None,
         router: RouterLink | None = None,
         launch: str | None = None,
+        meeting: Meeting | None = None,
         engine: Callable[..., Engine] = make_engine,
     ) -> None:
         self._plan = plan
@@ -134,7 +142,12 @@ class Node:
         self._engine: Engine | None = None
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
-        self._membership = Membership(plan, session, self._inbox, launch, router)
+        self._membership = Membership(plan, session, self._inbox, launch, router, meeting=meeting)
+        self._meeting = meeting
+        self._ways = Ways()
+        self._streams: RowStreams | None = None
+        self._keeper: StreamKeeper | None = None
+        self._mirrors: Mapping[int, SourceRows] = {}
         self._profiler: Profiler | None = None
         self._activity = Activity(plan, self._inbox.refusals)
         self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self._tell_set)
@@ -170,6 +183,10 @@ class Node:
             raise located from error
         finally:
             self.server.close()
+            if self._keeper is not None:
+                self._keeper.close()
+            if self._streams is not None:
+                self._streams.close()
             self._membership.close()
             self._inbox.close()
             self._memory.close()
@@ -208,7 +225,7 @@ class Node:
             instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
-        self._memory = self._membership.open_memory() or self._own_memory
+        self._memory = self._membership.memory or self._own_memory
         for place in plan.rings:
             if place.instance in instances:
                 ring, counter = self._memory.ring(place), self._memory.counter(place.counter)
@@ -233,14 +250,16 @@ class Node:
         """Connect the runners with the rings of their sources, and make links for what no ring carries."""
         plan, membership = self._plan, self._membership
         keys = membership.keys(plan.timeouts.start)
-        shares = {*welcome.shared, RECORDER} if self._memory is not self._own_memory else set()
+        self._ways = ways = welcome.ways
+        if self._meeting is not None and not ways.streams_of(plan.node):
+            self._meeting.close()  # nobody needs its door
         for link in plan.links_out:
             runner = self._runners[link.source]
             put = membership.sender(keys.frames(link.source, link.target_node))
-            layout = of_text(link.layout) if link.target_node in shares else link.layout
+            layout = link.layout if ways.way(plan.node, link.target_node) == "zenoh" else of_text(link.layout)
             links = self._initialization.out_links if link.initial_only else runner.out_links
             links.append(OutLink(link, layout, runner.outputs, put))
-        self._receivers = connect(plan, self._runners, self._memory, self._own_memory, shares)
+        self._receivers, self._mirrors = connect(plan, self._runners, self._memory, self._own_memory, ways)
         self._put_progress = membership.sender(keys.progress(plan.node))
         self._put_set = membership.sender(keys.settings(plan.node))
 
@@ -250,8 +269,18 @@ class Node:
         plan = self._plan
         self._initialization.run(self._runners.values())
         units = [[self._runners[name] for name in names] for names in plan.units]
-        shared = self._memory is not self._own_memory
-        self._engine = engine = self._make_engine(plan, units, self._memory, shared=shared, spins=not ONE_CORE)
+        self._streams = streams = self._make_streams()
+        if streams is not None and self._meeting is not None:
+            peers = self._ways.streams_of(plan.node)
+            self._keeper = StreamKeeper(streams, self._meeting, peers, self._inbox.post)
+        self._engine = engine = self._make_engine(
+            plan,
+            units,
+            self._memory,
+            self._windows(),
+            spins=not ONE_CORE,
+            streams=streams,
+        )
         self._inbox.move_to(self._memory, engine)
         self._activity.steps_with(engine)
         for runner in self._runners.values():
@@ -261,6 +290,36 @@ class Node:
         self._memory.progress[plan.node].raise_to(engine.covered + 1)
         self._tell_progress(engine)
         return engine
+
+    def _windows(self) -> Windows:
+        """Whose progress is known here, and how far each may be behind; the master keeps the windows of the others."""
+        ways, node, targets = self._ways, self._plan.node, self._plan.step_targets
+        told = {name: counter for name, counter in self._own_memory.progress.items() if name in targets}
+        known = {"ring": self._memory.progress, "stream": told}
+        ways_of = {name: ways.way(node, name) for name, _ in self._plan.windows if name != node}
+        return [
+            (name, counters[name], window)
+            for name, window in self._plan.windows
+            if name in (counters := known.get(ways_of.get(name, "zenoh"), {}))
+        ]
+
+    def _make_streams(self) -> RowStreams | None:
+        if self._meeting is None:
+            return None
+        ways, sockets = self._ways, self._meeting.sockets
+        return streams_of(self._plan, ways, sockets, self._runners, self._mirrors, self._memory, self._own_memory)
+
+    def _check_streams(self) -> None:
+        """Whether each stream can still be used.
+
+        Raises:
+            FmuMeshError: one has brought what is no part of this run.
+        """
+        for peer, state, about, row in self._streams.states() if self._streams is not None else ():
+            if (error := why_not(peer, state, about, row, (*self._plan.links_in, *self._plan.links_out))) is not None:
+                raise error
+        if self._keeper is not None:
+            self._keeper.check(self._plan.node, self._plan.timeouts.link)
 
     # --- from point to point
 
@@ -277,6 +336,7 @@ class Node:
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)
+            self._check_streams()
             if self._profiler is not None:
                 self._profiler.look(engine)
             with engine.sending:
@@ -331,8 +391,8 @@ class Node:
         _, kind, _, _, point, data = message
         if kind == GRANT:
             self._heard = self._clock()
-            if self._memory is not self._own_memory:
-                return  # the grant itself is in the shared memory; this is a sign of life
+            if self._ways.way(self._plan.node, MASTER) != "zenoh":
+                return  # the grant itself comes another way; this is a sign of life
             if point > (most := self._progress_sent + self._plan.window):
                 raise ProtocolBroken(
                     f"the master grants point {point} to node '{self._plan.node}', which may be granted {most} at most",
@@ -353,7 +413,7 @@ class Node:
         the window, so the other node can still step.
         """
         covered = engine.covered
-        if self._memory is not self._own_memory or covered == self._progress_sent:
+        if self._ways.way(self._plan.node, MASTER) != "zenoh" or covered == self._progress_sent:
             return
         now = time.monotonic()
         due = covered - self._progress_sent >= self._plan.progress_stride or now - self._progress_told_at > _TELL_S
@@ -397,6 +457,10 @@ class Node:
         try:
             for runner in self._runners.values():
                 runner.send_last(runner.step + 1 if running else 0)
+            if self._streams is not None and self._ways.way(self._plan.node, RECORDER) == "stream":
+                for link in self._plan.links_out:
+                    if link.target_node == RECORDER:
+                        self._streams.say_last(link.index)
         except FmuMeshError as unreachable:
             log.info("last_rows_not_sent", extra={"error": str(unreachable)})
 

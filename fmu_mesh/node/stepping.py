@@ -6,7 +6,7 @@ that frames fill. It owns nothing about waiting. `fmu_mesh.node.engine` steps th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple, Protocol, cast
 
@@ -24,6 +24,7 @@ from ..system.layout import Layout
 from ..system.plan import InstancePlan, Link, NodePlan
 from ..system.window import rows_of_ring
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
+from ..wire.ways import Ways
 from .links import OutLink
 
 __all__ = ["Runner", "Source", "connect", "sources_of"]
@@ -202,35 +203,46 @@ class Runner:
         return f"'{source.instance}.{output}', which feeds '{self.name}.{own}'"
 
 
+_NO_WAYS = Ways()
+
+
+class Connected(NamedTuple):
+    """What takes the frames of each link, by its number; the link itself if it brings initial values only.
+
+    And where the rows of each link come to that has a stream.
+    """
+
+    receivers: dict[int, FrameReceiver | Link]
+    streamed: dict[int, SourceRows]
+
+
 def connect(
     plan: NodePlan,
     runners: Mapping[str, Runner],
     memory: HostMemory,
     own_memory: HostMemory,
-    shares: Collection[str],
-) -> dict[int, FrameReceiver | Link]:
-    """Give all runners their sources: in ``memory`` for nodes that share it, and in mirrors for all others.
-
-    Returns:
-        What takes the frames of each link, by its number; the link itself if it brings initial values only.
-    """
+    ways: Ways = _NO_WAYS,
+) -> Connected:
+    """Give all runners their sources: in ``memory`` for nodes that share it, and in mirrors for all others."""
     rows: dict[str, list[SourceRows]] = {name: [SourceRows(own.outputs, own.counter)] for name, own in runners.items()}
     places = {place.instance: place for place in plan.rings}
     receivers: dict[int, FrameReceiver | Link] = {}
+    streamed: dict[int, SourceRows] = {}
     for link in plan.links_in:
         receivers[link.index] = link
         if link.initial_only:
             continue
-        shared = memory if link.source_node in shares else None
-        fits = partial(_fits, runners, link.source)
-        found, receiver = rows_of(link, places[link.source], shared, own_memory, fits)
+        way, fits = ways.way(plan.node, link.source_node), partial(_fits, runners, link.source)
+        found, receiver = rows_of(link, places[link.source], way, memory, own_memory, fits)
+        if way == "stream":
+            streamed.update((link.index, own) for own in found if own.text is False)
         rows.setdefault(link.source, []).extend(found)
         if receiver is not None:
             receivers[link.index] = receiver
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
         runner.sources.extend(sources_of(runner, rows, points))
-    return receivers
+    return Connected(receivers, streamed)
 
 
 def sources_of(

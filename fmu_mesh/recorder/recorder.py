@@ -31,7 +31,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -64,6 +64,7 @@ from ..wire.messages import (
     SetValue,
     decode_json,
 )
+from ..wire.ways import Ways
 
 __all__ = ["RecordedSource", "Recorder"]
 
@@ -92,6 +93,8 @@ class Recorder:
         files: the result files, in the order of the plan; closed by the recorder.
         has_begun: whether all instances have reached point 0; nothing is written before.
         notes: the folder of the run, if somebody counts the rows when this process was killed (`rows_left`).
+        memory: that of the master's process, if others exchange rows through it or through its row streams.
+        mirror_of: where the rows of a link come to that has a row stream.
 
     Use it as a context manager: the thread runs inside; afterwards the files have all complete rows.
     """
@@ -107,8 +110,10 @@ class Recorder:
         notes: Path | None = None,
         launch: str | None = None,
         memory: HostMemory | None = None,
+        mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
     ) -> None:
         self._plan = plan
+        self._mirror_of = mirror_of
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
@@ -187,8 +192,7 @@ class Recorder:
             progress_key = self._membership.keys(self._plan.timeouts.start).progress(RECORDER)
         except MeshLost:
             return False
-        shares = welcome.shared if self._memory is not self._own_memory else ()
-        self._sources = {link.index: self._source(link, shares) for link in self._plan.links_in}
+        self._sources = {link.index: self._source(link, welcome.ways) for link in self._plan.links_in}
         by_name = {source.link.source: source for source in self._sources.values()}
         self._files.begin(
             self._plan.grid, self._plan.records, lambda instance, variable: by_name[instance].column(variable)
@@ -196,7 +200,7 @@ class Recorder:
         self._put_progress = self._membership.sender(progress_key)
         return True
 
-    def _source(self, link: Link, shares: Collection[str]) -> RecordedSource:
+    def _source(self, link: Link, ways: Ways) -> RecordedSource:
         """Where the rows of an instance are: in its ring, in a mirror that frames fill, or text in the mirror."""
         place = next(place for place in self._plan.rings if place.instance == link.source)
 
@@ -204,8 +208,10 @@ class Recorder:
             """Whether rows of the source before its own step ``end`` overwrite no rows that are not written yet."""
             return end - self._written // link.step_points <= place.rows
 
-        shared = self._memory if link.source_node in shares else None
-        rows, receiver = rows_of(link, place, shared, self._own_memory, fits)
+        way, mirror = ways.way(RECORDER, link.source_node), self._mirror_of(link)
+        rows, receiver = rows_of(link, place, way, self._memory, self._own_memory, fits)
+        if mirror is not None:
+            rows = [mirror if own.text is False else own for own in rows]
         return RecordedSource(link, self._plan.grid.last_point, rows, receiver)
 
     def _record(self) -> None:
@@ -235,6 +241,10 @@ class Recorder:
         slowest = min(self._sources.values(), key=lambda source: source.covered)
         rows = due // slowest.link.step_points + 1
         return [(counter, rows) for counter in slowest.counters]
+
+    def note_last(self, source: str) -> None:
+        """From any thread: all rows of an instance have come by its row stream."""
+        self._inbox.post(lambda: self._ended.add(source))
 
     def _take(self, message: Message) -> None:
         self._inbox.hand_on(message, self._take_from_master, self._take_from_node)

@@ -294,7 +294,7 @@ class _Run:
             ring, counter = memory.ring(place), memory.counter(place.counter)
             timed = with_times(instance, item, node.grid)
             self._runners[item.name] = Runner(item, timed, node.grid, ring, counter)
-        connect(node, self._runners, memory, memory, ())
+        connect(node, self._runners, memory, memory)
 
     def _instance(self, name: str) -> Instance:
         run, around = self._run, self._around
@@ -308,7 +308,7 @@ class _Run:
         node, runners = self._node, self._runners.values()
         Initialization(node, _nothing_comes).run(runners)
         units = [[self._runners[name] for name in names] for names in node.units]
-        engine = make_engine(node, units, memory, shared=False, spins=False)
+        engine = make_engine(node, units, memory, spins=False)
         for runner in runners:
             runner.begin()
         self._engine = engine

@@ -27,6 +27,7 @@ from ..results.growth import GrowthWatch
 from ..results.record_files import open_results
 from ..system.plan import MASTER, RECORDER
 from ..wire.keys import Keys
+from ..wire.meeting import meeting_of
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
@@ -122,8 +123,17 @@ class _NodeProcess:
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
         router = RouterLink(session, run.zenoh.connect)
+        meeting = meeting_of(plan.node, process.folder, own) if plan.row_streams else None
+        if meeting is not None:
+            process.stack.callback(meeting.close)
         self._node = node = Node(
-            plan, session, self._open, on_hang=self._take_hang, router=router, launch=process.launch
+            plan,
+            session,
+            self._open,
+            on_hang=self._take_hang,
+            router=router,
+            launch=process.launch,
+            meeting=meeting,
         )
         process.interruption.goes_to(node.interrupt)
         try:
@@ -200,7 +210,11 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 profile=run.profile,
                 paused=run.paused,
             )
-            master = Master(plan, session, _Emitter(emit), settings, RouterLink(session, config.zenoh.connect))
+            meeting = meeting_of(MASTER, process.folder, own) if config.zenoh.row_streams else None
+            if meeting is not None:
+                process.stack.callback(meeting.close)
+            router = RouterLink(session, config.zenoh.connect)
+            master = Master(plan, session, _Emitter(emit), settings, router, meeting)
             process.stack.callback(master.close)
             master.claim()
         except FmuMeshError as error:  # before the first point, such as at a port that is in use
@@ -224,7 +238,10 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     notes=process.folder if process.is_child else None,
                     launch=process.launch,
                     memory=master.memory_for(RECORDER),
+                    mirror_of=master.streams.mirror if master.streams is not None else lambda _link: None,
                 )
+                if master.streams is not None:
+                    master.streams.tell_last(recorder.note_last)
             with recorder or nullcontext():
                 master.run()
         except FmuMeshError as error:

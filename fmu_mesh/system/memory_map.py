@@ -7,18 +7,22 @@ progress of each node, and the rows of each instance; then the rings. `fmu_mesh.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import msgspec
 
 from .layout import Layout, row_bytes
 
-__all__ = ["MASTER", "RECORDER", "MemoryMap", "RingPlace", "map_memory"]
+__all__ = ["MASTER", "RECORDER", "STREAMS", "MemoryMap", "RingPlace", "map_memory"]
 
 RECORDER = "@record"
 """Name of the recorder in place of the name of a node. No instance can have it."""
 
 MASTER = "@mesh"
 """Name of the master in place of the name of a node."""
+
+STREAMS = "@streams"
+"""Name of the thread that moves the row streams of the master's process, where it has a bell."""
 
 _LINE = 64
 """Size of a cache line in bytes. Two processes that write do not share one."""
@@ -33,6 +37,7 @@ class RingPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         step_points: base points per own step.
         rows: number of rows, a power of two.
         counter: offset of the counter of complete rows, in bytes.
+        text_counter: the same for rows whose text comes beside them, at another time.
         offset: offset of the first row, in bytes.
     """
 
@@ -42,6 +47,7 @@ class RingPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     layout: Layout
     rows: int
     counter: int
+    text_counter: int
     offset: int
 
 
@@ -53,14 +59,16 @@ class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         size: of the memory.
         bells: offset of the first bell; each takes 64 bytes.
         grant: the counter of granted points.
-        progress: the counters of known points, in the order of ``processes``; the master has none.
-        rings: the counters of complete rows of all instances.
+        sent: the counter of those points that were granted to processes of other hosts.
+        progress: the counters of known points, in the order of ``processes``; the last two have none.
+        rings: the counters of complete rows of all instances, and those of their text.
     """
 
     processes: tuple[str, ...]
     size: int
     bells: int
     grant: int
+    sent: int
     progress: tuple[int, ...]
     rings: tuple[int, ...]
 
@@ -76,21 +84,23 @@ class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def map_memory(
     processes: Sequence[str], rings: Mapping[str, tuple[str, int, Layout, int]]
 ) -> tuple[MemoryMap, dict[str, RingPlace]]:
-    """The map, and the place of each ring by instance; the processes are all nodes, then the master.
+    """The map, and the place of each ring by instance; the processes are all nodes. The master and `STREAMS` follow.
 
     A ring is given by its node, base points per own step, outputs and number of rows.
     """
     ends = _Places(_TOKEN_LINES * _LINE)
-    counter = _LINE + 8 * len(processes)
-    bells = ends.take(_LINE * len(processes))
-    grant = ends.take(counter)
-    progress = tuple(ends.take(counter) for _ in processes[:-1])
-    counters = {name: ends.take(counter) for name in rings}
+    everybody = (*processes, MASTER, STREAMS)
+    counter = _LINE + 8 * len(everybody)
+    bells = ends.take(_LINE * len(everybody))
+    grant, sent = ends.take(counter), ends.take(counter)
+    progress = tuple(ends.take(counter) for _ in processes)
+    counters = {name: (ends.take(counter), ends.take(counter)) for name in rings}
     places = {
-        name: RingPlace(name, node, points, layout, rows, counters[name], ends.take(rows * row_bytes(layout)))
+        name: RingPlace(name, node, points, layout, rows, *counters[name], ends.take(rows * row_bytes(layout)))
         for name, (node, points, layout, rows) in rings.items()
     }
-    return MemoryMap(tuple(processes), ends.end, bells, grant, progress, tuple(counters.values())), places
+    every = tuple(chain.from_iterable(counters.values()))
+    return MemoryMap(everybody, ends.end, bells, grant, sent, progress, every), places
 
 
 class _Places:

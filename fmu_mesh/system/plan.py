@@ -129,6 +129,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         loops: the algebraic loops at the start that have instances of this node.
         initialization: how these loops are iterated.
         shared_memory: whether processes of one host exchange messages through shared memory.
+        row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder.
     """
 
@@ -153,6 +154,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     records: tuple[RecordPlan, ...] = ()
     limits: LimitsConfig = LimitsConfig()
     shared_memory: bool = True
+    row_streams: bool = True
     restarts: int = 0
 
     def instance(self, name: str) -> InstancePlan:
@@ -173,6 +175,16 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Names of the nodes that exchange frames with this one, without the recorder, which is part of the master."""
         nodes = {link.source_node for link in self.links_in} | {link.target_node for link in self.links_out}
         return nodes - {RECORDER}
+
+    @property
+    def step_sources(self) -> set[str]:
+        """Names of the nodes whose rows it needs in its steps."""
+        return {link.source_node for link in self.links_in if not link.initial_only}
+
+    @property
+    def step_targets(self) -> set[str]:
+        """Names of the nodes that need its rows in their steps, with the recorder."""
+        return {link.target_node for link in self.links_out if not link.initial_only}
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -285,7 +297,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
         behind = (windows[RECORDER] if name in recorded else plan.window) + 3 * longest_step
         count = rows_of_ring(outputs[name], -(-behind // own.step_points), max(windows.values()))
         rings[name] = own.node, own.step_points, outputs[name], count
-    memory, places = map_memory([*windows, MASTER], rings)
+    memory, places = map_memory([*windows], rings)
     nodes = {}
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
@@ -317,6 +329,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             records=system.records if node == RECORDER else (),
             limits=config.limits,
             shared_memory=config.zenoh.shared_memory,
+            row_streams=config.zenoh.row_streams,
         )
     return nodes
 

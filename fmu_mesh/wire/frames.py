@@ -24,6 +24,7 @@ from ..system.memory_map import RingPlace
 from ..system.plan import RECORDER, Link
 from ..variables.value_types import DTYPES, Value, VariableType, is_text
 from .messages import HEADER, MAX_MESSAGE_SIZE
+from .ways import Way
 
 __all__ = [
     "FrameReceiver",
@@ -32,6 +33,7 @@ __all__ = [
     "encode_frames",
     "encode_rows",
     "initial_values",
+    "of_numbers",
     "of_text",
     "rows_of",
 ]
@@ -50,19 +52,25 @@ class SourceRows(NamedTuple):
     text: bool | None = None
 
 
-def rows_of(
-    link: Link, place: RingPlace, shared: HostMemory | None, own: HostMemory, fits: Callable[[int], bool]
+def rows_of(  # noqa: PLR0913, PLR0917  a link, and where its rows may be
+    link: Link, place: RingPlace, way: Way, memory: HostMemory, own: HostMemory, fits: Callable[[int], bool]
 ) -> tuple[list[SourceRows], FrameReceiver | None]:
     """Where the target of a link finds the rows of the source, and what takes the frames of the link.
 
-    The ring is at ``place`` in the memory that source and target share. If they share none, all columns come in frames;
-    otherwise those with text. The rows of frames are in a mirror, whose counter is in the ``own`` memory of the target.
+    By a ``ring``, numbers are at ``place`` in the ``memory`` that source and target share. By a ``stream``, they come
+    to a mirror of it, whose counter is in the ``own`` memory of the target, as that of each mirror. Text comes in
+    frames, and ``by Zenoh`` all columns do.
     """
-    rows = [SourceRows(shared.ring(place), shared.counter(place.counter), text=False)] if shared is not None else []
-    layout = link.layout if shared is None else of_text(link.layout)
+    rows, layout, counter = [], link.layout, own.counter(place.counter)
+    if way != "zenoh":
+        layout, counter, numbers = of_text(link.layout), own.counter(place.text_counter), of_numbers(link.layout)
+        if way == "ring":
+            rows.append(SourceRows(memory.ring(place), memory.counter(place.counter), text=False))
+        elif numbers.columns:
+            rows.append(SourceRows(Ring(numbers, place.rows), own.counter(place.counter), text=False))
     if not layout.columns:
         return rows, None
-    mirror = SourceRows(Ring(layout, place.rows), own.counter(place.counter), None if shared is None else True)
+    mirror = SourceRows(Ring(layout, place.rows), counter, None if way == "zenoh" else True)
     return [*rows, mirror], FrameReceiver(link, mirror.ring, mirror.counter, fits)
 
 
@@ -127,6 +135,11 @@ class FrameReceiver:
                 part[numbers & ring.mask] = new[received - first :]
             ring.stamps[numbers & ring.mask] = numbers + 1
             self._counter.raise_to(end)
+
+
+def of_numbers(layout: Layout) -> Layout:
+    """The columns without text."""
+    return Layout(tuple(column for column in layout.columns if not is_text(column.type)))
 
 
 def of_text(layout: Layout) -> Layout:

@@ -4,7 +4,8 @@ There are three steps; each is a query with an answer:
 
 * **register** with the master, which admits the node and answers with the run's id, or refuses it. The node declares
   nothing before, so a process that is not part of the run does not affect it.
-* **hello** to every node that sends frames to this one: a source that answers knows the subscription of this node.
+* **hello** to every node that sends rows to this one: a source that answers knows the subscription of this node. Those
+  that share no memory meet for a row stream (`fmu_mesh.wire.meeting`).
 * **ready** to the master, which answers when all nodes are ready.
 """
 
@@ -28,10 +29,12 @@ from ..rings.host_memory import HostMemory, Offer
 from ..system.plan import MASTER, RECORDER, NodePlan
 from .inbox import Inbox
 from .keys import RUN_ID_BYTES, Keys, RunKeys
+from .meeting import Door, Meeting
 from .messages import NodeReport, decode_json, sealed
 from .refusals import payload_of
 from .runtime import STOPPED, is_alive, is_stopped
 from .session import Question, RouterLink, ask, tokens
+from .ways import Ways
 
 __all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
 
@@ -67,6 +70,7 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         launch: the launcher that started it; None if it was started manually.
+        door: where the master reaches the process for a row stream.
         seal: the secret of the process, `sealed` twice. Its readiness contains the secret sealed once, and its report
             the secret itself. So nobody can send them who has only read what came before. No other process has the
             same one, while two hosts may have one process id and one host name.
@@ -78,6 +82,7 @@ class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     host: str
     launch: str | None = None
     seal: str = ""
+    door: Door | None = None
 
 
 class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,24 +91,35 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         grants: the key of the master's messages to this node.
         offer: the memory that processes on the master's host share; None if there is none.
+        door: where the process reaches the master for a row stream.
     """
 
     run: Annotated[str, msgspec.Meta(pattern=f"^[0-9a-f]{{{2 * RUN_ID_BYTES}}}$")]
     grants: str
     offer: Offer | None = None
+    door: Door | None = None
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node sends to its sources."""
+    """What a node sends to its sources, and what they answer: who it is, and how it can exchange rows."""
 
     node: str
+    shared: bool = False
+    door: Door | None = None
 
 
 class NodeReady(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a node reports when its links work; ``opened`` is what its seal was made from."""
+    """What a node reports when its links work.
+
+    Attributes:
+        shared: whether it uses the memory of the master's host.
+        opened: what its seal was made from.
+        streams: those with whom it has a socket for a row stream.
+    """
 
     shared: bool = False
     opened: str = ""
+    streams: tuple[str, ...] = ()
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -111,11 +127,11 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         profile: how many bursts and waits the node stores for a profile; 0: nothing is measured.
-        shared: the nodes that use the shared memory. The recorder always does if there is any.
+        ways: how rows go.
     """
 
     profile: int = 0
-    shared: tuple[str, ...] = ()
+    ways: Ways = Ways()
 
 
 class Membership:
@@ -124,9 +140,10 @@ class Membership:
     Args:
         inbox: its inbox; opened by `join`.
         memory: the shared memory, for a participant in the process of the master.
+        meeting: where it meets others for row streams; None: all of its rows go by rings and by Zenoh.
 
     Attributes:
-        memory: the shared memory, once `open_memory` has opened it; None if this process does not share any.
+        memory: the shared memory, from the admission on; None if this process does not share any.
         lost_master: whether the master was found to be gone, or does not answer.
         lost_link: whether only the link to it may be lost, so that nobody else can say it.
 
@@ -141,8 +158,10 @@ class Membership:
         launch: str | None = None,
         router: RouterLink | None = None,
         memory: HostMemory | None = None,
+        meeting: Meeting | None = None,
     ) -> None:
         self._plan = plan
+        self._meeting = meeting
         self._router = router or RouterLink(session)
         self.lost_master = self.lost_link = False
         self._stopped_s = 0.0
@@ -271,16 +290,6 @@ class Membership:
         question = Question(key, "the master", timeout_s, payload, priority=priority)
         ask(self._session, question, over)
 
-    def open_memory(self) -> HostMemory | None:
-        """The memory that the processes of the master's host share; None if this process cannot, or must not, open it.
-
-        Call it after `keys` and before `join`.
-        """
-        offer = self._admitted.result(0).offer
-        if self.memory is None and offer is not None and self._plan.shared_memory:
-            self.memory = HostMemory.opened(offer, self._plan.memory, self._plan.node)
-        return self.memory
-
     def join(self) -> Welcome:
         """Wait until the links with all other nodes work in both directions, then tell the master.
 
@@ -295,11 +304,11 @@ class Membership:
         if plan.node == RECORDER:
             senders |= {keys.settings(node): node for node, _ in plan.windows if node != RECORDER}
         inbox.open(self._session, keys, plan.node, {**senders, self._admitted.result(0).grants: MASTER})
-        hello = msgspec.json.encode(Hello(plan.node))
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
-            question = Question(keys.hello(node), f"node '{node}'", deadline_s, hello)
-            ask(self._session, question, self._has_nothing_to_join)
-        ready = msgspec.json.encode(NodeReady(self.memory is not None, sealed(self._secret)))
+            question = Question(keys.hello(node), f"node '{node}'", deadline_s, self._hello_to(node))
+            self._heard_hello(decode_json(ask(self._session, question, self._has_nothing_to_join), Hello))
+        streams = self._meet(deadline_s)
+        ready = msgspec.json.encode(NodeReady(self.memory is not None, sealed(self._secret), streams))
         question = Question(keys.ready(plan.node), "the master", 2 * deadline_s, ready)  # it waits for all others
         answer = ask(self._session, question, self._has_nothing_to_join)
         self._router.look()
@@ -320,11 +329,16 @@ class Membership:
         """Register, then declare the token and `hello`: the master notices from now on if this process is lost."""
         plan, stack = self._plan, self._stack
         seal, host = sealed(sealed(self._secret)), socket.gethostname()
-        registration = Registration(plan.node, plan.digest, os.getpid(), host, self._launch, seal)
+        door = self._meeting.door_for(MASTER) if self._meeting is not None else None
+        registration = Registration(plan.node, plan.digest, os.getpid(), host, self._launch, seal, door)
         payload = msgspec.json.encode(registration)
         question = Question(self._public.register, "the master", plan.timeouts.start, payload)
         admission = _understood(ask(self._session, question, lambda: self.given_up), Admission)
         self._keys = keys = self._public.run(admission.run)
+        if self.memory is None and admission.offer is not None and plan.shared_memory:
+            self.memory = HostMemory.opened(admission.offer, plan.memory, plan.node)
+        if self._meeting is not None:
+            self._meeting.knows(MASTER, admission.door if self.memory is None else None)
 
         def master_changed(sample: zenoh.Sample) -> None:
             if sample.kind == zenoh.SampleKind.DELETE:
@@ -344,8 +358,27 @@ class Membership:
             hello = decode_json(payload_of(query), Hello)
             if hello.node not in {link.target_node for link in self._plan.links_out}:
                 raise MessageRefused("its sender receives nothing from this node")
-            query.reply(query.key_expr, b"")
+            self._heard_hello(hello)
+            query.reply(query.key_expr, self._hello_to(hello.node))
             query.drop()
+
+    def _hello_to(self, peer: str) -> bytes:
+        door = self._meeting.door_for(peer) if self._meeting is not None and peer != RECORDER else None
+        return msgspec.json.encode(Hello(self._plan.node, self.memory is not None, door))
+
+    def _heard_hello(self, hello: Hello) -> None:
+        """From any thread: note where a peer is to be met, unless both share memory."""
+        if self._meeting is not None:
+            shares = hello.shared and self.memory is not None
+            self._meeting.knows(hello.node, None if shares else hello.door)
+
+    def _meet(self, deadline_s: float) -> tuple[str, ...]:
+        """Meet all with whom this node exchanges rows, and shares no memory; those that were met."""
+        if self._meeting is None:
+            return ()
+        peers = (self._plan.step_sources | self._plan.step_targets | {MASTER}) - {RECORDER}
+        self._meeting.settle(peers, deadline_s, self._has_nothing_to_join)
+        return tuple(self._meeting.sockets)
 
     def _has_nothing_to_join(self) -> bool:
         if self._master_went and not self.given_up:

@@ -21,6 +21,7 @@ from .time_profile import NodeProfile
 
 __all__ = [
     "ABORT",
+    "ALIVE",
     "FINISH",
     "FRAME",
     "GRANT",
@@ -46,6 +47,8 @@ FINISH: Final = 5
 ABORT: Final = 6
 LAST: Final = 8
 SET: Final = 9
+ALIVE: Final = 10
+"""Only in a row stream: its sender lives."""
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 

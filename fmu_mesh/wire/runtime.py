@@ -36,6 +36,7 @@ __all__ = [
     "leave_run_folder",
     "meshes",
     "remove_stale_folders",
+    "rows_socket",
     "run_folder",
     "run_name",
     "runtime_folder",
@@ -48,6 +49,7 @@ __all__ = [
 _SOCKET_PATH_LIMIT = 107
 """Of the system: 108 bytes with a zero at the end (unix(7))."""
 _SOCKET = ".sock"
+_ROWS = ".rows"
 _FOLDER_HINT = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
 _PF_EXITING = 0x4
 STOPPED = "is stopped (state T)"
@@ -230,7 +232,8 @@ def _remove_traces(folder: Path, name: str) -> None:
     remove_tree(folder / "fmus" / name)
     if (note := folder / f"{name}.pid").exists():
         used = f"{name.partition('.')[2]}{_SOCKET}"
-        for file in (folder / used, folder / f"{used}.lock", note):  # Zenoh uses a lock file beside its socket
+        others = f"{used}.lock", used.replace(_SOCKET, _ROWS)  # Zenoh uses a lock file beside its socket
+        for file in (folder / used, *(folder / other for other in others), note):
             file.unlink(missing_ok=True)
 
 
@@ -263,6 +266,11 @@ def socket_endpoint(folder: Path, node: str) -> str:
             hint="Set FMU_MESH_RUNTIME_DIR to a shorter path.",
         )
     return f"unixsock-stream/{path}"
+
+
+def rows_socket(folder: Path, node: str) -> Path:
+    """The socket where a node waits for row streams, in the folder of a run."""
+    return folder / _socket_name(node).replace(_SOCKET, _ROWS)
 
 
 def _socket_name(node: str) -> str:

@@ -171,8 +171,9 @@ class MeshInfo(msgspec.Struct, frozen=True):
     Attributes:
         run: the id of the run, which all its internal keys contain.
         result_file: the first result file; None if nothing is recorded.
-        shared_memory: the processes that exchange values, grants and progress through the memory of the master's host;
-            all others do it through Zenoh. Empty until all nodes are ready.
+        shared_memory: the processes that exchange values, grants and progress through the memory of the master's host.
+            Empty until all nodes are ready.
+        row_streams: the pairs of processes that do it by a row stream; all others do it through Zenoh.
         host_id: of the master's host; ``host`` is a name, which two hosts can have.
     """
 
@@ -193,6 +194,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     pid: int
     host: str
     shared_memory: tuple[str, ...] = ()
+    row_streams: tuple[tuple[str, str], ...] = ()
     result_files: tuple[str, ...] = ()
     host_id: str = ""
 

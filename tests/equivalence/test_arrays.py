@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.run import limits
 from fmu_mesh.system.layout import row_bytes
+from tests.helpers import BY_STREAMS, BY_ZENOH
 
 PARTS = '''\
 """Fields and images."""
@@ -71,7 +73,12 @@ NAMES = ("filter.light", "sum.total", "sum.last")
 
 
 def mesh_of(
-    folder: Path, size: int, *, window: int | str = "auto", record: tuple[str, ...] = NAMES, shared: bool = True
+    folder: Path,
+    size: int,
+    *,
+    window: int | str = "auto",
+    record: tuple[str, ...] = NAMES,
+    way: Mapping[str, bool] = {},
 ) -> fmu_mesh.Mesh:
     """Camera -> filter -> sum, with a factor on the way."""
     (folder / "parts.py").write_text(PARTS.format(size=size))
@@ -88,7 +95,7 @@ connections:
   - camera.image -> filter.image
   - {{from: filter.y, to: sum.u, factor: 1.0e-200}}
 record: {{file: fields.csv, variables: {json.dumps(record)}}}
-zenoh: {{shared_memory: {json.dumps(shared)}}}
+zenoh: {json.dumps(way)}
 """)
     return fmu_mesh.load(config)
 
@@ -120,8 +127,9 @@ def test_arrays_have_the_same_floats_in_all_ways(size: int, tmp_path: Path) -> N
     assert image.tolist() == np.full((size // 50, 50), 39).tolist()
 
 
-def test_arrays_in_frames_have_the_same_floats(tmp_path: Path) -> None:
-    mesh = mesh_of(tmp_path, 100_000, window=3, shared=False)
+@pytest.mark.parametrize("way", [BY_STREAMS, BY_ZENOH], ids=["streams", "frames"])
+def test_arrays_between_hosts_have_the_same_floats(tmp_path: Path, way: Mapping[str, bool]) -> None:
+    mesh = mesh_of(tmp_path, 100_000, window=3, way=dict(way))
 
     framed = mesh.run()
 

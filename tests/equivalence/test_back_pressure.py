@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 from fmu_mesh.run.options import PlanOptions
-from tests.helpers import Place, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, write_config
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
@@ -21,8 +22,10 @@ TINY_QUEUES = """
 """
 
 
-@pytest.mark.parametrize("way", ["shared memory", "zenoh"])
-def test_a_chain_of_eight_with_slow_end_runs_through_with_nothing_lost(way: str, place: Place, faulty: Path) -> None:
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "zenoh"])
+def test_a_chain_of_eight_with_slow_end_runs_through_with_nothing_lost(
+    way: Mapping[str, bool], place: Place, faulty: Path
+) -> None:
     """The queues of Zenoh hold one message each; that shared memory blocks when it is full has tests of its own."""
     (place.folder / "zenoh.json5").write_text(TINY_QUEUES, encoding="utf-8")
     names = [f"i{number}" for number in range(7)]
@@ -36,7 +39,7 @@ def test_a_chain_of_eight_with_slow_end_runs_through_with_nothing_lost(way: str,
         connections=connections,
         stop_time=POINTS * 0.001,
         simulation={"window": 8192},
-        zenoh={"shared_memory": way == "shared memory", "config": "zenoh.json5"},
+        zenoh={**way, "config": "zenoh.json5"},
     )
 
     assert place.run("launch", config, "--no-progress").wait() == 0

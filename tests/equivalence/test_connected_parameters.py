@@ -27,6 +27,7 @@ WAYS: list[tuple[tuple[str, ...], dict[str, str]]] = [
     (("--window", "1"), {}),
     ((), {"FMU_MESH_LIBRARY": "none"}),
     (("--set-config", "zenoh={shared_memory: false}"), {}),
+    (("--set-config", "zenoh={shared_memory: false, row_streams: false}"), {}),
     (("--set-config", "group=auto"), {}),
 ]
 """Options of `launch`, and its environment."""

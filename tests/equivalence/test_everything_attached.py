@@ -14,13 +14,13 @@ import pytest
 import fmu_mesh
 from tests.dashboards import Dashboard
 from tests.foxglove_client import FoxgloveClient
-from tests.helpers import DEADLINE_S, Place, braked, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, DEADLINE_S, Place, braked, wait_until, write_config
 
 FILES = ("all.csv", "all.parquet", "bag.mcap")
 EVERYTHING = ["*", "in:*", "param:*.k"]
 
 
-def config(folder: Path, *, shared_memory: bool) -> Path:
+def config(folder: Path, way: Mapping[str, bool]) -> Path:
     """A pendulum, a delay, a brake, and gains that a scenario and people may drive; three recorders."""
     folder.mkdir(exist_ok=True)
     instances: Mapping[str, Mapping[str, Any]] = {
@@ -43,15 +43,15 @@ def config(folder: Path, *, shared_memory: bool) -> Path:
             "values": {"driven.u": {"times": [0, 4, 15], "values": [0, 5, -3], "interpolation": "linear"}},
             "events": [{"at": 2.0, "set": {"slow.k": 0.5}}, {"at": 11.1, "set": {"slow.k": 2.5}}],
         },
-        zenoh={"shared_memory": shared_memory},
+        zenoh=way,
     )
 
 
-@pytest.mark.parametrize("shared_memory", [True, False])
-def test_a_run_with_everything_attached_is_that_of_one_process(place: Place, *, shared_memory: bool) -> None:
-    alone = config(place.folder / "alone", shared_memory=shared_memory)
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "zenoh"])
+def test_a_run_with_everything_attached_is_that_of_one_process(place: Place, way: Mapping[str, bool]) -> None:
+    alone = config(place.folder / "alone", way)
     assert place.run("launch", alone, "--local", "--no-progress").wait() == 0
-    watched = config(place.folder / "watched", shared_memory=shared_memory)
+    watched = config(place.folder / "watched", way)
 
     mesh = place.start("launch", watched, "--paused", "--no-progress")
     place.note()

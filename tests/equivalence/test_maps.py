@@ -16,7 +16,7 @@ import fmu_mesh
 from tests.equivalence.plain_loop import Wire, run_plainly
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.fmus.packing import repacked
-from tests.helpers import Place
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
@@ -63,7 +63,8 @@ STARTS: dict[str, dict[str, Any]] = {"x": {"uint64_in": 2**64 - 1}}
 WAYS: list[tuple[tuple[str, ...], dict[str, Any]]] = [
     ((), {}),
     (("--window", "1"), {}),
-    ((), {"zenoh": {"shared_memory": False}}),
+    ((), {"zenoh": BY_STREAMS}),
+    ((), {"zenoh": BY_ZENOH}),
     (("--window", "3"), {"group": "auto"}),
     ((), {"grouped": ("clock", "v", "w", "x", "y", "z")}),
 ]

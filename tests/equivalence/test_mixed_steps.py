@@ -24,7 +24,7 @@ from fmu_mesh.system.plan import NodePlan, Plan
 from tests.helpers import FMUS, rows_of
 from tests.plain_run import PlainRun
 from tests.planning import prepare
-from tests.scenarios.engines import EngineMesh, MakeEngine, burst_engine
+from tests.scenarios.engines import EngineMesh, MakeEngine, burst_engine, windows_of
 
 POINTS = 400
 SOURCE = """
@@ -58,7 +58,7 @@ CONNECTIONS: list[object] = [
 
 
 def plain_engine(plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory) -> PlainEngine:
-    return PlainEngine(plan, units, memory, shared=True)
+    return PlainEngine(plan, units, memory, windows_of(plan, memory))
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import fmu_mesh
 from tests.equivalence.test_types import written
 from tests.fmus.helpers import NO_COMPILER
 from tests.fmus.packing import repacked
-from tests.helpers import Place, rows_of, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, rows_of, wait_until, write_config
 
 SOURCE = """
 import fmu_mesh
@@ -95,9 +95,10 @@ def messages_of(path: Path) -> list[tuple[str, int, int, bytes]]:
         (("--window", "1"), {}),
         (("--algorithm", "jacobi"), {}),
         ((), {"group": "auto"}),
-        ((), {"zenoh": {"shared_memory": False}}),
+        ((), {"zenoh": BY_STREAMS}),
+        ((), {"zenoh": BY_ZENOH}),
     ],
-    ids=["memory", "window 1", "jacobi", "groups", "frames"],
+    ids=["memory", "window 1", "jacobi", "groups", "streams", "frames"],
 )
 def test_all_files_have_the_bytes_of_a_run_in_one_process(
     place: Place, options: tuple[str, ...], sections: dict[str, Any]
@@ -199,8 +200,8 @@ def test_an_input_has_the_value_with_which_its_instance_came_to_point(place: Pla
 
 
 @pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
-@pytest.mark.parametrize("zenoh", [{}, {"shared_memory": False}], ids=["memory", "frames"])
-def test_inputs_and_parameters_of_every_type_and_version_of_fmi(place: Place, zenoh: dict[str, bool]) -> None:
+@pytest.mark.parametrize("zenoh", [{}, BY_STREAMS, BY_ZENOH], ids=["memory", "streams", "frames"])
+def test_inputs_and_parameters_of_every_type_and_version_of_fmi(place: Place, zenoh: Mapping[str, bool]) -> None:
     path = written(place.folder)
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     outputs = content["record"]["variables"]

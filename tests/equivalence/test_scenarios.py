@@ -13,7 +13,7 @@ import pytest
 
 import fmu_mesh
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
-from tests.helpers import FMUS, Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, FMUS, Place, row_count, rows_of, wait_until, write_config
 
 STEER = '''
 import fmu_mesh
@@ -70,11 +70,12 @@ def local_rows(config: Path) -> bytes:
     "sections",
     [
         {},
-        {"zenoh": {"shared_memory": False}},
+        {"zenoh": BY_STREAMS},
+        {"zenoh": BY_ZENOH},
         {"simulation": {"window": 1, "algorithm": "jacobi"}},
         {"simulation": {"window": 7, "start_time": 0.0}},
     ],
-    ids=["rings", "frames", "lockstep", "window of 7"],
+    ids=["rings", "streams", "frames", "lockstep", "window of 7"],
 )
 def test_processes_give_the_floats_of_one_process(sections: Mapping[str, Any], place: Place) -> None:
     config = written(place.folder, **sections)

@@ -1,10 +1,11 @@
-"""Shared memory or Zenoh: whichever way messages take, the result is the same in every float."""
+"""Shared memory, row streams or Zenoh: whichever way messages take, the result is the same in every float."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from fmu_mesh.run.options import PlanOptions
 from tests.equivalence.test_equivalence import CHAIN, CYCLE, GAUSS_SEIDEL, JACOBI, PENDULUM, rewritten, shortened
-from tests.helpers import Place, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, wait_until, write_config
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
@@ -36,12 +37,13 @@ def local_result(place: Place, config: Path) -> bytes:
         (CYCLE, 300, "auto", GAUSS_SEIDEL),
     ],
 )
-def test_over_zenoh_the_floats_are_those_of_one_process(
-    name: str, points: int, window: int | str, algorithm: str, place: Place
+@pytest.mark.parametrize("way", [BY_STREAMS, BY_ZENOH], ids=["streams", "zenoh"])
+def test_between_hosts_the_floats_are_those_of_one_process(
+    way: Mapping[str, bool], name: str, points: int, window: int | str, algorithm: str, place: Place
 ) -> None:
     config = rewritten(name, place.folder, shortened(points, algorithm, window))
     content = yaml.safe_load(config.read_text(encoding="utf-8"))
-    content["zenoh"] = {"shared_memory": False}
+    content["zenoh"] = dict(way)
     config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     output = place.folder / "result.csv"
 

@@ -17,7 +17,7 @@ from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from tests.fmus import event_fmus
 from tests.fmus.chatty_fmus import chatty_fmu
 from tests.fmus.helpers import NO_COMPILER, find_fmu
-from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, row_count, rows_of, wait_until, write_config
 
 
 def with_faulty(
@@ -76,9 +76,9 @@ def test_failed_step_is_told_with_instance_point_time_and_message_of_fmu(
 
 
 @pytest.mark.parametrize("simulation", [{}, {"window": 1}, {"real_time_factor": 1}], ids=["auto", "lockstep", "paced"])
-@pytest.mark.parametrize("zenoh", [{}, {"shared_memory": False}], ids=["shared", "zenoh"])
+@pytest.mark.parametrize("zenoh", [{}, BY_STREAMS, BY_ZENOH], ids=["shared", "streams", "zenoh"])
 def test_when_an_fmu_fails_all_rows_before_are_kept(
-    place: Place, faulty: Path, simulation: dict[str, float], zenoh: dict[str, bool]
+    place: Place, faulty: Path, simulation: dict[str, float], zenoh: Mapping[str, bool]
 ) -> None:
     """The other node hears of it, and has rows that it had not sent yet: nobody steps on them."""
     config = with_faulty(place, faulty, {"fail_at": 0.5}, simulation=simulation, zenoh=zenoh)
@@ -90,9 +90,9 @@ def test_when_an_fmu_fails_all_rows_before_are_kept(
     place.assert_nothing_left()
 
 
-@pytest.mark.parametrize("zenoh", [{}, {"shared_memory": False}], ids=["shared", "zenoh"])
+@pytest.mark.parametrize("zenoh", [{}, BY_STREAMS, BY_ZENOH], ids=["shared", "streams", "zenoh"])
 def test_node_that_is_killed_in_long_step_has_sent_everything_before_it(
-    place: Place, faulty: Path, zenoh: dict[str, bool]
+    place: Place, faulty: Path, zenoh: Mapping[str, bool]
 ) -> None:
     config = write_config(
         place.folder,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import yaml
 from fmu_mesh.cli.main import main
 from fmu_mesh.system.window import AUTO_WINDOW_POINTS
 from tests.helpers import (
+    BY_STREAMS,
+    BY_ZENOH,
     DEADLINE_S,
     FMUS,
     Launched,
@@ -131,10 +134,10 @@ class Killer(fmu_mesh.Component):
 """
 
 
-@pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "Zenoh"])
 @pytest.mark.parametrize("window", [1, 300, "auto"])
 def test_of_process_killed_in_step_all_rows_before_it_are_kept(
-    place: Place, window: int | str, *, shared_memory: bool
+    place: Place, window: int | str, way: Mapping[str, bool]
 ) -> None:
     (place.folder / "killer.py").write_text(KILLER, encoding="utf-8")
     content: dict[str, Any] = {
@@ -148,7 +151,7 @@ def test_of_process_killed_in_step_all_rows_before_it_are_kept(
         "connections": ["pendulum.a -> killer.u", "killer.y -> gain.u"],
         # gain is not recorded: nobody knows how far it was when the run ended
         "record": {"variables": ["pendulum.a", "pendulum.der(a)", "killer.y", "killer.z"]},
-        "zenoh": {"shared_memory": shared_memory},
+        "zenoh": dict(way),
     }
     config = place.folder / "killed.yaml"
     config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
@@ -160,7 +163,7 @@ def test_of_process_killed_in_step_all_rows_before_it_are_kept(
     place.assert_nothing_left()
     [result] = place.folder.glob("**/killed*.csv")
     rows = rows_of(result)
-    if shared_memory:  # what a process wrote there stays when it is killed; a frame may be lost with its sender
+    if not way:  # what a process wrote there stays when it is killed; a frame may be lost with its sender
         assert len(rows) == 1236
     content["simulation"]["stop_time"] = (len(rows) - 1) * 0.001
     config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")

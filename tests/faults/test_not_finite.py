@@ -14,7 +14,7 @@ import fmu_mesh
 from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from tests.fmus.event_fmus import build_event_fmu
 from tests.fmus.helpers import FMUS, NO_COMPILER, build_test_fmu
-from tests.helpers import Place, rows_of
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, rows_of
 from tests.onnx_models import write_identity
 
 PARTS = '''"""Components of the tests."""
@@ -100,11 +100,12 @@ def failure_of(path: Path) -> fmu_mesh.FmuMeshError:
         ((), {}),
         (("--window", "1"), {}),
         (("--local",), {}),
-        ((), {"zenoh": {"shared_memory": False}}),
+        ((), {"zenoh": BY_STREAMS}),
+        ((), {"zenoh": BY_ZENOH}),
         ((), {"group": "all"}),
         ((), {"library": "none"}),
     ],
-    ids=["shared memory", "lockstep", "local", "frames", "group", "without the library"],
+    ids=["shared memory", "lockstep", "local", "streams", "frames", "group", "without the library"],
 )
 def test_an_infinite_output_ends_a_run_at_its_point(
     options: tuple[str, ...], changes: dict[str, Any], place: Place, monkeypatch: pytest.MonkeyPatch

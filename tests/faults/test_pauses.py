@@ -7,7 +7,7 @@ import selectors
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import psutil
@@ -15,7 +15,7 @@ import pytest
 
 from fmu_mesh.awake import AwakeClock
 from fmu_mesh.cli.main import main
-from tests.helpers import Place, row_count, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, row_count, wait_until, write_config
 
 LINK_S = 1.0
 STEP_S = 4.0
@@ -31,15 +31,15 @@ def pause(processes: Sequence[psutil.Process], seconds: float) -> None:
         process.resume()
 
 
-@pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "frames"])
-def test_a_run_goes_on_after_its_processes_were_stopped(place: Place, *, shared_memory: bool) -> None:
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "frames"])
+def test_a_run_goes_on_after_its_processes_were_stopped(place: Place, way: Mapping[str, bool]) -> None:
     """The last pause is that of a host that is suspended: longer than the deadline of a step, for all at once."""
     config = write_config(
         place.folder,
         stop_time=4.0,
         simulation={"real_time_factor": 1},
         timeouts={"link": LINK_S, "step": STEP_S},
-        zenoh={"shared_memory": shared_memory, "listen": ["tcp/127.0.0.1:0"]},
+        zenoh={**way, "listen": ["tcp/127.0.0.1:0"]},
     )
     result, undisturbed = config.with_suffix(".csv"), place.folder / "undisturbed.csv"
     launched = place.start("launch", config, "--no-progress")
@@ -102,14 +102,14 @@ def relay(place: Place) -> Iterator[tuple[str, Relay]]:
     relay.close()
 
 
-@pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "frames"])
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "frames"])
 def test_a_link_that_is_cut_is_named_by_both_ends(
-    place: Place, relay: tuple[str, Relay], *, shared_memory: bool
+    place: Place, relay: tuple[str, Relay], way: Mapping[str, bool]
 ) -> None:
     router, cable = relay
 
     def config(name: str, endpoint: str) -> Path:
-        zenoh = {"mode": "client", "connect": [endpoint], "shared_memory": shared_memory}
+        zenoh = {"mode": "client", "connect": [endpoint], **way}
         made = write_config(
             place.folder,
             stop_time=1e6,

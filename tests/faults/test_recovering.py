@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.results.formats import result_format
-from tests.helpers import Place, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, wait_until, write_config
 
 KILLS = int(os.environ.get("FMU_MESH_KILLS", "3"))
 NAMES = ["pair.csv", "pair.parquet", "pair.mcap"]
@@ -97,10 +98,12 @@ def test_launch_finishes_the_file_of_a_killed_master(place: Place, name: str) ->
 
 
 @pytest.mark.parametrize(
-    ("options", "zenoh"), [((), {"shared_memory": False}), (("--local",), {})], ids=["distributed", "local"]
+    ("options", "zenoh"),
+    [((), BY_STREAMS), ((), BY_ZENOH), (("--local",), {})],
+    ids=["streams", "frames", "local"],
 )
 def test_parquet_file_on_disk_that_gets_full_has_rows_that_are_told(
-    place: Place, options: tuple[str, ...], zenoh: dict[str, bool]
+    place: Place, options: tuple[str, ...], zenoh: Mapping[str, bool]
 ) -> None:
     """The limit for the size of a file is the disk that a test can fill. The stream reaches it before the file."""
     config = write_config(place.folder, record={"file": "pair.parquet"}, stop_time=100.0, zenoh=zenoh)

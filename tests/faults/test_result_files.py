@@ -6,12 +6,13 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.helpers import Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import BY_STREAMS, BY_ZENOH, Place, row_count, rows_of, wait_until, write_config
 
 MODES = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 
@@ -72,10 +73,12 @@ def test_a_second_run_does_not_write_into_the_file_of_the_first(place: Place, op
 
 
 @pytest.mark.parametrize(
-    ("options", "zenoh"), [((), {"shared_memory": False}), (("--local",), {})], ids=["distributed", "local"]
+    ("options", "zenoh"),
+    [((), BY_STREAMS), ((), BY_ZENOH), (("--local",), {})],
+    ids=["streams", "frames", "local"],
 )
 def test_a_disk_that_gets_full_leaves_as_many_complete_rows_as_reported(
-    place: Place, options: tuple[str, ...], zenoh: dict[str, bool]
+    place: Place, options: tuple[str, ...], zenoh: Mapping[str, bool]
 ) -> None:
     """The limit for the size of a file is the disk that a test can fill."""
     config = write_config(place.folder, stop_time=100.0, zenoh=zenoh)

@@ -80,7 +80,7 @@ def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, **si
         connections=("left.y -> right.x", "right.y -> left.u"),
         stop_time=stop_time,
         simulation={"window": 256, **simulation},
-        zenoh={"shared_memory": shared_memory},
+        zenoh={"shared_memory": shared_memory, "row_streams": False},
     )
 
 
@@ -276,7 +276,11 @@ def test_progress_that_a_stranger_sends_makes_no_result_shorter(place: Place) ->
     (place.folder / "gate.py").write_text(GATE)
     instances = {"gate": {"python": "gate.py:Gate"}, "free": {"fmu": "Gain"}}
     config = write_config(
-        place.folder, instances=instances, connections=(), stop_time=0.2, zenoh={"shared_memory": False}
+        place.folder,
+        instances=instances,
+        connections=(),
+        stop_time=0.2,
+        zenoh={"shared_memory": False, "row_streams": False},
     )
     launched = place.start("launch", config, "--no-progress")
     with place.session() as session:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -73,15 +76,56 @@ def test_nodes_of_another_host_connect_to_a_master_that_listens(tmp_path: Path) 
             started(second, "fmu-mesh node CONFIG delay --connect tcp/router:7447"),
         ]
 
-        def shared() -> list[str]:
+        def ways() -> list[list[Any]]:
             asked = first.start("fmu-mesh", "info", "mesh", "--json")
-            return list(json.loads(asked.output)["shared_memory"]) if asked.wait() == 0 else []
+            info = json.loads(asked.output) if asked.wait() == 0 else {"shared_memory": []}
+            return [info["shared_memory"], info["row_streams"]] if info["shared_memory"] else []
 
-        assert wait_until(shared, "a mesh that is there") == ["pendulum", "@record", "@mesh"]
+        streams = [["@mesh", "delay"], ["delay", "pendulum"]]
+        assert wait_until(ways, "a mesh that is there") == [["pendulum", "@record", "@mesh"], streams]
         resume = "fmu-mesh resume pendulum_delay --connect tcp/router:7447"
         wait_until(lambda: started(second, resume).wait() == 0, "a mesh that runs")
         assert ended(by_hand) == [0, 0, 0], "".join(one.story() for one in by_hand)
         assert (first.folder / RESULT).read_bytes() == expected
+
+
+PACED = "configs/paced.yaml"
+
+
+def paced(host: NetworkHost, example: str) -> list[str]:
+    """Write an example that takes 4 s there, and return the names of its two nodes."""
+    made = (ROOT / "configs" / example).read_text(encoding="utf-8")
+    made = re.sub(r"stop_time: \d+.0", "stop_time: 4.0", made)
+    made = made.replace("simulation:", "simulation:\n  real_time_factor: 1")
+    (host.folder / "own-clone" / PACED).write_text(made, encoding="utf-8")
+    return re.findall(r"^  (\w+):\n    fmu:", made, re.MULTILINE)
+
+
+@pytest.mark.parametrize("cut_s", [0.5, 3.0])
+@pytest.mark.parametrize("example", ["cycle2.yaml", "pendulum_delay.yaml"])
+def test_a_link_that_is_cut_for_a_while_costs_only_time(tmp_path: Path, example: str, cut_s: float) -> None:
+    with two_hosts(tmp_path) as (first, second):
+        near, far = paced(first, example)
+        paced(second, example)
+        result = first.folder / "out.csv"
+        by_hand = [
+            started(first, f"fmu-mesh master {PACED} --listen tcp/0.0.0.0:7447 --output ../out.csv"),
+            started(first, f"fmu-mesh node {PACED} {near}"),
+            started(second, f"fmu-mesh node {PACED} {far} --connect tcp/router:7447"),
+        ]
+        wait_until(lambda: row_count(result) > 100, "some rows")
+
+        assert second.start("ip", "link", "set", "wire", "down").wait() == 0
+        begun = time.monotonic()
+        wait_until(lambda: time.monotonic() - begun > cut_s, "the end of the cut")
+        rows = row_count(result)
+        assert second.start("ip", "link", "set", "wire", "up").wait() == 0
+        wait_until(lambda: row_count(result) > rows, "more rows")
+
+        assert ended(by_hand) == [0, 0, 0], "".join(one.story() for one in by_hand)
+        alone = started(second, f"fmu-mesh launch {PACED} --local --no-progress --output ../alone.csv")
+        assert alone.wait() == 0
+        assert result.read_bytes() == (second.folder / "alone.csv").read_bytes()
 
 
 def test_two_processes_of_two_hosts_with_equal_names_and_numbers_are_two(place: Place) -> None:

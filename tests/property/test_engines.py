@@ -27,13 +27,13 @@ from tests.property.test_random_systems import (
     planned,
     systems,
 )
-from tests.scenarios.engines import EngineMesh, MakeEngine, burst_engine
+from tests.scenarios.engines import EngineMesh, MakeEngine, burst_engine, windows_of
 
 needs_library = pytest.mark.skipif(native.library is None, reason="the library with the burst is not built here")
 
 
 def plain_engine(plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory) -> PlainEngine:
-    return PlainEngine(plan, units, memory, shared=True)
+    return PlainEngine(plan, units, memory, windows_of(plan, memory))
 
 
 def chain(count: int, last_point: int, window: int, *, closed: bool = False, recorded: bool = False) -> Drawn:

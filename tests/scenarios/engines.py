@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.node.engine import BurstEngine, Engine
+from fmu_mesh.node.engine import BurstEngine, Engine, Windows
 from fmu_mesh.node.stepping import Runner, sources_of
 from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan, Plan
 from fmu_mesh.wire.frames import SourceRows
 
-__all__ = ["EngineMesh", "MakeEngine", "burst_engine"]
+__all__ = ["EngineMesh", "MakeEngine", "burst_engine", "windows_of"]
 
 MakeEngine = Callable[[NodePlan, Sequence[Sequence[Runner]], HostMemory], Engine]
 
@@ -32,7 +32,12 @@ _END_S = 60.0
 
 def burst_engine(plan: NodePlan, units: Sequence[Sequence[Runner]], memory: HostMemory) -> BurstEngine:
     """An engine that steps in C."""
-    return BurstEngine(plan, units, memory, shared=True, spins=True)
+    return BurstEngine(plan, units, memory, windows_of(plan, memory), spins=True)
+
+
+def windows_of(plan: NodePlan, memory: HostMemory) -> Windows:
+    """Those of a node whose others all share its memory."""
+    return [(name, memory.progress[name], window) for name, window in plan.windows]
 
 
 class EngineMesh:

@@ -19,7 +19,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.node.engine import PlainEngine
+from fmu_mesh.node.engine import PlainEngine, Windows
 from fmu_mesh.node.node import Node
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import HostMemory, Wish
@@ -335,11 +335,10 @@ class _SimulatedEngine(PlainEngine):
         plan: NodePlan,
         units: Sequence[Sequence[Runner]],
         memory: HostMemory,
-        *,
-        shared: bool,
-        spins: bool,  # noqa: ARG002 nobody spins
+        windows: Windows,
+        **_: object,
     ) -> None:
-        super().__init__(plan, units, memory, shared=shared)
+        super().__init__(plan, units, memory, windows)
         self._process = process
 
     def run(self, wait_s: float, *, eager: bool) -> bool:
@@ -366,9 +365,6 @@ class _SimulatedMembership(Membership):
 
     def keys(self, _patience_s: float) -> RunKeys:
         return RUN
-
-    def open_memory(self) -> None:
-        return
 
     def report(self, *_: object, **__: object) -> None:
         return

@@ -114,7 +114,7 @@ def test_where_a_ring_is_shared_only_its_text_comes_in_frames() -> None:
     shared, own = HostMemory.private(map_, "right"), HostMemory.private(map_, "right")
     place, link = places["source"], Link(3, "source", "left", "right", 2, layout, (0, -1))
 
-    rows, receiver = rows_of(link, place, shared, own, lambda _end: True)
+    rows, receiver = rows_of(link, place, "ring", shared, own, lambda _end: True)
     assert receiver is not None
     receiver.take(0, 1, encode_rows(FRAME, link.index, 0, (np.array([["one"]], dtype=np.object_),)))
 
@@ -123,8 +123,10 @@ def test_where_a_ring_is_shared_only_its_text_comes_in_frames() -> None:
         (("s",), 1, True),
     ]
     assert rows[1].ring.value(0, "s") == "one"
-    assert rows_of(LINK, place, shared, own, lambda _end: True)[1] is None
-    assert [part.text for part in rows_of(link, place, None, own, lambda _end: True)[0]] == [None]
+    assert rows_of(LINK, place, "ring", shared, own, lambda _end: True)[1] is None
+    assert [part.text for part in rows_of(link, place, "zenoh", shared, own, lambda _end: True)[0]] == [None]
+    streamed, _ = rows_of(link, place, "stream", shared, own, lambda _end: True)
+    assert [(part.ring.layout.names, part.text) for part in streamed] == [(("a",), False), (("s",), True)]
 
 
 def test_a_frame_that_came_before_is_dropped(receiver: Receiver) -> None:

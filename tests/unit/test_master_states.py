@@ -28,6 +28,7 @@ from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.wire.membership import NodeReady, Registration
 from fmu_mesh.wire.messages import FINISH, GRANT, NodeReport, sealed
 from fmu_mesh.wire.views import Command
+from fmu_mesh.wire.ways import Ways
 from tests.helpers import write_config
 from tests.planning import prepare
 
@@ -127,7 +128,7 @@ def test_nodes_are_answered_when_the_last_one_is_ready(plan: Plan) -> None:
     run.ready("pendulum", "delay")
     assert run.decide() == []
     run.ready(RECORDER)
-    assert run.decide() == [AnswerAll(ALL)]
+    assert run.decide() == [AnswerAll(Ways(ALL))]
     assert run.states.state == "initializing"
 
 

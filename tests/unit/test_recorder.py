@@ -22,9 +22,10 @@ from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan
 from fmu_mesh.wire.frames import encode_rows
 from fmu_mesh.wire.keys import Keys, RunKeys
-from fmu_mesh.wire.membership import Admission, Welcome
+from fmu_mesh.wire.membership import Admission, Hello, Welcome
 from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, HEADER, LAST, encode_json
 from fmu_mesh.wire.session import Wiring, close_session, open_session
+from fmu_mesh.wire.ways import Ways
 from tests.helpers import DEADLINE_S, wait_until
 from tests.scenarios.scenario import Scenario
 
@@ -51,7 +52,9 @@ class Mesh:
         self._keys = RunKeys.new(public)
         self._reports: list[zenoh.Query] = []
         self._entities: list[Any] = [
-            session.declare_queryable(self._keys.hello("n"), lambda query: query.reply(query.key_expr, b"")),
+            session.declare_queryable(
+                self._keys.hello("n"), lambda query: query.reply(query.key_expr, msgspec.json.encode(Hello("n")))
+            ),
             session.declare_queryable(public.register, self._register),
             session.declare_queryable(self._keys.ready(RECORDER), self._take_ready),
             session.declare_queryable(self._keys.report(RECORDER), self._take_report),
@@ -88,7 +91,7 @@ class Mesh:
         )
 
     def _take_ready(self, query: zenoh.Query) -> None:
-        query.reply(query.key_expr, msgspec.json.encode(Welcome(shared=self.shared)))
+        query.reply(query.key_expr, msgspec.json.encode(Welcome(ways=Ways(self.shared))))
         self._welcomed.set()
 
     def _take_report(self, query: zenoh.Query) -> None:

@@ -89,6 +89,10 @@ def instance_status(status: InstanceStatus) -> list[str]:
 _PARTS = {"@record": "the recorder", "@mesh": "the master"}
 
 
+def _part(name: str) -> str:
+    return _PARTS.get(name, name)
+
+
 def mesh_info(info: MeshInfo) -> list[str]:
     """The information about a mesh."""
     end = seconds(info.stop_time) if info.stop_time is not None else "an open end"
@@ -104,7 +108,8 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("nodes", ", ".join(info.nodes)),
             ("result files" if len(info.result_files) > 1 else "result file", ", ".join(info.result_files) or "none"),
             ("endpoints", ", ".join(info.endpoints)),
-            ("shared memory", ", ".join(_PARTS.get(name, name) for name in info.shared_memory) or "not used"),
+            ("shared memory", ", ".join(map(_part, info.shared_memory)) or "not used"),
+            ("row streams", ", ".join(f"{_part(one)} with {_part(other)}" for one, other in info.row_streams)),
             ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),
         ]
     )

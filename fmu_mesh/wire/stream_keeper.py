@@ -1,0 +1,110 @@
+"""Keeps row streams alive: a stream that is cut is dialled again, and goes on where it was.
+
+Says each other process twice a second that this one lives, so that a silent link is noticed soon.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Mapping, Sequence
+
+from ..awake import AwakeClock
+from ..errors import MeshLost
+from ..rings.row_streams import RowStreams
+from ..system.memory_map import MASTER, RECORDER
+from .meeting import Meeting
+
+__all__ = ["StreamKeeper"]
+
+# Who meets here: two processes whose link was cut; and a thread, `keeper`, which says that this process lives and
+# dials, with the one that reads the streams. A new socket, its own or one that came to the door, is posted to that one,
+# because nobody else may change a stream. ADR 74.
+#
+# What may go wrong:
+# * A link is cut for a moment. TCP would repeat what was lost after pauses that double: after a cut of 20 s only after
+#   27 s. So a stream that is silent for `_SILENT_S` is dialled again, every `_AGAIN_S`, and the first connection that
+#   comes about replaces it.
+# * Both dial: the later name does it first, and who dials tells the other that it is busy (`Meeting`).
+# * The peer has ended. Then nobody answers at its door, and this goes on until this process ends, too: whether the
+#   other one is gone, its token says.
+# * It was ended by a stop (SIGSTOP) or a long step: its keeper still says that it lives, or its host is suspended, and
+#   nobody answers.
+
+_BEAT_S = 0.5
+_SILENT_S = 1.5
+"""Three beats."""
+_AGAIN_S = 0.25
+
+
+class StreamKeeper:
+    """Keeps the streams of one process.
+
+    Args:
+        post: lets the thread that reads the streams do something.
+    """
+
+    def __init__(
+        self, streams: RowStreams, meeting: Meeting, peers: Sequence[str], post: Callable[[Callable[[], None]], None]
+    ) -> None:
+        self._streams = streams
+        self._meeting = meeting
+        self._peers = peers
+        self._post = post
+        self._cut_since: dict[str, float] = {}
+        self._clock = AwakeClock()
+        self._closing = threading.Event()
+        meeting.wait_for_returns(self)
+        self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
+        self._thread.start()
+
+    @property
+    def cut(self) -> dict[str, float]:
+        """From any thread: for how long the streams with these peers are cut, in s."""
+        now = self._clock()
+        return {peer: now - since for peer, since in [*self._cut_since.items()]}
+
+    def check(self, own: str, limit_s: float) -> None:
+        """Check that no stream is cut for longer.
+
+        Raises:
+            MeshLost: one is; names both ends.
+        """
+        for peer, cut_s in self.cut.items():
+            if cut_s > limit_s:
+                ends = _spoken(own), _spoken(peer)
+                raise MeshLost(
+                    f"the link between {ends[0]} and {ends[1]} is cut for {cut_s:.0f} s",
+                    hint="Is the process stopped, its host suspended, or the network cut? `timeouts.link` limits it.",
+                )
+
+    def close(self) -> None:
+        """End."""
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        beaten = 0.0
+        while not self._closing.wait(_AGAIN_S):
+            now = self._clock()
+            if now - beaten >= _BEAT_S:
+                beaten = now
+                self._streams.beat()
+            for peer in self._peers:
+                if self._streams.silent_s(peer) > _SILENT_S:
+                    self._cut_since.setdefault(peer, now)
+                    self._meeting.dial(peer, again=True)
+                else:
+                    self._cut_since.pop(peer, None)
+
+    def received(self, peer: str) -> dict[int, int]:
+        """See `fmu_mesh.wire.meeting.Returns`."""
+        return self._streams.received(peer)
+
+    def take(self, peer: str, own: socket.socket, received: Mapping[int, int]) -> None:
+        """See `fmu_mesh.wire.meeting.Returns`."""
+        self._post(lambda: self._streams.resume(peer, own, received))
+
+
+def _spoken(name: str) -> str:
+    return {MASTER: "the master", RECORDER: "the recorder"}.get(name, f"node '{name}'")
