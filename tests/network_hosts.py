@@ -20,7 +20,7 @@ import pytest
 
 from tests.helpers import DEADLINE_S, Launched, wait_until
 
-__all__ = ["NEEDS_HOSTS", "NetworkHost", "two_hosts"]
+__all__ = ["NEEDS_HOSTS", "NetworkHost", "started_apart", "two_hosts"]
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _HIDDEN: Final = "/tmp"  # noqa: S108  of which each host has its own
@@ -112,3 +112,20 @@ def two_hosts(folder: Path, names: Sequence[str] = ("first", "second")) -> Itera
             for words in (f"addr add 10.77.0.{number}/24 dev wire", "link set wire up"):
                 assert host.start("ip", *words.split()).wait() == 0
         yield hosts
+
+
+def started_apart(hosts: Sequence[NetworkHost], config: Path, nodes: Sequence[str], *options: str) -> list[Launched]:
+    """Start a master with these options and every second node on the first host, and the other nodes on the second one.
+
+    Args:
+        hosts: both.
+        config: relative to the folder of the copies, which has it on both hosts.
+        nodes: their names.
+        options: of the master.
+    """
+    first, second = hosts
+    return [
+        first.start("fmu-mesh", "master", str(config), "--listen", "tcp/0.0.0.0:7447", "--no-progress", *options),
+        *(first.start("fmu-mesh", "node", str(config), node) for node in nodes[::2]),
+        *(second.start("fmu-mesh", "node", str(config), node, "--connect", "tcp/router:7447") for node in nodes[1::2]),
+    ]
