@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -28,8 +28,10 @@ _TOOLS: Final = ("unshare", "nsenter", "ip")
 _SPACES: Final = ("--net", "--pid", "--mount", "--uts", "--ipc")
 
 NEEDS_HOSTS = pytest.mark.skipif(
-    os.geteuid() != 0 or any(shutil.which(tool) is None for tool in _TOOLS),
-    reason="needs root and the commands unshare, nsenter and ip",
+    os.geteuid() != 0
+    or any(shutil.which(tool) is None for tool in _TOOLS)
+    or subprocess.run(["unshare", *_SPACES, "true"], capture_output=True, check=False).returncode != 0,
+    reason="needs root, namespaces, and the commands unshare, nsenter and ip",
 )
 
 
@@ -114,7 +116,13 @@ def two_hosts(folder: Path, names: Sequence[str] = ("first", "second")) -> Itera
         yield hosts
 
 
-def started_apart(hosts: Sequence[NetworkHost], config: Path, nodes: Sequence[str], *options: str) -> list[Launched]:
+def started_apart(
+    hosts: Sequence[NetworkHost],
+    config: Path,
+    nodes: Sequence[str],
+    *options: str,
+    environment: Mapping[str, str] = {},
+) -> list[Launched]:
     """Start a master with these options and every second node on the first host, and the other nodes on the second one.
 
     Args:
@@ -122,10 +130,13 @@ def started_apart(hosts: Sequence[NetworkHost], config: Path, nodes: Sequence[st
         config: relative to the folder of the copies, which has it on both hosts.
         nodes: their names.
         options: of the master.
+        environment: more variables of all processes.
     """
     first, second = hosts
+    there = ["--connect", "tcp/router:7447"]
+    master = ["fmu-mesh", "master", str(config), "--listen", "tcp/0.0.0.0:7447", "--no-progress", *options]
     return [
-        first.start("fmu-mesh", "master", str(config), "--listen", "tcp/0.0.0.0:7447", "--no-progress", *options),
-        *(first.start("fmu-mesh", "node", str(config), node) for node in nodes[::2]),
-        *(second.start("fmu-mesh", "node", str(config), node, "--connect", "tcp/router:7447") for node in nodes[1::2]),
+        first.start(*master, **environment),
+        *(first.start("fmu-mesh", "node", str(config), node, **environment) for node in nodes[::2]),
+        *(second.start("fmu-mesh", "node", str(config), node, *there, **environment) for node in nodes[1::2]),
     ]
