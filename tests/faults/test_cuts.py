@@ -6,11 +6,13 @@ two systems are cut a few times.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import random
+import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -20,12 +22,10 @@ import yaml
 from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.system.plan import RECORDER
 from tests.all_systems import SYSTEMS, written_system
-from tests.helpers import FMUS, Launched, row_count, wait_until
+from tests.helpers import BY_STREAMS, FMUS, Launched, Place, row_count, wait_until
 from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_apart, two_hosts
 from tests.plain_run import PlainRun
 from tests.planning import prepare
-
-pytestmark = NEEDS_HOSTS
 
 IS_LONG: Final = "FMU_MESH_CUTS" in os.environ
 CUTS: Final = int(os.environ.get("FMU_MESH_CUTS", "4"))
@@ -39,6 +39,10 @@ CONFIG: Final = Path("system", "system.yaml")
 
 MAIN, CYCLE, STAR = "pendulum_delay", "cycle2", "star"
 BY_ZENOH: Final = {"row_streams": False}
+
+LIBC: Final = ctypes.CDLL(None, use_errno=True)
+PIDFD_GETFD: Final = 438
+"""The number of this call of the system on every processor."""
 
 
 class Apart(NamedTuple):
@@ -84,6 +88,15 @@ def cut(host: NetworkHost, seconds: float) -> None:
     link_is(host, "up")
 
 
+def until_more_rows(mesh: Apart, times: int = 1) -> float:
+    """Wait until so many times rows are written, or the run has ended; return how long that took, in s."""
+    begun = time.monotonic()
+    for _ in range(times):
+        rows = row_count(mesh.result)
+        wait_until(lambda: row_count(mesh.result) > rows or not mesh.launched[0].running, "more rows")  # noqa: B023  used here
+    return time.monotonic() - begun
+
+
 @contextmanager
 def running(folder: Path, name: str, zenoh: Mapping[str, bool]) -> Iterator[Apart]:
     """A system that runs for `LASTS_S`, with some rows written."""
@@ -98,6 +111,7 @@ def running(folder: Path, name: str, zenoh: Mapping[str, bool]) -> Iterator[Apar
         yield mesh
 
 
+@NEEDS_HOSTS
 @pytest.mark.parametrize(
     ("name", "zenoh"),
     [
@@ -119,6 +133,7 @@ def test_short_cuts_at_any_moment_cost_only_time(tmp_path: Path, name: str, zeno
         mesh.assert_ends_well()
 
 
+@NEEDS_HOSTS
 @pytest.mark.parametrize("seconds", [3.0, 20.0] if IS_LONG else [3.0])
 @pytest.mark.parametrize("zenoh", [{}, BY_ZENOH], ids=["streams", "zenoh"])
 @pytest.mark.parametrize("name", [MAIN, CYCLE, STAR])
@@ -128,11 +143,8 @@ def test_after_a_long_cut_a_run_goes_on_at_once(
     with running(tmp_path, name, zenoh) as mesh:
         link_is(mesh.hosts[1], "down")
         let_pass(seconds)
-        rows = row_count(mesh.result)
         link_is(mesh.hosts[1], "up")
-        back = time.monotonic()
-        wait_until(lambda: row_count(mesh.result) > rows or not mesh.launched[0].running, "more rows")
-        waited_s = time.monotonic() - back
+        waited_s = until_more_rows(mesh)
 
         mesh.assert_ends_well()
         assert waited_s <= AFTER_S + FLUSH_S, f"it waited {waited_s:.2f} s after the network was back"
@@ -204,6 +216,7 @@ def written_parts(folder: Path, source: str, content: Mapping[str, object]) -> P
     return path
 
 
+@NEEDS_HOSTS
 @pytest.mark.skipif(not IS_LONG, reason="it takes 20 s; FMU_MESH_CUTS asks for it")
 def test_rows_of_eight_megabytes_survive_a_cut(tmp_path: Path) -> None:
     content = {
@@ -244,6 +257,7 @@ def prepared(folder: Path) -> Iterator[tuple[list[NetworkHost], Path]]:
         yield hosts, configs[0]
 
 
+@NEEDS_HOSTS
 @pytest.mark.parametrize("seconds", LONGEST)
 def test_a_network_that_comes_late_delays_the_start(tmp_path: Path, seconds: float) -> None:
     with prepared(tmp_path) as (hosts, config):
@@ -261,6 +275,7 @@ def connections(host: NetworkHost) -> int:
     return sum(line.split()[3] == "01" for line in lines)
 
 
+@NEEDS_HOSTS
 @pytest.mark.parametrize("seconds", LONGEST)
 @pytest.mark.parametrize("later_s", [0.0, 0.02, 0.05, 0.1, 0.2] if IS_LONG else [0.0, 0.05])
 @pytest.mark.parametrize("met", [1, 2, 3], ids=["the session", "a first stream", "a second stream"])
@@ -277,6 +292,7 @@ def test_a_cut_while_nodes_register_and_meet_costs_only_time(
         mesh.assert_ends_well()
 
 
+@NEEDS_HOSTS
 @pytest.mark.parametrize("seconds", LONGEST)
 @pytest.mark.parametrize("moment", ["initialize", "last step"])
 @pytest.mark.parametrize("who", ["near", "far"])
@@ -299,3 +315,54 @@ def test_a_cut_in_initialization_or_at_the_end_costs_only_time(
         link_is(hosts[1], "up")
 
         mesh.assert_ends_well()
+
+
+def streams_here(place: Place) -> list[tuple[int, int]]:
+    """The process and the descriptor of each end of a stream that came to a door."""
+    lines = Path("/proc/net/unix").read_text(encoding="utf-8").splitlines()
+    fields = [line.split() for line in lines if line.endswith(".rows") and str(place.folder) in line]
+    connected = {f"socket:[{field[6]}]" for field in fields if field[5] == "03"}
+    found = []
+    for process in place.processes():
+        with suppress(OSError):
+            own = Path(f"/proc/{process.pid}/fd")
+            found += [(process.pid, int(file.name)) for file in own.iterdir() if str(file.readlink()) in connected]
+    return found
+
+
+def shut_down(pid: int, descriptor: int) -> bool:
+    """End a socket of another process, as if its peer had reset it; whether it was there."""
+    process = os.pidfd_open(pid)
+    try:
+        own = LIBC.syscall(PIDFD_GETFD, process, descriptor, 0)
+        if own < 0:
+            return False
+        with socket.socket(fileno=own) as end:
+            end.shutdown(socket.SHUT_RDWR)
+    except OSError:
+        return False
+    finally:
+        os.close(process)
+    return True
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may take a socket of another process")
+@pytest.mark.parametrize("name", SYSTEMS if IS_LONG else (MAIN, CYCLE, STAR))
+def test_a_stream_that_ends_is_dialled_again_and_costs_only_time(place: Place, name: str) -> None:
+    seed = random.SystemRandom().randrange(2**32) if IS_LONG else 0
+    chance = random.Random(seed)  # noqa: S311  a moment
+    config = written_system(name, place.folder / "system", lasts_s=LASTS_S, zenoh=BY_STREAMS)
+    launched = place.start("launch", config, "--no-progress")
+    mesh = Apart((), config, [launched])
+    wait_until(lambda: row_count(mesh.result) > 1 or not launched.running, "some rows")
+
+    ended, waited_s = 0, []
+    while ended < CUTS and launched.running:
+        let_pass(chance.uniform(0.0, 0.5))
+        if (there := streams_here(place)) and shut_down(*chance.choice(there)):
+            ended += 1
+            waited_s.append(until_more_rows(mesh, 2))  # the first ones may have come before
+
+    assert ended == CUTS, f"seed {seed}; the run has ended before\n{mesh.story()}"
+    mesh.assert_ends_well()
+    assert max(waited_s) <= AFTER_S + 2 * FLUSH_S, f"seed {seed}: it waited {waited_s} s"
