@@ -21,7 +21,7 @@ from tests.fmus.event_fmus import Version, build_event_fmu
 from tests.fmus.helpers import NO_COMPILER, session_folder
 from tests.helpers import FMUS
 
-__all__ = ["SYSTEMS", "written_system"]
+__all__ = ["FEATURES", "SYSTEMS", "written_system"]
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 POINTS: Final = 2000
@@ -127,7 +127,7 @@ def _example(path: Path) -> dict[str, Any]:
     return content
 
 
-_MADE: Final[Mapping[str, Callable[[Path], dict[str, Any]]]] = {
+FEATURES: Final[Mapping[str, Callable[[Path], dict[str, Any]]]] = {
     "star": _star,
     "set": _set,
     "text and arrays": _told,
@@ -137,7 +137,7 @@ _MADE: Final[Mapping[str, Callable[[Path], dict[str, Any]]]] = {
     "types": lambda folder: yaml.safe_load(types.written(folder).read_text(encoding="utf-8")),
 }
 
-SYSTEMS: Final = (*EXAMPLES, *_MADE)
+SYSTEMS: Final = (*EXAMPLES, *FEATURES)
 
 
 def written_system(name: str, folder: Path, *, lasts_s: float = 0.0, zenoh: Mapping[str, Any] = {}) -> Path:
@@ -156,7 +156,7 @@ def written_system(name: str, folder: Path, *, lasts_s: float = 0.0, zenoh: Mapp
         shutil.copytree(example.parent, folder, dirs_exist_ok=True)
         content = _example(example)
     else:
-        content = _MADE[name](folder)
+        content = FEATURES[name](folder)
     record = {"variables": None, **content.get("record", {}), "file": "system.csv"}
     for instance in content["instances"].values():
         if Path(instance.get("fmu", "")).parent == folder:  # which has another path for a host

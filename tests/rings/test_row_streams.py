@@ -276,6 +276,29 @@ def test_a_forged_byte_changes_nothing_that_came_before_it(place: int, value: in
     target.streams.close(0.0)
 
 
+@pytest.mark.parametrize("reads", [0, 1, 2, 8, 20])
+def test_a_cut_while_a_thread_sends_large_rows_costs_no_byte(reads: int) -> None:
+    """The kernel takes a tenth of a row at once, so each read ends within one."""
+    source, target = ends(rows=8, wide=2_000_000)
+    values = np.frombuffer(os.urandom(2_000_000), np.uint8)
+    for row in range(4):
+        source.ring.put(row, "wide", values)
+        source.ring.stamp(row)
+    source.counter.raise_to(4)
+    source.streams.serve(0.0)
+    for _ in range(reads):
+        target.streams.serve(0.0)
+    here, there = socket.socketpair()
+
+    source.streams.resume("target", here, target.streams.received("source"))
+    target.streams.resume("source", there, {})
+
+    turn(source, target, until=lambda: target.counter.value == 4)
+    assert all((target.ring.array("wide")[row] == values).all() for row in range(4))
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
 def test_a_peer_that_reads_nothing_does_not_hold_the_end_up() -> None:
     source, target = ends(rows=8, wide=8_000_000)
     source.ring.put(0, "wide", np.zeros(8_000_000, np.uint8))
