@@ -140,14 +140,14 @@ FEATURES: Final[Mapping[str, Callable[[Path], dict[str, Any]]]] = {
 SYSTEMS: Final = (*EXAMPLES, *FEATURES)
 
 
-def written_system(name: str, folder: Path, *, lasts_s: float = 0.0, zenoh: Mapping[str, Any] = {}) -> Path:
+def written_system(name: str, folder: Path, *, lasts_s: float = 0.0, **sections: Mapping[str, Any]) -> Path:
     """Write a system, and return the path of its configuration; a test is skipped where it cannot run.
 
     Args:
         name: one of `SYSTEMS`.
         folder: where it goes.
         lasts_s: how long a run takes by the wall clock; 0: as short as it can.
-        zenoh: the section.
+        sections: more of the file.
     """
     if name in {"events", "types"} and NO_COMPILER is not None:
         pytest.skip(NO_COMPILER)
@@ -164,7 +164,7 @@ def written_system(name: str, folder: Path, *, lasts_s: float = 0.0, zenoh: Mapp
     simulation = content["simulation"]
     if lasts_s:
         simulation["real_time_factor"] = simulation["stop_time"] / lasts_s
-    made = {**content, "mesh": "system", "record": record, "zenoh": dict(zenoh)}
+    made = {**content, "mesh": "system", "record": record} | {key: dict(section) for key, section in sections.items()}
     path = folder / "system.yaml"
     path.write_text(yaml.safe_dump(made, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return path

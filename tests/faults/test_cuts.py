@@ -11,7 +11,7 @@ import os
 import random
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -37,7 +37,7 @@ FLUSH_S: Final = 0.2
 """The recorder writes so often into the file."""
 CONFIG: Final = Path("system", "system.yaml")
 
-MAIN, CYCLE, STAR = "pendulum_delay", "cycle2", "star"
+THREE: Final = [MAIN := "pendulum_delay", CYCLE := "cycle2", STAR := "star"]
 BY_ZENOH: Final = {"row_streams": False}
 
 LIBC: Final = ctypes.CDLL(None, use_errno=True)
@@ -98,11 +98,13 @@ def until_more_rows(mesh: Apart, times: int = 1) -> float:
 
 
 @contextmanager
-def running(folder: Path, name: str, zenoh: Mapping[str, bool]) -> Iterator[Apart]:
+def running(folder: Path, name: str, zenoh: Mapping[str, bool], link_s: float = 30.0) -> Iterator[Apart]:
     """A system that runs for `LASTS_S`, with some rows written."""
     with two_hosts(folder) as hosts:
         configs = [
-            written_system(name, host.folder / "own-clone" / CONFIG.parent, lasts_s=LASTS_S, zenoh=zenoh)
+            written_system(
+                name, host.folder / "own-clone" / CONFIG.parent, lasts_s=LASTS_S, zenoh=zenoh, timeouts={"link": link_s}
+            )
             for host in hosts
         ]
         nodes = [node for node in prepare(configs[0]).nodes if node != RECORDER]
@@ -134,22 +136,27 @@ def test_short_cuts_at_any_moment_cost_only_time(tmp_path: Path, name: str, zeno
 
 
 @NEEDS_HOSTS
-@pytest.mark.parametrize("seconds", [3.0, 20.0] if IS_LONG else [3.0])
 @pytest.mark.parametrize(
-    ("name", "zenoh"),
+    ("name", "zenoh", "seconds"),
     [
-        *(pytest.param(name, {}, id=f"{name}-streams") for name in ([MAIN, CYCLE, STAR] if IS_LONG else [MAIN])),
-        *(pytest.param(name, BY_ZENOH, id=f"{name}-zenoh") for name in ([MAIN, CYCLE, STAR] if IS_LONG else [CYCLE])),
+        *(pytest.param(name, {}, 3.0, id=f"{name}-streams-3") for name in (THREE if IS_LONG else [MAIN])),
+        *(pytest.param(name, BY_ZENOH, 3.0, id=f"{name}-zenoh-3") for name in (THREE if IS_LONG else [CYCLE])),
+        *(pytest.param(name, {}, 20.0, id=f"{name}-streams-20") for name in (THREE if IS_LONG else [])),
     ],
 )
 def test_after_a_long_cut_a_run_goes_on_at_once(
-    tmp_path: Path, name: str, zenoh: Mapping[str, bool], seconds: float
+    tmp_path: Path,
+    name: str,
+    zenoh: Mapping[str, bool],
+    seconds: float,
+    record_property: Callable[[str, object], None],
 ) -> None:
     with running(tmp_path, name, zenoh) as mesh:
         link_is(mesh.hosts[1], "down")
         let_pass(seconds)
         link_is(mesh.hosts[1], "up")
         waited_s = until_more_rows(mesh)
+        record_property("waited_s", waited_s)
 
         mesh.assert_ends_well()
         assert waited_s <= AFTER_S + FLUSH_S, f"it waited {waited_s:.2f} s after the network was back"
@@ -219,6 +226,21 @@ def written_parts(folder: Path, source: str, content: Mapping[str, object]) -> P
     path = folder / CONFIG.name
     path.write_text(yaml.safe_dump({"mesh": "system", **content}, sort_keys=False), encoding="utf-8")
     return path
+
+
+@NEEDS_HOSTS
+@pytest.mark.parametrize("zenoh", [{}, BY_ZENOH] if IS_LONG else [{}], ids=lambda own: "zenoh" if own else "streams")
+def test_a_pause_during_a_cut_takes_effect_and_costs_only_time(tmp_path: Path, zenoh: Mapping[str, bool]) -> None:
+    with running(tmp_path, CYCLE, zenoh) as mesh:
+        first, second = mesh.hosts
+        link_is(second, "down")
+        pausing = first.start("fmu-mesh", "pause", "system")
+        let_pass(2.0)
+        link_is(second, "up")
+
+        assert pausing.wait() == 0, pausing.story() + mesh.story()
+        assert first.start("fmu-mesh", "resume", "system").wait() == 0
+        mesh.assert_ends_well()
 
 
 @NEEDS_HOSTS
