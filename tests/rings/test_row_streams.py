@@ -224,7 +224,7 @@ def test_rows_that_came_by_the_old_connection_meanwhile_need_not_come_again() ->
 
 
 @pytest.mark.parametrize("received", [-5, 6, 2**40])
-def test_a_peer_that_says_a_wrong_number_of_rows_gets_those_in_the_ring(both: tuple[End, End], received: int) -> None:
+def test_a_wrong_number_of_rows_gets_those_in_the_ring(both: tuple[End, End], received: int) -> None:
     source, target = both
     source.write(0, 5)
     here, there = socket.socketpair()
@@ -236,7 +236,7 @@ def test_a_peer_that_says_a_wrong_number_of_rows_gets_those_in_the_ring(both: tu
     assert [*source.streams.states()] == []
 
 
-def test_after_a_cut_at_each_byte_rows_counters_and_the_end_are_there() -> None:
+def test_a_cut_at_each_byte_loses_no_row_counter_or_end() -> None:
     """The bytes of some rows, a counter and the end of a link; the reader gets so many of them, and no more."""
     length, cut = 1, 0
     while cut < length:
