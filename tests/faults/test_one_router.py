@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -104,6 +105,23 @@ def test_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place
     assert first.wait() == 4
     assert f"the link to the router at {endpoint_of(router)} was lost" in first.message
     assert len(rows_of(result)) > 100
+
+
+@pytest.mark.parametrize("seconds", [0.5, 3.0])
+def test_a_router_that_is_gone_for_a_while_costs_only_time(place: Place, router: Launched, seconds: float) -> None:
+    config = through(router, place, "client")
+    endpoint, result = endpoint_of(router), place.folder / "pair.csv"
+    first = place.start("launch", config, "--no-progress")
+    wait_until(lambda: row_count(result) > 100, "100 rows")
+
+    router.signal(signal.SIGKILL)
+    end = time.monotonic() + seconds
+    wait_until(lambda: time.monotonic() > end, "the end of a time")
+    again = place.start("router", "--listen", endpoint)
+
+    assert_ends_well(first, result)
+    again.signal(signal.SIGTERM)
+    assert again.wait() == 0
 
 
 def test_every_run_has_an_id_of_its_own(place: Place) -> None:
