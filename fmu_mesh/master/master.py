@@ -230,7 +230,7 @@ class Master:
             paced = states.wanted
             if states.takes_commands:
                 paced, pause_s = self._pacer.limit(paced, states.granting.slowest)
-            stopped = self._members.stopped() if states.silent_s(now) > states.deadlines.step else ()
+            stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
             before, actions = states.state, states.decide(now, paced, stopped)
             if not states.moves:  # at once: to publish takes as long as thousands of points
                 self._clock.stop()
@@ -251,7 +251,8 @@ class Master:
         states = self._states
         if self._meeting is None or self.streams is None:
             return
-        states.meet(tuple(self._meeting.sockets))
+        states.registrations.meet(tuple(self._meeting.sockets))
+        states.granting.measured(self.streams.round_trip_s)
         try:
             if self.streams.check():
                 states.excuse()

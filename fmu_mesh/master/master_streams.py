@@ -76,6 +76,11 @@ class MasterStreams:
             self._thread.start()
             self._keeper = StreamKeeper(self._streams, self._meeting, [end.peer for end in ends], self._post)
 
+    @property
+    def round_trip_s(self) -> float:
+        """From any thread: the longest round trip to a node, in s."""
+        return self._keeper.round_trip_s if self._keeper is not None else 0.0
+
     def check(self) -> bool:
         """From any thread: whether a stream is cut, so that nobody may be able to go on.
 

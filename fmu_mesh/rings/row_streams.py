@@ -11,6 +11,7 @@ import math
 import os
 import select
 import socket
+import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -40,6 +41,9 @@ _BUFFER_BYTES: Final = 256 * 1024
 _HEADER_BYTES: Final = 24
 _LAZY_S: Final = 0.005
 """How long rows for the recorder, and the progress of a node for the master, may wait for more of their kind."""
+_ROUND_TRIP: Final = struct.Struct("I")
+_ROUND_TRIP_AT: Final = 148
+"""Where `tcpi_min_rtt`, in microseconds, stands in the `tcp_info` of linux/tcp.h."""
 _TURN_S: Final = 0.02
 _LOOK_S: Final = 0.5
 
@@ -226,6 +230,16 @@ class RowStreams:
             return math.inf
         silent_s = time.monotonic() - stream.heard_ns / 1e9
         return 0.0 if silent_s > _LOOK_S and select.select([own], [], [], 0.0)[0] else silent_s
+
+    def round_trip_s(self, peer: str) -> float:
+        """From any thread: the shortest round trip to a peer that its socket has measured, in s; 0 on one host."""
+        own = self._sockets[self._number[peer]]
+        if own.family == socket.AF_UNIX:
+            return 0.0
+        with suppress(OSError, struct.error):
+            (found,) = _ROUND_TRIP.unpack_from(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256), _ROUND_TRIP_AT)
+            return float(found) / 1e6
+        return 0.0
 
     def resume(self, peer: str, own: socket.socket, received: Mapping[int, int]) -> None:
         """Go on with a new socket, after the rows that the peer has."""

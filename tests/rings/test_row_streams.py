@@ -201,7 +201,7 @@ def test_after_each_cut_rows_go_on_where_the_reader_is(cuts: list[tuple[int, int
     target.streams.close(0.0)
 
 
-def test_a_silent_peer_is_noticed_and_what_was_not_read_is_a_sign_of_life(both: tuple[End, End]) -> None:
+def test_what_was_not_read_yet_is_a_sign_of_life(both: tuple[End, End]) -> None:
     source, target = both
     assert target.streams.silent_s("source") < 0.5
 

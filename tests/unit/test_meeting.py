@@ -83,7 +83,7 @@ def test_the_earlier_name_dials_where_the_later_one_cannot(make: Make, tmp_path:
     assert_connected(one, other)
 
 
-def test_a_door_at_all_addresses_is_tried_where_there_is_a_connection_already(make: Make) -> None:
+def test_a_door_at_all_addresses_is_tried_at_known_hosts(make: Make) -> None:
     one = make("a", "0.0.0.0")  # noqa: S104  the door is at all addresses
     other = make("b", "127.0.0.1", connected=("127.0.0.1",))
     assert one.door_for("b").addresses[0].startswith("tcp:*:")
@@ -94,7 +94,7 @@ def test_a_door_at_all_addresses_is_tried_where_there_is_a_connection_already(ma
     assert_connected(one, other)
 
 
-def test_who_cannot_be_reached_is_given_up_and_no_door_needs_no_wait(make: Make, tmp_path: Path) -> None:
+def test_who_cannot_be_reached_is_given_up_without_more_waiting(make: Make, tmp_path: Path) -> None:
     one = make("a")
     one.knows("b", Door((f"unix:{tmp_path / 'nobody'}", "tcp:127.0.0.1:1"), "secret"))
     one.knows("c", None)
@@ -129,7 +129,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("name", STRANGE)
-def test_a_stranger_who_comes_first_is_sent_away_and_the_peer_gets_in(make: Make, name: str, tmp_path: Path) -> None:
+def test_a_stranger_who_comes_first_is_sent_away(make: Make, name: str, tmp_path: Path) -> None:
     one, other = make("a"), make("b")
     introduce(one, other)
     with socket.socket(socket.AF_UNIX) as stranger:
