@@ -182,9 +182,10 @@ class MasterStates:
             self._slowest_moved_at = None
         return news
 
-    def excuse(self) -> None:
-        """A link is cut: that nobody moves is no fault, until the link has been silent for too long."""
+    def excuse(self, now: float) -> None:
+        """A link is cut: that nobody moves or reports is no fault, until the link has been silent for too long."""
         self._moved_at = self._slowest_moved_at = None
+        self._entered_at = now
 
     def report(self, report: NodeReport) -> None:
         """A node reports its end, or that an FMU ends the simulation."""
@@ -323,7 +324,7 @@ class MasterStates:
                 self.fail(self.ended_by)
             else:
                 self._enter("stopping", now)
-                self._actions.append(SendToAll(FINISH, granting.last_point))
+                self._send_finish(now)
             return
         grant = min(self.wanted, paced)
         if grant > granting.grant:
@@ -339,6 +340,8 @@ class MasterStates:
     def _wait_for_reports(self, now: float) -> None:
         if missing := [node for node in self.plan.nodes if node not in self.reports]:
             self._check_deadline(now, self.deadlines.stop, "the end was not reported by", missing)
+            if now - self._sent_at >= self.deadlines.heartbeat:  # a router that was lost has passed nothing on
+                self._send_finish(now)
         else:
             self.state = "done"
 
@@ -350,6 +353,10 @@ class MasterStates:
         if (grown and self.granting.messages) or now - self._sent_at >= self.deadlines.heartbeat:
             self._sent_at = now
             self._actions.append(SendToAll(GRANT, owed))
+
+    def _send_finish(self, now: float) -> None:
+        self._sent_at = now
+        self._actions.append(SendToAll(FINISH, self.granting.last_point))
 
     def _check_deadline(self, now: float, limit_s: float, what: str, missing: Sequence[str]) -> None:
         if now - self._entered_at > limit_s:

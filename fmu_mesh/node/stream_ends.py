@@ -10,7 +10,7 @@ from ..rings.host_memory import HostMemory
 from ..rings.row_streams import CounterEnd, RowsEnd, RowStreams, StreamEnd
 from ..system.plan import MASTER, RECORDER, NodePlan
 from ..wire.frames import SourceRows, of_numbers
-from ..wire.messages import GRANT, PROGRESS
+from ..wire.messages import FINISH, GRANT, PROGRESS
 from ..wire.streamed_rows import incoming_rows
 from ..wire.ways import Ways
 from .stepping import Runner
@@ -40,7 +40,7 @@ def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connec
         if peer in plan.step_targets:
             heard.append(CounterEnd(PROGRESS, number(peer), own_memory.progress[peer]))
         if peer == MASTER:
-            heard.append(CounterEnd(GRANT, 0, own_memory.grant))
+            heard += [CounterEnd(GRANT, 0, own_memory.grant), CounterEnd(FINISH, 0, own_memory.finish)]
             if RECORDER in own_memory.progress:
                 heard.append(CounterEnd(PROGRESS, number(RECORDER), own_memory.progress[RECORDER]))
         incoming = [

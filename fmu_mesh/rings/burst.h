@@ -220,6 +220,7 @@ typedef struct { /* all units of a process */
   Peer *peers;
   int64_t n_peers;
   Counter *ceiling;  /* the grant of the master */
+  Counter *finish;   /* above 0: the run is over; NULL: that comes another way */
   Counter *progress; /* of this node */
   int64_t last_point, slice_ns;
   int64_t wait_ns;   /* how long to sleep where nothing can step */

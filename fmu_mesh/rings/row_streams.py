@@ -220,14 +220,14 @@ class RowStreams:
         return {rows.link: rows.known for rows in stream.incoming[: stream.n_incoming]}
 
     def silent_s(self, peer: str) -> float:
-        """From any thread: for how long nothing has come from a peer, in s; infinite if the stream has ended.
+        """From any thread: for how long nothing has come from a peer, in s; infinite if there is no stream any more.
 
         What has come and was not read yet, because a step is under way, counts as a sign of life.
         """
-        number = self._number[peer]
-        stream, own = self._tables[number], self._sockets[number]
-        if stream.state != StreamState.OPEN:
+        number = self._number.get(peer)
+        if number is None or self._tables[number].state != StreamState.OPEN:
             return math.inf
+        stream, own = self._tables[number], self._sockets[number]
         silent_s = time.monotonic() - stream.heard_ns / 1e9
         return 0.0 if silent_s > _LOOK_S and select.select([own], [], [], 0.0)[0] else silent_s
 

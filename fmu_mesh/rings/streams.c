@@ -43,7 +43,7 @@ typedef struct { /* as `fmu_mesh.wire.messages.HEADER`; in front of each frame *
   int64_t point;
 } Header;
 
-enum { FRAME = 1, GRANT = 3, PROGRESS = 4, LAST = 8, ALIVE = 10 }; /* of frames, as `fmu_mesh.wire.messages` has them */
+enum { FRAME = 1, GRANT = 3, PROGRESS = 4, FINISH = 5, LAST = 8, ALIVE = 10 }; /* of frames, as `fmu_mesh.wire.messages` has them */
 
 /* ---- sending */
 
@@ -285,6 +285,7 @@ static void take(const Place *place, Stream *stream) {
       case FRAME:
       case LAST: take_frame(stream, &header); break;
       case GRANT:
+      case FINISH:
       case PROGRESS: take_number(place, stream, &header); break;
       case ALIVE: break;
       default: refuse(stream, REFUSED, header.kind, header.point);

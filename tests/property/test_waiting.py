@@ -53,7 +53,7 @@ FUNCTIONS = (
     "claim",
     "grant_withdraw",
 )
-DIGEST = "64795eb09eab2d61"
+DIGEST = "9d270152dc275f65"
 """Of these functions, when `Protocol` was last compared with them."""
 
 NEVER = 99
