@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
 import pytest
 
@@ -30,10 +30,22 @@ def endpoint_of(router: Launched) -> str:
     return router.output.split("router at ")[1].split()[0].rstrip(",")
 
 
-def through(router: Launched, place: Place, mode: str, name: str = "pair.yaml", **sections: dict[str, Any]) -> Path:
+def through(  # noqa: PLR0913, PLR0917  one mesh
+    router: Launched,
+    place: Place,
+    mode: str,
+    name: str = "pair.yaml",
+    zenoh: Mapping[str, bool] = MappingProxyType({}),
+    link_s: float = 30.0,
+) -> Path:
     """A mesh of some seconds whose processes meet on the router, or on this host and the router."""
-    sections["zenoh"] = {"mode": mode, "connect": [endpoint_of(router)], **sections.get("zenoh", {})}
-    config = write_config(place.folder, stop_time=POINTS * 0.001, simulation={"real_time_factor": 1}, **sections)
+    config = write_config(
+        place.folder,
+        stop_time=POINTS * 0.001,
+        simulation={"real_time_factor": 1},
+        timeouts={"link": link_s},
+        zenoh={"mode": mode, "connect": [endpoint_of(router)], **zenoh},
+    )
     return config.rename(place.folder / name)
 
 
@@ -95,7 +107,7 @@ def test_a_second_process_for_a_node_is_refused_without_disturbing_the_first(pla
 
 
 def test_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place, router: Launched) -> None:
-    config = through(router, place, "client", timeouts={"link": 2.0})
+    config = through(router, place, "client", link_s=2.0)
     result = place.folder / "pair.csv"
     first = place.start("launch", config, "--no-progress")
     wait_until(lambda: row_count(result) > 100, "100 rows")
@@ -108,7 +120,7 @@ def test_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place
 
 
 @pytest.mark.parametrize("zenoh", [{}, BY_STREAMS], ids=["by rings", "by streams"])
-def test_a_router_that_comes_back_costs_nothing(place: Place, router: Launched, zenoh: dict[str, Any]) -> None:
+def test_a_router_that_comes_back_costs_nothing(place: Place, router: Launched, zenoh: Mapping[str, bool]) -> None:
     config = through(router, place, "client", zenoh=zenoh)
     result = place.folder / "pair.csv"
     first = place.start("launch", config, "--no-progress")
