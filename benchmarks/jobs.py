@@ -76,6 +76,7 @@ class Job:
         system: has no members where there is nothing to compare the values with.
         timed: the communication steps, or whole commands, from the start of the process to its end.
         watched: whether the first step and the memory of the commands are watched.
+        rows: what each row of the table is.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Job:
     entries: tuple[Entry, ...]
     timed: Literal["steps", "commands"] = "steps"
     watched: bool = False
+    rows: str = "contestant"
 
 
 def with_checkout(jobs: Sequence[Job], folder: Path) -> list[Job]:
