@@ -32,7 +32,7 @@ from benchmarks.task import System
 from tests.helpers import Launched, wait_until
 from tests.network_hosts import NetworkHost, two_hosts
 
-__all__ = ["main"]
+__all__ = ["JOBS", "LINKS", "FarJob", "FarRuns", "main"]
 
 _MOST_S: Final = 120.0
 _SUMMARY: Final = re.compile(r"^(\d+) points in [0-9.]+ s: (\d+) points/s", re.MULTILINE)
