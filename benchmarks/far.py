@@ -35,7 +35,7 @@ from tests.network_hosts import NetworkHost, two_hosts
 __all__ = ["JOBS", "LINKS", "FarJob", "FarRuns", "main"]
 
 _MOST_S: Final = 120.0
-_SUMMARY: Final = re.compile(r"^(\d+) points in [0-9.]+ s: (\d+) points/s", re.MULTILINE)
+_SUMMARY: Final = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class FarJob:
     """A configuration with two instances in nodes of their own.
 
     Attributes:
+        config: its file; empty: 8 bytes for each point through a TCP socket, and no mesh.
         points: how many it takes without a delay.
         delayed: the same with a delay.
         few: the same where packets are lost, or the line is slow.
@@ -67,7 +68,10 @@ class FarJob:
 
 _CHAIN: Final = "pendulum_delay.yaml"
 JOBS: Final = (
-    FarJob("far_chain", "far: pendulum -> delay, many points", _CHAIN, 2_000_000, 2_000_000, 20_000),
+    FarJob("far_chain", "far: pendulum -> delay, many points", _CHAIN, 2_000_000, 2_000_000, 100_000),
+    FarJob(
+        "far_socket", "far: 8 bytes for each point through a TCP socket: the limit", "", 2_000_000, 2_000_000, 100_000
+    ),
     FarJob("far_main", "far: the main example (configs/pendulum_delay.yaml)", _CHAIN, 20_000, 20_000, 20_000),
     FarJob("far_cycle", "far: two instances in a cycle (configs/cycle2.yaml)", "cycle2.yaml", 20_000, 300, 300),
 )
@@ -76,6 +80,27 @@ LINKS: Final = (
     FarLink(50.0, loss_percent=1.0),
     FarLink(50.0, kbit_per_s=1000.0),
 )
+
+_RECEIVING: Final = """
+import socket
+with socket.create_server(("10.77.0.2", 7000)) as own:
+    print("here", flush=True)
+    connection, _ = own.accept()
+    room = bytearray(1 << 20)
+    while connection.recv_into(room):
+        pass
+    connection.sendall(b"done")
+"""
+_SENDING: Final = """
+import socket, sys, time
+data = bytes(8 * int(sys.argv[1]))
+with socket.create_connection(("10.77.0.2", 7000)) as own:
+    begin = time.monotonic()
+    own.sendall(data)
+    own.shutdown(socket.SHUT_WR)
+    assert own.recv(4)
+    print(time.monotonic() - begin)
+"""
 
 
 class FarRuns:
@@ -92,6 +117,9 @@ class FarRuns:
 
     def run(self, job: FarJob, measured: Measured) -> None:
         """Run a job once; the link has to be there."""
+        if not job.config:
+            self._send(measured)
+            return
         first, second = self._hosts
         file, (near, far) = self._written(job, measured.points)
         reference, result = first.folder / f"{job.name}-{measured.points}.csv", first.folder / "far.csv"
@@ -118,10 +146,24 @@ class FarRuns:
             measured.failure = " ".join("".join(one.errors for one in running).split())[-400:]
             measured.failed += 1
             return
-        measured.costs.append(1 / int(found[2]))
+        seconds, rate = float(found[2]), int(found[3])  # rounded: the first one is finer where a run is slow
+        measured.costs.append(seconds / measured.points if seconds > 1 else 1 / rate)
         equal = filecmp.cmp(reference, result, shallow=False)
         if not measured.result.startswith("DIFFERS"):
             measured.result = "all bytes equal" if equal else "DIFFERS"
+
+    def _send(self, measured: Measured) -> None:
+        """Send as many bytes as a chain of these points needs."""
+        first, second = self._hosts
+        receiving = second.start(sys.executable, "-c", _RECEIVING)
+        wait_until(lambda: "here" in receiving.output, f"who receives; {receiving.errors}")
+        sending = first.start(sys.executable, "-c", _SENDING, str(measured.points))
+        try:
+            if sending.wait(_MOST_S):
+                raise RuntimeError(sending.story())
+            measured.costs.append(float(sending.output) / measured.points)
+        finally:
+            _end([sending, receiving])
 
     def _written(self, job: FarJob, points: int) -> tuple[str, list[str]]:
         """Write a configuration to both hosts: its path there, and its instances."""
@@ -152,7 +194,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rate", type=float, default=0.0, metavar="KBIT", help="kbit/s of each way (no limit)")
     names = [job.name for job in JOBS]
     parser.add_argument("--jobs", nargs="+", choices=names, default=names, metavar="JOB", help=f"of {', '.join(names)}")
-    parser.add_argument("--points", type=int, metavar="N", help="points of the chain (2000000, or few)")
+    parser.add_argument(
+        "--points", type=int, metavar="N", help="points of the chain, and of the socket (2000000, or few)"
+    )
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="interleaved rounds (1)")
     parser.add_argument("--window", type=int, metavar="N", help="the window of each configuration (auto)")
     parser.add_argument("--zenoh", action="store_true", help="rows by Zenoh, and not by row streams")
@@ -171,7 +215,7 @@ def _all(options: argparse.Namespace) -> Figures:
     if options.delays or options.loss or options.rate:
         links = tuple(FarLink(delay, options.loss, options.rate) for delay in options.delays or (0.0, 50.0))
     jobs = [job for job in JOBS if job.name in options.jobs]
-    tables = [job.table(links, options.points if job.name == "far_chain" else None) for job in jobs]
+    tables = [job.table(links, options.points if job.points == JOBS[0].points else None) for job in jobs]
     results = {job.name: {entry.label: Measured(2, entry.points) for entry in job.entries} for job in tables}
     changes: dict[str, dict[str, object]] = {"zenoh": {"row_streams": not options.zenoh}}
     if options.window is not None:

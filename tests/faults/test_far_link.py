@@ -1,4 +1,4 @@
-"""The program that delays packets between two hosts: what it delays, loses and limits."""
+"""The program that delays packets between two hosts: what it delays, loses and limits, and a mesh over it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import far
 from benchmarks.far_link import FarLink, far_link, why_not
 from tests.helpers import wait_until
 from tests.network_hosts import two_hosts
@@ -74,3 +75,10 @@ def test_a_slow_line_takes_its_time_and_drops_what_is_too_much(tmp_path: Path) -
 
     assert 1 < came < 50
     assert seconds >= came * one
+
+
+def test_a_cycle_over_a_far_network_equals_one_process(capsys: pytest.CaptureFixture[str]) -> None:
+    assert far.main(["--delays", "5", "--jobs", "far_cycle"]) == 0
+
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("  5 ms"))
+    assert row.endswith("all bytes equal")
