@@ -117,9 +117,19 @@ class FarRuns:
 
     def run(self, job: FarJob, measured: Measured) -> None:
         """Run a job once; the link has to be there."""
-        if not job.config:
-            self._send(measured)
-            return
+        running: list[Launched] = []
+        try:
+            if job.config:
+                self._run_mesh(job, measured, running)
+            else:
+                self._send(measured, running)
+        except AssertionError:
+            measured.failure = f"not done within {_MOST_S:.0f} s"
+            measured.failed += 1
+        finally:
+            _end(running)
+
+    def _run_mesh(self, job: FarJob, measured: Measured, running: list[Launched]) -> None:
         first, second = self._hosts
         file, (near, far) = self._written(job, measured.points)
         reference, result = first.folder / f"{job.name}-{measured.points}.csv", first.folder / "far.csv"
@@ -127,20 +137,13 @@ class FarRuns:
             alone = first.start("fmu-mesh", "launch", file, "--local", "--output", f"../{reference.name}")
             if alone.wait(_MOST_S):
                 raise RuntimeError(alone.story())
-        running = [
+        running += [
             first.start("fmu-mesh", "master", file, "--listen", "tcp/0.0.0.0:7447", "--output", f"../{result.name}"),
             first.start("fmu-mesh", "node", file, near),
             second.start("fmu-mesh", "node", file, far, "--connect", "tcp/router:7447"),
         ]
-        try:
-            wait_until(lambda: not running[0].running, "the end", _MOST_S)
-            codes = [one.wait() for one in running]
-        except AssertionError:
-            measured.failure = f"not done within {_MOST_S:.0f} s"
-            measured.failed += 1
-            return
-        finally:
-            _end(running)
+        wait_until(lambda: not running[0].running, "the end", _MOST_S)
+        codes = [one.wait() for one in running]
         found = _SUMMARY.search(running[0].output)
         if any(codes) or found is None or int(found[1]) != measured.points:
             measured.failure = " ".join("".join(one.errors for one in running).split())[-400:]
@@ -152,18 +155,15 @@ class FarRuns:
         if not measured.result.startswith("DIFFERS"):
             measured.result = "all bytes equal" if equal else "DIFFERS"
 
-    def _send(self, measured: Measured) -> None:
+    def _send(self, measured: Measured, running: list[Launched]) -> None:
         """Send as many bytes as a chain of these points needs."""
         first, second = self._hosts
-        receiving = second.start(sys.executable, "-c", _RECEIVING)
+        running.append(receiving := second.start(sys.executable, "-c", _RECEIVING))
         wait_until(lambda: "here" in receiving.output, f"who receives; {receiving.errors}")
-        sending = first.start(sys.executable, "-c", _SENDING, str(measured.points))
-        try:
-            if sending.wait(_MOST_S):
-                raise RuntimeError(sending.story())
-            measured.costs.append(float(sending.output) / measured.points)
-        finally:
-            _end([sending, receiving])
+        running.append(sending := first.start(sys.executable, "-c", _SENDING, str(measured.points)))
+        if sending.wait(_MOST_S):
+            raise RuntimeError(sending.story())
+        measured.costs.append(float(sending.output) / measured.points)
 
     def _written(self, job: FarJob, points: int) -> tuple[str, list[str]]:
         """Write a configuration to both hosts: its path there, and its instances."""
@@ -197,12 +197,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--points", type=int, metavar="N", help="points of the chain, and of the socket (2000000, or few)"
     )
-    parser.add_argument("--repeat", type=int, default=1, metavar="N", help="interleaved rounds (1)")
+    parser.add_argument("--repeat", type=int, default=3, metavar="N", help="interleaved rounds (3)")
     parser.add_argument("--window", type=int, metavar="N", help="the window of each configuration (auto)")
     parser.add_argument("--zenoh", action="store_true", help="rows by Zenoh, and not by row streams")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the measurements to this file")
     add_write_docs(parser)
     options = parser.parse_args(arguments)
+    chosen = {name for name, value in vars(options).items() if value != parser.get_default(name)}
+    if options.write_docs and chosen - {"write_docs", "repeat", "json"}:
+        parser.error("--write-docs needs all jobs and all networks")
     if reason := why_not():
         print(f"skipped: {reason}")
         return int(options.write_docs)
@@ -236,7 +239,7 @@ def _all(options: argparse.Namespace) -> Figures:
         for label, measured in results[job.name].items()
         if measured.failed or measured.result.startswith("DIFFERS")
     ]
-    about = f"Medians of {options.repeat} interleaved round(s), rows by {'Zenoh' if options.zenoh else 'row streams'}"
+    about = f"Medians of {options.repeat} interleaved rounds, rows by {'Zenoh' if options.zenoh else 'row streams'}"
     return Figures(about, report.markdown().strip(), report.text(), problems)
 
 
