@@ -30,7 +30,7 @@ def endpoint_of(router: Launched) -> str:
     return router.output.split("router at ")[1].split()[0].rstrip(",")
 
 
-def through(  # noqa: PLR0913, PLR0917  one mesh
+def through(
     router: Launched,
     place: Place,
     mode: str,
