@@ -146,7 +146,10 @@ class Granting:
         """The slowest node of this host, and its point from which on there is something to do for the master."""
         if not self.seen:
             return None
-        slowest = min(self.seen, key=self.progress.__getitem__)
+        nodes = [node for node in self.seen if node != RECORDER]
+        if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:
+            nodes = [*self.seen]  # the recorder may be far behind: what is granted next does not depend on it
+        slowest = min(nodes, key=self.progress.__getitem__)
         reached = self.progress[slowest]
         if reached >= self.reaches_all and reached >= 0:
             return None

@@ -16,6 +16,8 @@ PAUSE = "@pause"
 """Name of what limits the grant while the mesh is paused."""
 
 _STEADY_S = 0.05
+_LATE = 4
+"""After so many times of what a grant should take, fewer points are granted. TCP is slow, too, until it knows a link."""
 _TICK_S = 1e-6
 _MOST_POINTS = 1 << 40
 
@@ -50,7 +52,7 @@ class Reach:
     """
 
     def __init__(self) -> None:
-        self._points = 1
+        self._points = self._fresh = 1
         self._slowest = self._granted = self._mark = -1
         self._since = 0.0
         self._shortest_s = math.inf
@@ -63,17 +65,19 @@ class Reach:
         elapsed_s = now - self._since
         if is_used := slowest >= self._mark:
             self._shortest_s = min(self._shortest_s, elapsed_s)
-        if is_used or elapsed_s >= _STEADY_S + (round_trip_s or 0.0):
+        if is_used or elapsed_s >= _LATE * (_STEADY_S + (round_trip_s or 0.0)):
             gone, on_way_s = slowest - self._slowest, self._shortest_s if round_trip_s is None else round_trip_s
             passing = gone / max(elapsed_s, _TICK_S)
-            # Who has used a far grant soon was waiting most of the time: it steps faster than points have come.
-            stepping_s = elapsed_s - (round_trip_s or 0.0)
-            speed = gone / max(stepping_s, _TICK_S) if is_used and stepping_s < _STEADY_S / 2 else passing
+            # Who has used a far grant soon had waited for it, and steps faster than points have come.
+            stepping_s = max(elapsed_s - (round_trip_s or 0.0), _TICK_S)
+            waited = is_used and stepping_s < _STEADY_S / 2
+            speed = max(passing, self._fresh / stepping_s) if waited else passing
             wanted = speed * _STEADY_S + passing * on_way_s
             least = 1 if is_used else self._points // 2  # what is late may be on its way
             self._points = max(1, least, math.ceil(min(wanted, _MOST_POINTS)))
             self._slowest, self._since = slowest, now
             self._mark = max(self._granted + 1, slowest + self._points)  # nobody can be there before this round trip
+            self._fresh = self._mark - self._granted
         self._granted = max(self._granted, slowest + self._points)
         return self._points
 

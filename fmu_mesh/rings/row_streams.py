@@ -39,6 +39,8 @@ Rows = TypeVar("Rows", native.OutgoingTable, native.IncomingTable)
 _BUFFER_BYTES: Final = 256 * 1024
 """What one call of the system sends or reads; a larger row has a larger buffer."""
 _HEADER_BYTES: Final = 24
+_UNSENT_BYTES: Final = 128 * 1024
+"""What waits in the kernel for the network at most: a grant, or how far a node is, has to wait behind it."""
 _LAZY_S: Final = 0.005
 """How long rows for the recorder, and the progress of a node for the master, may wait for more of their kind."""
 _ROUND_TRIP: Final = struct.Struct("I")
@@ -137,8 +139,13 @@ class RowStreams:
         self.address = ctypes.addressof(self._streams)
         self._library.streams_listen(self.address, os.getpid(), self._ring)
         for number, end in enumerate(ends):
-            end.socket.settimeout(0.0)
-            self._library.stream_open(self._at(number), end.socket.fileno())
+            self._open(number, end.socket)
+
+    def _open(self, number: int, own: socket.socket) -> None:
+        own.settimeout(0.0)
+        if own.family != socket.AF_UNIX:
+            own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
+        self._library.stream_open(self._at(number), own.fileno())
 
     def _at(self, number: int) -> int:
         return ctypes.addressof(self._tables[number])
@@ -247,11 +254,10 @@ class RowStreams:
         self._library.stream_hold(self._at(number))
         self._sockets[number].close()
         self._sockets[number] = own
-        own.settimeout(0.0)
         stream = self._tables[number]
         for rows in stream.outgoing[: stream.n_outgoing]:
             rows.go_on(received.get(rows.link, 0))
-        self._library.stream_open(self._at(number), own.fileno())
+        self._open(number, own)
 
     def close(self, patience_s: float = 1.0) -> None:
         """Send what is left, for so long at most, and end all streams."""

@@ -83,6 +83,14 @@ static int put_rows(Stream *stream, Outgoing *out, int64_t ready) {
 
 /* Put what is new into the buffer: with `all`, also what may wait. Returns whether something did not fit. */
 static int fill(Stream *stream, int all) {
+  for (int64_t i = 0; i < stream->n_told; i++) { /* before any rows, which may be many: others wait for these numbers */
+    Told *told = &stream->told[i];
+    const int64_t value = value_of(told->counter);
+    if (value < told->sent + (all ? 1 : told->stride)) continue;
+    if (room(stream) < 0) return 1;
+    put_header(stream, told->kind, told->number, 0, value);
+    told->sent = value;
+  }
   for (int64_t i = 0; i < stream->n_outgoing; i++) {
     Outgoing *out = &stream->outgoing[i];
     const int64_t ready = value_of(out->counter);
@@ -93,14 +101,6 @@ static int fill(Stream *stream, int all) {
       put_header(stream, LAST, out->link, 0, ready);
       atomic_store(&out->last, SAID);
     }
-  }
-  for (int64_t i = 0; i < stream->n_told; i++) {
-    Told *told = &stream->told[i];
-    const int64_t value = value_of(told->counter);
-    if (value < told->sent + (all ? 1 : told->stride)) continue;
-    if (room(stream) < 0) return 1;
-    put_header(stream, told->kind, told->number, 0, value);
-    told->sent = value;
   }
   return 0;
 }
