@@ -17,7 +17,7 @@ PAUSE = "@pause"
 
 _STEADY_S = 0.05
 _LATE = 4
-"""After so many times of what a grant should take, fewer points are granted. TCP is slow, too, until it knows a link."""
+"""After so many times of what a grant should take, fewer points are granted. TCP begins slowly, too."""
 _TICK_S = 1e-6
 _MOST_POINTS = 1 << 40
 
