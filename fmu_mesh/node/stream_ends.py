@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Final
 
 from ..rings.host_memory import HostMemory
 from ..rings.row_streams import CounterEnd, RowsEnd, RowStreams, StreamEnd
@@ -16,9 +15,6 @@ from ..wire.ways import Ways
 from .stepping import Runner
 
 __all__ = ["streams_of"]
-
-_RARELY: Final = 1 << 40
-"""The grant of the master reaches far ahead, so it may learn a few milliseconds later how far this node is."""
 
 
 def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connected
@@ -34,8 +30,8 @@ def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connec
     ends, number = [], memory.map.number_of
     for peer in ways.streams_of(plan.node):
         told, heard = [], []
-        if peer in plan.step_sources or peer == MASTER:  # whose windows end at this node
-            stride = plan.progress_stride if peer != MASTER else _RARELY
+        if peer in plan.step_sources or peer == MASTER:  # whose windows end at this node; grants reach far ahead
+            stride = plan.progress_stride if peer != MASTER else 0
             told.append(CounterEnd(PROGRESS, number(plan.node), memory.progress[plan.node], stride))
         if peer in plan.step_targets:
             heard.append(CounterEnd(PROGRESS, number(peer), own_memory.progress[peer]))

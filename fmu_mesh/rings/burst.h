@@ -158,7 +158,7 @@ typedef struct { /* a counter of this process that the other one has, too */
   int64_t kind, number; /* of its frames: GRANT or PROGRESS, and of which process */
   Counter *counter;
   int64_t sent;
-  int64_t stride; /* by how much it grows before it is sent without need */
+  int64_t stride; /* by how much it grows before it is sent; 0: it may wait with all that is lazy */
 } Told;
 
 typedef struct { /* a counter of the other process */

@@ -86,7 +86,11 @@ class RowsEnd(NamedTuple):
 
 
 class CounterEnd(NamedTuple):
-    """A counter that one process tells another one: frames of a ``kind`` with the ``number`` of a participant."""
+    """A counter that one process tells another one: frames of a ``kind`` with the ``number`` of a participant.
+
+    Attributes:
+        stride: by how much it grows before it is sent; 0: it may wait for a while.
+    """
 
     kind: int
     number: int

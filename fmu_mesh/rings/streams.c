@@ -86,7 +86,7 @@ static int fill(Stream *stream, int all) {
   for (int64_t i = 0; i < stream->n_told; i++) { /* before any rows, which may be many: others wait for these numbers */
     Told *told = &stream->told[i];
     const int64_t value = value_of(told->counter);
-    if (value < told->sent + (all ? 1 : told->stride)) continue;
+    if (value <= told->sent || (told->stride > 0 ? value < told->sent + told->stride : !all)) continue;
     if (room(stream) < 0) return 1;
     put_header(stream, told->kind, told->number, 0, value);
     told->sent = value;
@@ -130,7 +130,7 @@ static int has_new(const Stream *stream) {
   for (int64_t i = 0; i < stream->n_outgoing; i++)
     if (value_of(stream->outgoing[i].counter) > stream->outgoing[i].sent || stream->outgoing[i].last == UNSAID) return 1;
   for (int64_t i = 0; i < stream->n_told; i++)
-    if (value_of(stream->told[i].counter) > stream->told[i].sent) return 1;
+    if (stream->told[i].stride <= 1 && value_of(stream->told[i].counter) > stream->told[i].sent) return 1;
   return 0;
 }
 
