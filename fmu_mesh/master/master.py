@@ -413,4 +413,5 @@ class Master:
             error=states.failure.report() if states.failure is not None else None,
             overruns=self._pacer.overruns,
             refused=self._inbox.refusals.count,
+            cut=self.streams.cut if self.streams is not None else {},
         )

@@ -86,6 +86,11 @@ class MasterStreams:
         """From any thread: for how long nothing has come from a node, in s; infinite without a row stream."""
         return self._streams.silent_s(node) if self._streams is not None else math.inf
 
+    @property
+    def cut(self) -> dict[str, float]:
+        """From any thread: for how long the streams with these nodes are cut, in s."""
+        return self._keeper.cut if self._keeper is not None else {}
+
     def check(self) -> bool:
         """From any thread: whether a stream is cut, so that nobody may be able to go on.
 

@@ -282,7 +282,7 @@ class Node:
             streams=self._streams,
         )
         self._inbox.move_to(self._memory, engine)
-        self._activity.steps_with(engine)
+        self._activity.steps_with(engine, self._ways, self._keeper)
         for runner in self._runners.values():
             runner.begin()
             runner.flush()

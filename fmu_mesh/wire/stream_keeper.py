@@ -68,19 +68,23 @@ class StreamKeeper:
         now = self._clock()
         return {peer: now - since for peer, since in [*self._cut_since.items()]}
 
+    def cut_in_words(self, own: str, limit_s: float = 0.0) -> list[str]:
+        """From any thread: the streams that are cut for longer, with both ends."""
+        return [
+            f"the link between {_spoken(own)} and {_spoken(peer)} is cut for {cut_s:.0f} s"
+            for peer, cut_s in self.cut.items()
+            if cut_s > limit_s
+        ]
+
     def check(self, own: str, limit_s: float) -> None:
         """Check that no stream is cut for longer.
 
         Raises:
             MeshLost: one is; names both ends.
         """
-        for peer, cut_s in self.cut.items():
-            if cut_s > limit_s:
-                ends = _spoken(own), _spoken(peer)
-                raise MeshLost(
-                    f"the link between {ends[0]} and {ends[1]} is cut for {cut_s:.0f} s",
-                    hint="Is the process stopped, its host suspended, or the network cut? `timeouts.link` limits it.",
-                )
+        if words := self.cut_in_words(own, limit_s):
+            hint = "Is the process stopped, its host suspended, or the network cut? `timeouts.link` limits it."
+            raise MeshLost(words[0], hint=hint)
 
     def close(self) -> None:
         """End."""
