@@ -24,6 +24,7 @@ _MODULES_NEED = {
     "fmpy_arrays": ("fmpy",),
     "zeromq_lockstep": ("fmpy", "pyzmq"),
     "zenoh_lockstep": ("fmpy", "eclipse-zenoh"),
+    "zenoh_round_trip": ("fmpy", "eclipse-zenoh"),
     "helics_federates": ("fmpy", "helics"),
     "ecos_engine": ("ecospy", "tbb"),
     "mosaik_scenario": ("fmpy", "mosaik"),
@@ -76,6 +77,7 @@ class Job:
         system: has no members where there is nothing to compare the values with.
         timed: the communication steps, or whole commands, from the start of the process to its end.
         watched: whether the first step and the memory of the commands are watched.
+        rows: what each row of the table is.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Job:
     entries: tuple[Entry, ...]
     timed: Literal["steps", "commands"] = "steps"
     watched: bool = False
+    rows: str = "contestant"
 
 
 def with_checkout(jobs: Sequence[Job], folder: Path) -> list[Job]:
@@ -133,6 +136,7 @@ _CYCLE2 = System(
         Member("velocity", "Integrator", "u", "y", {"k": -1.0, "y": 0.0}),
     ),
 )
+_STAR5 = System("star", "gauss_seidel", 0.001, _gains(5))
 _CHATTY = System("chain", "gauss_seidel", 0.001, (Member("chatty", CHATTY, "u", "y", {"u": 1.0}),))
 _SIZES = (2, 16, 64)
 _US = "fmu_mesh"
@@ -143,6 +147,9 @@ _C_ONE = "C, one process"
 _C_OWN = "C, process per FMU"
 _ZENOH = "zenoh lockstep by hand"
 _MEMORY = "shared memory, C"
+_STREAMS = "fmu_mesh, row streams"
+_BY_ZENOH = "fmu_mesh, Zenoh"
+_APART = "without shared memory, as between two hosts"
 
 
 def _c(points: int, processes: Literal["one", "own"]) -> Entry:
@@ -167,14 +174,30 @@ def _helics(label: str, points: int, quick: int, *, core: str = "tcp", coupled: 
     return Entry(label, "helics_federates", points, quick, options, "jacobi")
 
 
-def _lockstep(points: int, quick: int) -> tuple[Entry, ...]:
+def _messages(points: int, quick: int) -> tuple[Entry, ...]:
     """What exchanges a message for every value."""
     return (
         _helics("HELICS coupled, tcp", points, quick),
         Entry("ZeroMQ lockstep by hand", "zeromq_lockstep", points, quick, coupling="jacobi"),
         Entry(_ZENOH, "zenoh_lockstep", points, quick, coupling="jacobi"),
-        Entry("mosaik, process per FMU", "mosaik_scenario", points // 2, quick),
     )
+
+
+def _lockstep(points: int, quick: int) -> tuple[Entry, ...]:
+    """The same, and mosaik."""
+    return (*_messages(points, quick), Entry("mosaik, process per FMU", "mosaik_scenario", points // 2, quick))
+
+
+def _apart(way: Literal["streams", "zenoh"], points: int, quick: int = 0, **options: str) -> Entry:
+    """Ours without shared memory."""
+    return Entry(_STREAMS if way == "streams" else _BY_ZENOH, OURS, points, quick, {"apart": way, **options})
+
+
+def _spinning(transport: Literal["tcp", "unix"], what: Literal["trip", "exchange"]) -> Entry:
+    """40 bytes between two processes of C that do not sleep: there and back, or both ways at once."""
+    label = f"{'TCP' if transport == 'tcp' else 'Unix socket'}, C, spinning: one {'round ' * (what == 'trip')}{what}"
+    options = {"transport": transport, "language": "c", "spins": what, "bytes": "40"}
+    return Entry(label, "ping_pong", 50_000, options=options, system=_NOTHING)
 
 
 def _limit(label: str, transport: str, language: str, cores: str = "any", points: int = 30_000) -> Entry:
@@ -298,12 +321,50 @@ JOBS = (
         ),
     ),
     Job(
-        "frames",
-        "pendulum -> delay without shared memory, as between two hosts, own process per FMU",
+        "apart_cycle",
+        f"two instances in a cycle (configs/cycle2.yaml) {_APART}",
+        _CYCLE2,
+        (
+            _apart("streams", 50_000),
+            Entry(f"{_STREAMS}, nothing recorded", OURS, 50_000, options={"apart": "streams", "record": "none"}),
+            _apart("zenoh", 10_000, 3_000),
+            *_messages(10_000, 3_000),
+            replace(_c(50_000, "own"), label=f"{_C_OWN}, TCP", options={"processes": "own", "transport": "tcp"}),
+            _spinning("tcp", "trip"),
+            _spinning("tcp", "exchange"),
+            _spinning("unix", "trip"),
+            _spinning("unix", "exchange"),
+            Entry("Zenoh in Python: one round trip", "zenoh_round_trip", 10_000, 3_000, system=_NOTHING),
+        ),
+    ),
+    Job(
+        "apart_window1",
+        f"window 1, two nodes in a chain, {_APART}",
+        _CHAIN2,
+        (
+            _apart("streams", 10_000, window="1"),
+            _apart("zenoh", 5_000, 2_000, window="1"),
+            Entry(_ZENOH, "zenoh_lockstep", 5_000, 3_000),
+            _spinning("tcp", "trip"),
+        ),
+    ),
+    Job(
+        "apart_chain",
+        f"pendulum -> delay, many points, with shared memory, and {_APART}",
         _PENDULUM,
         (
-            Entry("fmu_mesh, shared memory", OURS, 400_000),
-            Entry("fmu_mesh, no shared memory", OURS, 400_000, options={"shared_memory": "no"}),
+            Entry("fmu_mesh, shared memory", OURS, 1_000_000, 400_000),
+            _apart("streams", 1_000_000, 400_000),
+            _apart("zenoh", 200_000, 50_000),
+        ),
+    ),
+    Job(
+        "apart_star",
+        f"one source that feeds four, with shared memory, and {_APART}",
+        _STAR5,
+        (
+            Entry("fmu_mesh, shared memory", OURS, 200_000, 100_000),
+            _apart("streams", 200_000, 100_000),
         ),
     ),
     Job(

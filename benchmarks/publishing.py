@@ -45,6 +45,7 @@ _LOOK_S = 5.0
 
 BLOCKS = {
     "jobs": "benchmarks",
+    "far": "benchmarks.far",
     "recording": "benchmarks.recording",
     "formats": "benchmarks.formats",
     "scale": "benchmarks.scale",

@@ -13,10 +13,9 @@ from benchmarks.targets import TARGETS, Target
 
 __all__ = ["Report"]
 
-_STEPS = ("contestant", "points", "points/s", "us/point", "spread", "ratio", "values")
-_COMMANDS = ("contestant", "s", "spread", "ratio", "values")
+_STEPS = ("points", "points/s", "us/point", "spread", "ratio", "values")
+_COMMANDS = ("s", "spread", "ratio", "values")
 _WATCHED = (
-    "contestant",
     "first point, s",
     "end, s",
     "spread",
@@ -157,7 +156,7 @@ class Report:
 
 
 def _header(job: Job) -> Row:
-    return _WATCHED if job.watched else _COMMANDS if job.timed == "commands" else _STEPS
+    return (job.rows, *(_WATCHED if job.watched else _COMMANDS if job.timed == "commands" else _STEPS))
 
 
 def _first_point(job: Job, measured: Measured) -> Row:

@@ -1,4 +1,4 @@
-"""What our own figures should be: what issue 17 asks for, and what is aimed at."""
+"""What our own figures should be: what issues 17 and 38 ask for, and what is aimed at."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ _COMMAND, _LOCAL = "fmu-mesh launch", "fmu-mesh launch --local"
 _NO_FILE = "fmu_mesh, nothing recorded"
 _EIGHT, _TWO = "fmu_mesh, chain of 8", "fmu_mesh, chain of 2"
 _ROUND_TRIP = "shared memory, C: one round trip"
-_FRAMES, _MEMORY = "fmu_mesh, no shared memory", "fmu_mesh, shared memory"
+_STREAMS, _BY_ZENOH, _MEMORY = "fmu_mesh, row streams", "fmu_mesh, Zenoh", "fmu_mesh, shared memory"
+_TCP, _ZENOH = "TCP, C, spinning: one round trip", "Zenoh in Python: one round trip"
 _WINDOW1 = "fmu_mesh, gauss_seidel"
 
 TARGETS = (
@@ -64,7 +65,15 @@ TARGETS = (
     Target("cycle in one group, against the FMPy loop", "group", "fmu_mesh", "times as fast", 40, 80, _FMPY),
     Target("window 1: a point, against a round trip", "window1", _WINDOW1, "times as long", 25, 8, _ROUND_TRIP),
     Target("chain of 8 against chain of 2", "chain8", _EIGHT, "times as long, each", 1.0, 0.7, _TWO),
-    Target("main job without shared memory, against with it", "frames", _FRAMES, "times as fast", 0.33, 0.5, _MEMORY),
+    Target(
+        "cycle by streams, a point, against a TCP round trip", "apart_cycle", _STREAMS, "times as long", 3, 1.5, _TCP
+    ),
+    Target("the same, against HELICS", "apart_cycle", _STREAMS, "times as fast", 10, 20, "HELICS coupled, tcp"),
+    Target("cycle by Zenoh, against its round trip", "apart_cycle", _BY_ZENOH, "times as long", 1.3, 1.1, _ZENOH),
+    Target("window 1 by streams, against that round trip", "apart_window1", _STREAMS, "times as long", 10, 5, _TCP),
+    Target("chain by streams, against shared memory", "apart_chain", _STREAMS, "times as fast", 0.5, 0.77, _MEMORY),
+    Target("star by streams, against shared memory", "apart_star", _STREAMS, "times as fast", 0.5, 0.77, _MEMORY),
+    Target("chain at a round trip of 50 ms, against 0 ms", "far_chain", "50 ms", "times as fast", 0.5, 0.83, "0 ms"),
     Target("FMI 1.0, against the other checkout", "kinds", _FMI1, "times as fast", 2, 4, _FMI1 + OTHER),
     Target("Boolean, Enumeration, against the other checkout", "kinds", _FMI2, "times as fast", 2, 4, _FMI2 + OTHER),
     Target("main job, launch --local", "pendulum", "fmu_mesh, launch --local", "points/s", 437_000, 800_000),

@@ -1,7 +1,7 @@
 """What a contestant is asked to do, and what it answers. Standard library only: every environment imports it.
 
 All systems of the benchmark are rows of instances with one connected input and one output each: instance ``i`` is fed
-by instance ``i - 1``. In a chain nobody feeds the first one, in a cycle the last one does.
+by instance ``i - 1``, or in a star by the first one. In a cycle the last one feeds the first one, else nobody does.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Member:
 class System:
     """A system structure; `step_size` is in s."""
 
-    kind: Literal["chain", "cycle"]
+    kind: Literal["chain", "cycle", "star"]
     algorithm: Algorithm
     step_size: float
     members: tuple[Member, ...]
@@ -51,7 +51,7 @@ class System:
     def source_of(self, index: int) -> int | None:
         """Index of the instance that feeds instance ``index``."""
         if index > 0:
-            return index - 1
+            return 0 if self.kind == "star" else index - 1
         return len(self.members) - 1 if self.kind == "cycle" else None
 
     def stages(self) -> list[list[int]]:

@@ -98,8 +98,10 @@ def _mounted_checkout(folder: Path) -> list[str]:
 
 
 @contextmanager
-def two_hosts(folder: Path, names: Sequence[str] = ("first", "second")) -> Iterator[list[NetworkHost]]:
-    """Two hosts with a network between them; the first one has the address of `router`."""
+def two_hosts(
+    folder: Path, names: Sequence[str] = ("first", "second"), *, wired: bool = True
+) -> Iterator[list[NetworkHost]]:
+    """Two hosts with a network between them, if they are ``wired``; the first one has the address of `router`."""
     (shared := folder / "shared").mkdir()
     with ExitStack() as stack:
         hosts = []
@@ -107,13 +109,18 @@ def two_hosts(folder: Path, names: Sequence[str] = ("first", "second")) -> Itera
             (own := folder / f"host{number}").mkdir()
             hosts.append(NetworkHost(name, own, shared))
             stack.callback(hosts[-1].close)
-        first, second = (str(host.pid) for host in hosts)
-        link = ["ip", "link", "add", "wire", "netns", first, "type", "veth", "peer", "name", "wire", "netns", second]
-        subprocess.run(link, check=True, timeout=DEADLINE_S)
-        for number, host in enumerate(hosts, 1):
-            for words in (f"addr add 10.77.0.{number}/24 dev wire", "link set wire up"):
-                assert host.start("ip", *words.split()).wait() == 0
+        if wired:
+            _wire(hosts)
         yield hosts
+
+
+def _wire(hosts: Sequence[NetworkHost]) -> None:
+    first, second = (str(host.pid) for host in hosts)
+    link = ["ip", "link", "add", "wire", "netns", first, "type", "veth", "peer", "name", "wire", "netns", second]
+    subprocess.run(link, check=True, timeout=DEADLINE_S)
+    for number, host in enumerate(hosts, 1):
+        for words in (f"addr add 10.77.0.{number}/24 dev wire", "link set wire up"):
+            assert host.start("ip", *words.split()).wait() == 0
 
 
 def started_apart(

@@ -1,26 +1,28 @@
 /* The limit: a chain or a cycle of FMUs without any tool, in one process, or with a process for each instance.
  *
- *   c_program PROCESSES LEAD POINTS STEP_SIZE INSTANCE...
+ *   c_program PROCESSES memory|tcp LEAD POINTS STEP_SIZE INSTANCE...
  *   INSTANCE: LIBRARY GUID RESOURCES SOURCE INPUT OUTPUT INITIAL COUNT, and COUNT times REFERENCE VALUE
  *
  * SOURCE is the number of the instance that feeds this one, or -1. An instance takes its step from point k with the
  * value of its source at point k + LEAD. Prints the time from the first to the last point in s, and the last outputs.
  *
  * Each instance writes its outputs into a ring in shared memory, and counts them. Who waits for a counter spins, and
- * lets other processes run from time to time. It never sleeps.
+ * lets other processes run from time to time. It never sleeps. With `tcp`, each output goes to its target through a
+ * socket, eight bytes at a time, and who waits for it spins as well; memory then has the first and the last outputs.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
-#include <sched.h>
 #include <signal.h>
 #include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/wait.h>
 #include <time.h>
-#include <unistd.h>
+
+#include "sockets.h"
 
 #include "fmi2FunctionTypes.h"
 
@@ -45,6 +47,7 @@ typedef struct {
     fmi2ValueReference input, output;
     Output *own, *source, *target;       /* target: whom it feeds */
     long source_point, target_point;     /* what is known of them, so that their counters are rarely read */
+    int to_source, to_target;            /* sockets, where memory carries nothing */
 } Instance;
 
 static pid_t parent; /* 0 in the first process, which ends the others with it */
@@ -128,26 +131,43 @@ static int instantiate(Instance *self, char **argv, double stop_time, Output *ou
 
 /* ---- stepping */
 
-static void step(Instance *self, long point, long lead, double step_size) {
-    if (self->source != NULL) {
-        long row = point + lead;
+static void set_input(Instance *self, long row) {
+    double value;
+    if (self->to_source != 0 && row > 0) { /* the initial row is in memory */
+        if (!receive_spinning(self->to_source, &value, sizeof value)) fail("recv");
+    } else {
         if (self->source_point < row) self->source_point = wait_for(&self->source->point, row);
-        check(self->set(self->component, &self->input, 1, &self->source->rows[row % ROWS]), "fmi2SetReal");
+        value = self->source->rows[row % ROWS];
     }
+    check(self->set(self->component, &self->input, 1, &value), "fmi2SetReal");
+}
+
+static void step(Instance *self, long point, long lead, double step_size) {
+    if (self->source != NULL) set_input(self, point + lead);
     check(self->step(self->component, (double)point * step_size, step_size, fmi2True), "fmi2DoStep");
     /* The target may still need the row of its own point. */
-    if (self->target != NULL && self->target_point < point + 2 - ROWS)
+    if (self->target != NULL && self->to_target == 0 && self->target_point < point + 2 - ROWS)
         self->target_point = wait_for(&self->target->point, point + 2 - ROWS);
-    check(self->get(self->component, &self->output, 1, &self->own->rows[(point + 1) % ROWS]), "fmi2GetReal");
+    double *value = &self->own->rows[(point + 1) % ROWS];
+    check(self->get(self->component, &self->output, 1, value), "fmi2GetReal");
+    if (self->to_target != 0 && send(self->to_target, value, sizeof *value, MSG_NOSIGNAL) != sizeof *value)
+        fail("send");
     atomic_store_explicit(&self->own->point, point + 1, memory_order_release);
 }
 
 int main(int argc, char **argv) {
     Instance instances[MOST] = {0};
-    if (argc < 5) return 2;
-    const long processes = atol(argv[1]), lead = atol(argv[2]), points = atol(argv[3]);
-    const double step_size = strtod(argv[4], NULL);
+    if (argc < 6) return 2;
+    const long processes = atol(argv[1]), lead = atol(argv[3]), points = atol(argv[4]);
+    const int by_tcp = strcmp(argv[2], "tcp") == 0;
+    const double step_size = strtod(argv[5], NULL);
     if (processes < 1 || processes > MOST) fail("too many processes");
+    int links[MOST][2]; /* from each instance to the next one, and from the last to the first */
+    for (long i = 0; by_tcp && i < processes; i++) {
+        /* Two in a cycle have one connection, as two hosts would. */
+        if (i == 1 && processes == 2) links[1][0] = links[0][1], links[1][1] = links[0][0];
+        else if (!tcp_pair(links[i])) fail("sockets");
+    }
     Shared *shared = mmap(NULL, sizeof *shared, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
     if (shared == MAP_FAILED) fail("mmap");
 
@@ -165,7 +185,7 @@ int main(int argc, char **argv) {
     }
 
     int n = 0;
-    for (int next = 5; next < argc; n++) {
+    for (int next = 6; next < argc; n++) {
         if (n == MOST || next + 8 > argc) fail("arguments");
         instances[n].own = &shared->outputs[n];
         next += instantiate(&instances[n], argv + next, (double)points * step_size, shared->outputs,
@@ -174,7 +194,10 @@ int main(int argc, char **argv) {
     if (processes != 1 && processes != n) fail("one process, or one for each instance");
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
-            if (instances[j].source == instances[i].own) instances[i].target = instances[j].own;
+            if (instances[j].source == instances[i].own) {
+                instances[i].target = instances[j].own;
+                if (by_tcp) instances[i].to_target = links[i][0], instances[j].to_source = links[i][1];
+            }
 
     const int first = processes == 1 ? 0 : (int)process, end = processes == 1 ? n : first + 1;
     atomic_fetch_add(&shared->ready, 1);

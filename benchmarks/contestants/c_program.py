@@ -1,7 +1,8 @@
 """The limit: a program in C that does nothing but step the FMUs, in one process or in one process per FMU.
 
 Between processes, outputs pass through shared memory, and who waits for a value spins. It has no messages, no master,
-no errors with names, and it records nothing. Option `processes`: `one`, or `own` for a process per FMU.
+no errors with names, and it records nothing. Option `processes`: `one`, or `own` for a process per FMU; `transport`:
+`tcp` for sockets over loopback in place of shared memory.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def run(task: Task) -> Outcome:
     count = 1 if task.options["processes"] == "one" else len(system.members)
     lead = 0 if system.algorithm == "jacobi" else 1
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        command = [str(program), str(count), str(lead), str(task.points), system.step_size.hex()]
+        transport = task.options.get("transport", "memory")
+        command = [str(program), str(count), transport, str(lead), str(task.points), system.step_size.hex()]
         for index in range(len(system.members)):
             command += _instance(task, index, f"{folder}/{index}")
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=_DEADLINE_S)

@@ -51,7 +51,8 @@ def compiled(source: Path, *flags: str) -> tuple[Path, dict[str, str]]:
         msg = "there is no C compiler"
         raise RuntimeError(msg)
     about = subprocess.run([compiler, "--version"], check=True, capture_output=True, text=True).stdout.splitlines()[0]
-    digest = hashlib.sha256(repr((about, flags, source.read_bytes())).encode()).hexdigest()[:12]
+    sources = [source, *sorted(source.parent.glob("*.h"))]
+    digest = hashlib.sha256(repr((about, flags, [file.read_bytes() for file in sources])).encode()).hexdigest()[:12]
     program = _ROOT / "build" / "bench-programs" / f"{source.stem}-{digest}"
     if not program.exists():
         program.parent.mkdir(parents=True, exist_ok=True)

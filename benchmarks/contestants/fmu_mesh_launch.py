@@ -1,7 +1,7 @@
 """fmu_mesh: `fmu-mesh launch` on a configuration written from the task; runs in the project's own environment.
 
 Options: `window`; `group` = `one` puts all instances into one node; `local` = `yes` is `launch --local`; `record` =
-`outputs` (the outputs that the system reads), `all` or `none`; `shared_memory` = `no` sends all rows in frames;
+`outputs` (the outputs that the system reads), `all` or `none`; `apart` = `streams` or `zenoh` is without shared memory;
 `result` is the CSV file; `checkout` is the folder of another checkout with its `.venv`, whose fmu_mesh runs instead.
 """
 
@@ -89,7 +89,9 @@ def configuration(task: Task) -> dict[str, Any]:
         "instances": instances,
         "connections": connections,
         "record": record,
-        "zenoh": {"shared_memory": options.get("shared_memory") != "no"},
+        "zenoh": {"streams": {"shared_memory": False}, "zenoh": {"shared_memory": False, "row_streams": False}}.get(
+            options.get("apart", ""), {}
+        ),
     }
 
 

@@ -1,9 +1,10 @@
-/* 16 bytes there and back, `count` times, between this process and a child: ping_pong unix|tcp|memory COUNT prints
- * seconds. Through shared memory both sides spin; a number tells the other side that the bytes are there. */
+/* Bytes there and back, COUNT times, between this process and a child; it prints seconds:
+ *
+ *   ping_pong unix|tcp|memory COUNT                   16 bytes
+ *   ping_pong unix|tcp COUNT trip|exchange BYTES      the same, but who waits spins; or both send at once, then both wait
+ *
+ * Through shared memory both sides spin; a number tells the other side that the bytes are there. */
 #define _GNU_SOURCE
-#include <netinet/in.h>
-#include <netinet/tcp.h>
-#include <sched.h>
 #include <signal.h>
 #include <stdatomic.h>
 #include <stdio.h>
@@ -11,30 +12,16 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/prctl.h>
-#include <sys/socket.h>
 #include <sys/wait.h>
 #include <time.h>
-#include <unistd.h>
+
+#include "sockets.h"
+
+enum { MOST = 4096 };
 
 static void fail(const char *what) {
     perror(what);
     exit(1);
-}
-
-static void tcp_pair(int ends[2]) {
-    struct sockaddr_in address = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
-    socklen_t size = sizeof address;
-    int listener = socket(AF_INET, SOCK_STREAM, 0), on = 1;
-    if (listener < 0 || bind(listener, (struct sockaddr *)&address, size) != 0 || listen(listener, 1) != 0 ||
-        getsockname(listener, (struct sockaddr *)&address, &size) != 0)
-        fail("listen");
-    ends[0] = socket(AF_INET, SOCK_STREAM, 0);
-    if (ends[0] < 0 || connect(ends[0], (struct sockaddr *)&address, size) != 0) fail("connect");
-    ends[1] = accept(listener, NULL, NULL);
-    if (ends[1] < 0) fail("accept");
-    setsockopt(ends[0], IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
-    setsockopt(ends[1], IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
-    close(listener);
 }
 
 static double now(void) {
@@ -52,24 +39,33 @@ static pid_t forked(void) {
 
 /* ---- over a socket */
 
-static double over_sockets(const char *transport, long count) {
+static int spins; /* whether who waits for bytes spins */
+
+static int send_all(int end, const char *data, size_t size) {
+    return send(end, data, size, MSG_NOSIGNAL) == (ssize_t)size;
+}
+
+static int receive_all(int end, char *data, size_t size) {
+    return spins ? receive_spinning(end, data, size) : recv(end, data, size, MSG_WAITALL) == (ssize_t)size;
+}
+
+static double over_sockets(const char *transport, long count, size_t size, int exchange) {
     int ends[2];
-    char data[16] = {0};
-    if (strcmp(transport, "tcp") == 0)
-        tcp_pair(ends);
-    else if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends) != 0)
-        fail("socketpair");
+    char data[MOST] = {0};
+    if (strcmp(transport, "tcp") == 0 ? !tcp_pair(ends) : socketpair(AF_UNIX, SOCK_STREAM, 0, ends) != 0)
+        fail("sockets");
     if (forked() == 0) {
         close(ends[0]);
-        while (recv(ends[1], data, sizeof data, MSG_WAITALL) == (ssize_t)sizeof data)
-            if (send(ends[1], data, sizeof data, MSG_NOSIGNAL) != (ssize_t)sizeof data) _exit(1);
+        if (exchange && !send_all(ends[1], data, size)) _exit(1);
+        while (receive_all(ends[1], data, size))
+            if (!send_all(ends[1], data, size)) _exit(1);
         _exit(0);
     }
     close(ends[1]);
     double begin = now();
     for (long i = 0; i < count; i++) {
-        if (send(ends[0], data, sizeof data, MSG_NOSIGNAL) != (ssize_t)sizeof data) fail("send");
-        if (recv(ends[0], data, sizeof data, MSG_WAITALL) != (ssize_t)sizeof data) fail("recv");
+        if (!send_all(ends[0], data, size)) fail("send");
+        if (!receive_all(ends[0], data, size)) fail("recv");
     }
     double end = now();
     close(ends[0]);
@@ -120,9 +116,13 @@ static double through_memory(long count) {
 }
 
 int main(int argc, char **argv) {
-    if (argc != 3) return 2;
-    long count = atol(argv[2]);
-    double seconds = strcmp(argv[1], "memory") == 0 ? through_memory(count) : over_sockets(argv[1], count);
+    if (argc != 3 && argc != 5) return 2;
+    const long count = atol(argv[2]);
+    const size_t size = argc == 5 ? strtoul(argv[4], NULL, 10) : 16;
+    if (size < 1 || size > MOST) return 2;
+    spins = argc == 5;
+    const int exchange = spins && strcmp(argv[3], "exchange") == 0;
+    double seconds = strcmp(argv[1], "memory") == 0 ? through_memory(count) : over_sockets(argv[1], count, size, exchange);
     wait(NULL);
     printf("%.9f\n", seconds);
     return 0;

@@ -2,7 +2,8 @@
 
 One round trip is the least that one step of a coupled pair costs. Options: `transport` (`memory`, `unix` or `tcp`),
 `language` (`c` or `python`; `memory` only in C), and `cores`: `one` keeps both processes on one core, where a message
-wakes no sleeping core up.
+wakes no sleeping core up. Option `spins`, in C: `trip` or `exchange` (both send at once, as in a Jacobi cycle) of so
+many `bytes` over sockets, and who waits spins.
 """
 
 from __future__ import annotations
@@ -75,6 +76,8 @@ def _configure(connection: socket.socket, transport: str) -> None:
 def _in_c(task: Task) -> Outcome:
     program, compiler = compiled(_SOURCE)
     command = [str(program), task.options["transport"], str(task.points)]
+    if "spins" in task.options:
+        command += [task.options["spins"], task.options["bytes"]]
     output = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
     return Outcome(float(output), versions=compiler)
 

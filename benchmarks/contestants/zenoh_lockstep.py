@@ -20,7 +20,7 @@ from benchmarks.contestants.entry import main, nodes, versions
 from benchmarks.contestants.fmu import opened
 from benchmarks.task import Outcome, Task
 
-__all__: list[str] = []
+__all__ = ["hello", "publisher", "session_of"]
 
 _GRANT = struct.Struct("<q")
 _OUTPUT = struct.Struct("<qqd")
@@ -30,9 +30,9 @@ _COORDINATOR = "coordinator"
 def run(task: Task) -> Outcome:
     """Coordinate; timed is the coordinator's loop."""
     members = task.system.members
-    with tempfile.TemporaryDirectory(prefix="bench-") as folder, _session(folder, _COORDINATOR, []) as session:
+    with tempfile.TemporaryDirectory(prefix="bench-") as folder, session_of(folder, _COORDINATOR, []) as session:
         outputs = session.declare_subscriber("bench/out/*", FifoChannel(64))
-        grant = _publisher(session, "bench/grant")
+        grant = publisher(session, "bench/grant")
         answers = session.declare_queryable(f"bench/hello/{_COORDINATOR}", FifoChannel(64))
         with nodes(_node, [(task, index, folder) for index in range(len(members))]):
             waiting = [answers.recv() for _ in members]
@@ -69,15 +69,15 @@ def _loop(
 def _node(_pipe: Connection, task: Task, index: int, folder: str) -> None:
     system = task.system
     source = system.source_of(index)
-    with _session(folder, str(index), [_COORDINATOR, *map(str, range(index))]) as session, opened(task, index) as own:
+    with session_of(folder, str(index), [_COORDINATOR, *map(str, range(index))]) as session, opened(task, index) as own:
         grants = session.declare_subscriber("bench/grant", FifoChannel(64))
         values = None if source is None else session.declare_subscriber(f"bench/out/{source}", FifoChannel(64))
-        publisher = _publisher(session, f"bench/out/{index}")
+        output = publisher(session, f"bench/out/{index}")
         with session.declare_queryable(f"bench/hello/{index}", lambda query: query.reply(query.key_expr, b"")):
             if source is not None:
-                _hello(session, str(source))
-            _hello(session, _COORDINATOR)
-            put, pack, unpack = publisher.put, _OUTPUT.pack, _OUTPUT.unpack
+                hello(session, str(source))
+            hello(session, _COORDINATOR)
+            put, pack, unpack = output.put, _OUTPUT.pack, _OUTPUT.unpack
             next_grant = grants.handler.recv
             next_value = None if values is None else values.handler.recv
             fmu, inputs, outputs, step_size = own.fmu, own.inputs, own.outputs, system.step_size
@@ -92,18 +92,20 @@ def _node(_pipe: Connection, task: Task, index: int, folder: str) -> None:
                 put(pack(index, point + 1, fmu.getReal(outputs)[0]))
 
 
-def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """What sends each message at once."""
     return session.declare_publisher(key, express=True, reliability=zenoh.Reliability.BEST_EFFORT)
 
 
-def _hello(session: zenoh.Session, name: str) -> None:
+def hello(session: zenoh.Session, name: str) -> None:
     """Ask until ``name`` answers: then the link works both ways and knows our subscribers."""
     pause = threading.Event()
     while not any(reply.ok for reply in session.get(f"bench/hello/{name}", timeout=20.0)):
         pause.wait(0.02)
 
 
-def _session(folder: str, name: str, peers: list[str]) -> zenoh.Session:
+def session_of(folder: str, name: str, peers: list[str]) -> zenoh.Session:
+    """A session that listens at a Unix socket of its name, and connects to those of others."""
     config = zenoh.Config()
     settings = {
         "mode": "peer",

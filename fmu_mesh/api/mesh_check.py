@@ -14,6 +14,7 @@ from ..pictures.plan_view import PlanView, plan_view
 from ..pictures.tables import html_table
 from ..printing import page
 from ..run.run_plan import RunPlan
+from ..system.round_trip import round_trip_cost
 from ..text import counted
 
 __all__ = ["Check", "check_of", "together"]
@@ -66,6 +67,16 @@ class Check(msgspec.Struct, frozen=True):
     def page(self) -> str:
         """What would run, as text; empty if the configuration is wrong."""
         return page(plan_page(self.run.plan, self.run.loaded)) if self.run is not None else ""
+
+    def at_round_trip(self, seconds: float) -> list[str]:
+        """What a network with this round trip between hosts costs the run at least, in sentences.
+
+        Example:
+            >>> import fmu_mesh
+            >>> fmu_mesh.load("configs/pendulum_delay.yaml").check(window=1).at_round_trip(0.05)
+            ['window 1: between hosts at least 0.05 s per point, 1000 s for 20000 points']
+        """
+        return round_trip_cost(self.require().plan, seconds)
 
     def require(self) -> RunPlan:
         """The plan of the run.

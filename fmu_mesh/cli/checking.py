@@ -26,10 +26,11 @@ class CheckReport(msgspec.Struct, frozen=True):
     exit_code: int
     plan: PlanView | msgspec.Raw | None = None  # what would run; None if the configuration is wrong
     error: Failure | None = None  # what is wrong, with all findings
+    round_trip: list[str] = []  # what --round-trip costs, in sentences
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    plan = None
+    plan, costs = None, []
     try:
         check = mesh_of(arguments).check(**given_options(arguments))
         if arguments.json and check.run is not None:
@@ -37,12 +38,16 @@ def _check(arguments: argparse.Namespace) -> int:
         elif check.run is not None:
             print(in_flags(str(check or check.page)))
         check.require()
+        if arguments.round_trip is not None:
+            costs = check.at_round_trip(arguments.round_trip)
     except FmuMeshError as error:
         if arguments.json:
             print_json(CheckReport(str(arguments.config), error.exit_code, plan, failure_of(error)))
         raise
     if arguments.json:
-        print_json(CheckReport(str(arguments.config), 0, plan))
+        print_json(CheckReport(str(arguments.config), 0, plan, round_trip=costs))
+    elif costs:
+        print("", f"Between hosts, with a round trip of {arguments.round_trip:g} s", *costs, sep="\n")
     return 0
 
 

@@ -8,7 +8,19 @@ from pathlib import Path
 from ..config.call_options import option_fields
 from ..run.options import SimulateOptions
 from ..sweeps.sweep_options import SweepOptions
-from .arguments import PACKAGE, QUIET, Parsers, argument, count, endpoint, group, json_switch, switch, whole
+from .arguments import (
+    PACKAGE,
+    QUIET,
+    Parsers,
+    argument,
+    count,
+    endpoint,
+    group,
+    json_switch,
+    positive_seconds,
+    switch,
+    whole,
+)
 from .run_options import CONFIGURED, add_options, options
 
 __all__ = ["HERE", "PARSERS", "SIMULATION"]
@@ -157,6 +169,13 @@ PARSERS: Parsers = {
         *_OUTPUT,
         _OUTCOME,
     ),
-    "check": (*CONFIGURED, QUIET, json_switch("print the plan, or all findings, as one JSON object")),
+    "check": (
+        *CONFIGURED,
+        argument(
+            "--round-trip", "S", "show what a network between hosts with this round trip costs", type=positive_seconds
+        ),
+        QUIET,
+        json_switch("print the plan, or all findings, as one JSON object"),
+    ),
     "schema": (),
 }

@@ -12,7 +12,9 @@ from ..errors import FmuMeshError, StepFailed
 from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
+from ..wire.stream_keeper import StreamKeeper
 from ..wire.views import InstanceStatus
+from ..wire.ways import Ways
 from .engine import Engine
 from .stepping import Runner
 
@@ -32,11 +34,13 @@ class Activity:
     def __init__(self, plan: NodePlan, refusals: Refusals) -> None:
         self.state = "starting"
         self.runners: Mapping[str, Runner] = {}
+        self.ways: Ways | None = None
         self._plan = plan
         self._refusals = refusals
         self._started = 0.0
         self._clock = AwakeClock()
         self._engine: Engine | None = None
+        self._keeper: StreamKeeper | None = None
         self._under_way: tuple[str, int, float] | None = None
 
     def enter(self, state: str) -> None:
@@ -47,8 +51,9 @@ class Activity:
         """All instances are loaded."""
         self.runners = runners
 
-    def steps_with(self, engine: Engine) -> None:
-        """The instances are at their first point, and this engine steps them."""
+    def steps_with(self, engine: Engine, ways: Ways, keeper: StreamKeeper | None) -> None:
+        """The instances are at their first point, and this engine steps them; the keeper is that of its row streams."""
+        self.ways, self._keeper = ways, keeper
         self._started = time.monotonic()
         self._engine = engine
 
@@ -107,7 +112,8 @@ class Activity:
     def _in_words(self, runner: Runner) -> str:
         current = self._engine.current if self._engine is not None else None
         if current is None:
-            return f"waiting at point {runner.point} for {runner.waits_for}"
+            cut = self._keeper.cut_in_words(self._plan.node) if self._keeper is not None else ()
+            return "; ".join((f"waiting at point {runner.point} for {runner.waits_for}", *cut))
         if current is not runner:
             return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
         now = self._clock()

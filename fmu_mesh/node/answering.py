@@ -19,6 +19,7 @@ from ..system.plan import NodePlan
 from ..system.start_values import why_not_settable
 from ..variables.model_description import Value, Variable
 from ..variables.value_conversion import to_plain
+from ..variables.value_types import is_text
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, escape, unescape
 from ..wire.messages import SetValue
@@ -33,6 +34,7 @@ from ..wire.values import (
     json_encoding,
 )
 from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView
+from ..wire.ways import Way, Ways
 from .activity import Activity
 from .inputs import set_input
 from .stepping import Runner
@@ -105,7 +107,7 @@ class Answers:
             return
         views: dict[str, Callable[[], object]] = {"status": lambda: self._activity.status(name)}
         if runner is not None:
-            views["info"] = lambda: instance_info(self._plan, runner)
+            views["info"] = lambda: instance_info(self._plan, runner, self._activity.ways)
         for what, view in views.items():
             if query.key_expr.intersects(zenoh.KeyExpr(f"{root}/{what}")):
                 query.reply(f"{root}/{what}", msgspec.json.encode(view()), encoding=json_encoding)
@@ -275,10 +277,19 @@ class _Pending:
         self.finish(partial(self.query.reply_err, reason))
 
 
-def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
+def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
     sources = runner.plan.sources
+    nodes = {link.source: link.source_node for link in plan.links_in}
+
+    def way_of(source: str, target: str, *, initial_only: bool) -> Way | None:
+        if ways is None or source not in nodes:
+            return None
+        of = description.variable_of(target)
+        by_message = initial_only or (of is not None and is_text(of.type))
+        return "zenoh" if by_message else ways.way(plan.node, nodes[source])
+
     return InstanceInfo(
         instance=runner.name,
         model_name=description.model_name,
@@ -318,6 +329,7 @@ def instance_info(plan: NodePlan, runner: Runner) -> InstanceInfo:
                 own.offset,
                 own.map,
                 initial_only,
+                way_of(feed.source, own.target, initial_only=initial_only),
             )
             for initial_only, feeds in ((False, runner.plan.feeds), (True, runner.plan.parameters))
             for feed in feeds

@@ -40,6 +40,7 @@ class GraphVariable(msgspec.Struct, frozen=True):
     Attributes:
         source: the output; ``target``: the input. ``source_unit``, ``target_unit``: their units; empty without one.
         map: what the input gets instead of a value, such as `0 -> 2, 1 -> 5`; empty without a map.
+        way: `row stream` or `Zenoh` if its values come so from another process, in a mesh that runs; otherwise empty.
     """
 
     source: str
@@ -49,6 +50,7 @@ class GraphVariable(msgspec.Struct, frozen=True):
     factor: float = 1.0
     offset: float = 0.0
     map: str = ""
+    way: str = ""
 
     @property
     def unit_text(self) -> str:

@@ -153,7 +153,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
         for edge in self.edges:
             delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
             for own in edge.variables if edge.source == node.instance else ():
-                remark = ", ".join(filter(None, [delay, "map" if own.map else ""]))
+                remark = ", ".join(filter(None, [delay, "map" if own.map else "", own.way]))
                 rows.append((own.source, f"{edge.target}.{own.target}", shortened(own.unit_text, 14), remark))
         first = shortened(" " * indent + "  ".join(filter(None, heading)), _COLUMNS)
         return [first, *_fitted(rows, indent + 2)]
@@ -194,7 +194,7 @@ def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
             target, _, input_ = c.target.partition(".")
             both = [units.get(end, units.get(end.partition("[")[0], "")) for end in (c.source, c.target)]
             mapped = ", ".join(f"{have} -> {want}" for have, want in c.map)
-            variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset, mapped)
+            variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset, mapped, c.way_in_words)
             connections.append(((source, target, INITIAL if c.initial_only else c.delay), variable))
     return graph_of(mesh, nodes, connections)
 

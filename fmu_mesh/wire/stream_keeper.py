@@ -42,6 +42,9 @@ class StreamKeeper:
 
     Args:
         post: lets the thread that reads the streams do something.
+
+    Attributes:
+        round_trip_s: the longest one to a peer, in s.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class StreamKeeper:
         self._meeting = meeting
         self._peers = peers
         self._post = post
+        self.round_trip_s = self._round_trip_s()
         self._cut_since: dict[str, float] = {}
         self._clock = AwakeClock()
         self._closing = threading.Event()
@@ -64,19 +68,23 @@ class StreamKeeper:
         now = self._clock()
         return {peer: now - since for peer, since in [*self._cut_since.items()]}
 
+    def cut_in_words(self, own: str, limit_s: float = 0.0) -> list[str]:
+        """From any thread: the streams that are cut for longer, with both ends."""
+        return [
+            f"the link between {_spoken(own)} and {_spoken(peer)} is cut for {cut_s:.0f} s"
+            for peer, cut_s in self.cut.items()
+            if cut_s > limit_s
+        ]
+
     def check(self, own: str, limit_s: float) -> None:
         """Check that no stream is cut for longer.
 
         Raises:
             MeshLost: one is; names both ends.
         """
-        for peer, cut_s in self.cut.items():
-            if cut_s > limit_s:
-                ends = _spoken(own), _spoken(peer)
-                raise MeshLost(
-                    f"the link between {ends[0]} and {ends[1]} is cut for {cut_s:.0f} s",
-                    hint="Is the process stopped, its host suspended, or the network cut? `timeouts.link` limits it.",
-                )
+        if words := self.cut_in_words(own, limit_s):
+            hint = "Is the process stopped, its host suspended, or the network cut? `timeouts.link` limits it."
+            raise MeshLost(words[0], hint=hint)
 
     def close(self) -> None:
         """End."""
@@ -90,12 +98,16 @@ class StreamKeeper:
             if now - beaten >= _BEAT_S:
                 beaten = now
                 self._streams.beat()
+                self.round_trip_s = self._round_trip_s()
             for peer in self._peers:
                 if self._streams.silent_s(peer) > _SILENT_S:
                     self._cut_since.setdefault(peer, now)
                     self._meeting.dial(peer, again=True)
                 else:
                     self._cut_since.pop(peer, None)
+
+    def _round_trip_s(self) -> float:
+        return max(map(self._streams.round_trip_s, self._peers), default=0.0)
 
     def received(self, peer: str) -> dict[int, int]:
         """See `fmu_mesh.wire.meeting.Returns`."""

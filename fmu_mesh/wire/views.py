@@ -11,6 +11,7 @@ from ..simtime import ENDLESS
 from ..text import counted
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
+from .ways import Way
 
 __all__ = [
     "GOING_ON",
@@ -65,6 +66,8 @@ class ConnectionView(msgspec.Struct, frozen=True):
     Attributes:
         map: what the input gets instead of a value, both as numbers.
         initial_only: whether it gives a parameter its value in the initialization, and has no part in the steps.
+        way: how its values come from another process: `ring` (in shared memory), `stream` (a row stream) or `zenoh`;
+            None within one process, and until all nodes are ready.
     """
 
     source: str = msgspec.field(name="from")
@@ -74,6 +77,12 @@ class ConnectionView(msgspec.Struct, frozen=True):
     offset: float = 0.0
     map: tuple[tuple[int, int], ...] = ()
     initial_only: bool = False
+    way: Way | None = None
+
+    @property
+    def way_in_words(self) -> str:
+        """Empty for the usual one, shared memory."""
+        return {"stream": "row stream", "zenoh": "Zenoh"}.get(self.way or "", "")
 
 
 class InstanceInfo(msgspec.Struct, frozen=True):
@@ -213,6 +222,8 @@ class MeshStatus(msgspec.Struct, frozen=True):
         real_time_factor: simulated over wall-clock time since the first point.
         overruns: points by which the run fell behind the wall clock beyond `catch_up`.
         refused: messages that the master refused: malformed ones, and those of unknown senders.
+        cut: the nodes whose row streams to the master are cut, and for how long in s. Who is cut from another node says
+            so in the `activity` of its instances.
     """
 
     mesh: str
@@ -226,6 +237,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     error: ErrorReport | None = None
     overruns: int = 0
     refused: int = 0
+    cut: dict[str, float] = {}
 
 
 class RosView(msgspec.Struct, frozen=True):

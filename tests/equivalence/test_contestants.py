@@ -58,6 +58,15 @@ def test_a_chain_of_eight_c_processes_equals_the_reference() -> None:
 
 
 @needs_compiler
+@pytest.mark.parametrize("name", ["pendulum", "cycle2", "chain8"])
+def test_c_processes_over_sockets_equal_the_reference(name: str) -> None:
+    job = BY_NAME[name]
+    task, last = task_of(job.entries[-1].system or job.system, 5_000, processes="own", transport="tcp")
+
+    assert list(c_program.run(task).last.values()) == last
+
+
+@needs_compiler
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_c_program_whose_fmu_fails_ends_in_words(index: int) -> None:
     pendulum = BY_NAME["pendulum"].system
@@ -71,12 +80,32 @@ def test_a_c_program_whose_fmu_fails_ends_in_words(index: int) -> None:
 
 
 @needs_compiler
-def test_a_round_trip_through_shared_memory_is_measured() -> None:
-    options = {"transport": "memory", "language": "c"}
-
-    outcome = ping_pong.run(Task(System("chain", "jacobi", 1.0, ()), 1_000, options))
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"transport": "memory"},
+        {"transport": "tcp", "spins": "trip", "bytes": "40"},
+        {"transport": "unix", "spins": "exchange", "bytes": "40"},
+    ],
+    ids=lambda options: options["transport"],
+)
+def test_a_round_trip_between_two_c_programs_is_measured(options: dict[str, str]) -> None:
+    outcome = ping_pong.run(Task(System("chain", "jacobi", 1.0, ()), 1_000, {"language": "c", **options}))
 
     assert outcome.seconds > 0.0
+
+
+@pytest.mark.parametrize("way", ["streams", "zenoh"])
+def test_a_star_without_shared_memory_equals_the_reference(tmp_path: Path, way: str) -> None:
+    job = BY_NAME["apart_star"]
+    (entry,) = (entry for entry in job.entries if entry.options.get("apart") == "streams")
+    chosen = replace(job, entries=(replace(entry, points=500, quick=0, options={"apart": way}),))
+
+    with Bench([chosen], Peers(Path(sys.executable)), tmp_path, quick=True) as bench:
+        bench.run(1, 200.0)
+
+    assert bench.broken == []
+    assert [measured.result for measured in bench.results[job.name].values()] == ["all points equal"]
 
 
 @needs_compiler

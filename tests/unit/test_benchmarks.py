@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import far
 from benchmarks.commands import RunFailed
 from benchmarks.comparing import Reference, compare
 from benchmarks.first_step import Started
@@ -36,7 +37,8 @@ def reported(target: Target, entries: dict[str, Measured], timed: str = "steps")
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.what)
 def test_a_target_names_rows_of_its_job(target: Target) -> None:
-    labels = {entry.label for job in with_checkout(JOBS, ROOT) if job.name == target.job for entry in job.entries}
+    jobs = [*with_checkout(JOBS, ROOT), *(job.table(far.LINKS, None) for job in far.JOBS)]
+    labels = {entry.label for job in jobs if job.name == target.job for entry in job.entries}
 
     assert target.entry in labels
     assert not target.against or target.against in labels

@@ -10,7 +10,7 @@ from ...pictures.tables import pairs, table
 from ...simtime import ENDLESS
 from ...text import short_number
 from ...wire.client.readings import Reading
-from ...wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
+from ...wire.views import ConnectionView, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
 
 __all__ = [
     "cells",
@@ -62,6 +62,7 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             ("time", seconds(status.time)),
             ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),
             ("overruns", str(status.overruns or "")),
+            *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
             ("error", status.error.message if status.error is not None else ""),
@@ -129,12 +130,17 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("step size", seconds(info.step_size)),
             ("can", ", ".join(can)),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
-            ("fed by", ", ".join(f"{c.source} -> {c.target}{' (map)' if c.map else ''}" for c in info.connections)),
+            ("fed by", ", ".join(map(_connection, info.connections))),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
         ]
     )
     return [*facts, "", *variables(info)]
+
+
+def _connection(view: ConnectionView) -> str:
+    about = ", ".join(filter(None, ("map" if view.map else "", view.way_in_words)))
+    return f"{view.source} -> {view.target}{f' ({about})' if about else ''}"
 
 
 def cells(reading: Reading) -> list[str]:
