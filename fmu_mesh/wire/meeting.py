@@ -178,7 +178,7 @@ class Meeting:
             self._dialing = None
             if found is not None:
                 self._keep(peer, *found)
-            elif not again and self._changed.wait_for(lambda: peer in self.sockets, _PATIENCE_S / 2):
+            elif not again and self._changed.wait_for(lambda: peer in self.sockets, _PATIENCE_S):  # it dials late
                 return True
         return found is not None
 
