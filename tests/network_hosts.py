@@ -10,7 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -20,7 +20,7 @@ import pytest
 
 from tests.helpers import DEADLINE_S, Launched, wait_until
 
-__all__ = ["NEEDS_HOSTS", "NetworkHost", "two_hosts"]
+__all__ = ["NEEDS_HOSTS", "NetworkHost", "started_apart", "two_hosts"]
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _HIDDEN: Final = "/tmp"  # noqa: S108  of which each host has its own
@@ -28,8 +28,10 @@ _TOOLS: Final = ("unshare", "nsenter", "ip")
 _SPACES: Final = ("--net", "--pid", "--mount", "--uts", "--ipc")
 
 NEEDS_HOSTS = pytest.mark.skipif(
-    os.geteuid() != 0 or any(shutil.which(tool) is None for tool in _TOOLS),
-    reason="needs root and the commands unshare, nsenter and ip",
+    os.geteuid() != 0
+    or any(shutil.which(tool) is None for tool in _TOOLS)
+    or subprocess.run(["unshare", *_SPACES, "true"], capture_output=True, check=False).returncode != 0,
+    reason="needs root, namespaces, and the commands unshare, nsenter and ip",
 )
 
 
@@ -119,3 +121,29 @@ def _wire(hosts: Sequence[NetworkHost]) -> None:
     for number, host in enumerate(hosts, 1):
         for words in (f"addr add 10.77.0.{number}/24 dev wire", "link set wire up"):
             assert host.start("ip", *words.split()).wait() == 0
+
+
+def started_apart(
+    hosts: Sequence[NetworkHost],
+    config: Path,
+    nodes: Sequence[str],
+    *options: str,
+    environment: Mapping[str, str] = {},
+) -> list[Launched]:
+    """Start a master with these options and every second node on the first host, and the other nodes on the second one.
+
+    Args:
+        hosts: both.
+        config: relative to the folder of the copies, which has it on both hosts.
+        nodes: their names.
+        options: of the master.
+        environment: more variables of all processes.
+    """
+    first, second = hosts
+    there = ["--connect", "tcp/router:7447"]
+    master = ["fmu-mesh", "master", str(config), "--listen", "tcp/0.0.0.0:7447", "--no-progress", *options]
+    return [
+        first.start(*master, **environment),
+        *(first.start("fmu-mesh", "node", str(config), node, **environment) for node in nodes[::2]),
+        *(second.start("fmu-mesh", "node", str(config), node, *there, **environment) for node in nodes[1::2]),
+    ]

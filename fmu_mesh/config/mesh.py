@@ -68,7 +68,7 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         Literal["auto"] | Annotated[int, Meta(ge=1, le=MAX_WINDOW)],
         Meta(
             description="How many points a node may run ahead of the slowest; 1 is strict lockstep; "
-            "auto: up to 32768 points, fewer for many instances or large rows."
+            "auto: up to 262144 points, fewer for many instances or large rows."
         ),
     ] = "auto"
     real_time_factor: Annotated[

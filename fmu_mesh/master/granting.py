@@ -1,8 +1,8 @@
 """What the nodes have reached, and what they are granted.
 
 The nodes of this host keep the windows among themselves, and the last point can be granted to them at once, because a
-grant can be taken back. A node that does not share this memory gets grants by messages: they contain the windows, reach
-about 50 ms ahead, and stay. It reports its progress by messages, too.
+grant can be taken back. A node that does not share this memory gets grants by a row stream or by messages, and tells
+its progress so, too: these grants reach about 50 ms ahead, and stay; those by messages contain the windows.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ class Granting:
         # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
         self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
         self._sent = 0
-        self._reach = Reach(plan.window)
+        self._reach = Reach()
+        self._round_trip_s: float | None = None
 
     def go(self, ways: Ways) -> None:
         """From now on, the nodes read the grant and tell their progress in these ways."""
@@ -64,6 +65,10 @@ class Granting:
             if not own.initial_only
         }
         self._keep_windows = self.messages or not ways.all_but_zenoh(links)
+
+    def measured(self, round_trip_s: float) -> None:
+        """The longest round trip to a node by a row stream takes so long, in s."""
+        self._round_trip_s = round_trip_s if not self.messages else None  # that of messages is not known
 
     def end_at(self, point: int) -> None:
         """End the run at a point before its last one."""
@@ -132,7 +137,7 @@ class Granting:
             return 0, False
         credit = min(map(operator.add, self.progress.values(), self._windows)) if self._keep_windows else self.grant
         ahead = min(point for node, point in self.progress.items() if node != RECORDER)
-        owed = min(self.grant, credit, ahead + self._reach.points(ahead, now))
+        owed = min(self.grant, credit, ahead + self._reach.points(ahead, now, self._round_trip_s))
         grown = owed > self._sent
         self._sent = max(self._sent, owed)
         return self._sent, grown
@@ -141,7 +146,10 @@ class Granting:
         """The slowest node of this host, and its point from which on there is something to do for the master."""
         if not self.seen:
             return None
-        slowest = min(self.seen, key=self.progress.__getitem__)
+        nodes = [node for node in self.seen if node != RECORDER]
+        if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:
+            nodes = [*self.seen]  # the recorder may be far behind: what is granted next does not depend on it
+        slowest = min(nodes, key=self.progress.__getitem__)
         reached = self.progress[slowest]
         if reached >= self.reaches_all and reached >= 0:
             return None

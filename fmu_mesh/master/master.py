@@ -55,13 +55,14 @@ from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
 from ..wire.meeting import Meeting
-from ..wire.messages import PROGRESS, NodeReport, decode_json, sealed
+from ..wire.messages import FINISH, PROGRESS, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
 from ..wire.runtime import this_host
 from ..wire.session import RouterLink, tokens
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import Command, MeshInfo, MeshStatus
+from ..wire.ways import Ways
 from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
 from .master_streams import MasterStreams
 from .members import Followers, Members
@@ -225,12 +226,12 @@ class Master:
     def _decide(self, now: float) -> float:
         """Do what there is to do; return for how long there is nothing more if nothing arrives, in s."""
         states, pause_s = self._states, math.inf
-        self._look_at_streams()
+        self._look_at_streams(now)
         while True:
             paced = states.wanted
             if states.takes_commands:
                 paced, pause_s = self._pacer.limit(paced, states.granting.slowest)
-            stopped = self._members.stopped() if states.silent_s(now) > states.deadlines.step else ()
+            stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
             before, actions = states.state, states.decide(now, paced, stopped)
             if not states.moves:  # at once: to publish takes as long as thousands of points
                 self._clock.stop()
@@ -246,28 +247,31 @@ class Master:
             self._watch.note(states.granting.holder(hold=states.hold, paced=paced))
         return pause_s
 
-    def _look_at_streams(self) -> None:
+    def _look_at_streams(self, now: float) -> None:
         """Note who was met, and that a cut link is no fault of a node until it has been silent for too long."""
         states = self._states
         if self._meeting is None or self.streams is None:
             return
-        states.meet(tuple(self._meeting.sockets))
+        states.registrations.meet(tuple(self._meeting.sockets))
+        states.granting.measured(self.streams.round_trip_s)
         try:
             if self.streams.check():
-                states.excuse()
+                states.excuse(now)
         except MeshLost as error:
             states.fail(error)
+
+    def _open_streams(self, ways: Ways) -> None:
+        if self.streams is not None and self._meeting is not None:
+            self.streams.start(ways)
+            for both in self._states.registrations.unmet(ways):
+                log.warning("%s cannot reach each other: their rows go by Zenoh", spoken(*both))
+            if not ways.streams_of(MASTER):
+                self._meeting.close()  # nobody needs its door
 
     def _do(self, action: Action) -> None:
         match action:
             case AnswerAll(ways):
-                states = self._states
-                if self.streams is not None and self._meeting is not None:
-                    self.streams.start(ways)
-                    for both in states.registrations.unmet(ways):
-                        log.warning("%s cannot reach each other: their rows go by Zenoh", spoken(*both))
-                    if not ways.streams_of(MASTER):
-                        self._meeting.close()  # nobody needs its door
+                self._open_streams(ways)
                 entries = TIME_LINE_ENTRIES // len(self._states.plan.nodes) if self._watch is not None else 0
                 self._members.welcome(entries, ways)
             case FollowClock(point):
@@ -277,6 +281,8 @@ class Master:
             case RaiseSent(point):
                 self._memory.sent.raise_to(point)
             case SendToAll(kind, point):
+                if kind == FINISH:
+                    self._memory.finish.raise_to(point + 1)
                 self._members.send(kind, point)
             case EndAll(error):
                 self._members.abort(error)
@@ -302,7 +308,8 @@ class Master:
             memory.progress[node].raise_to(point + 1)
         states.progress((node, memory.progress[node].value - 1) for node in seen)
         self._server.publish_status()
-        for node in self._members.lost(router_is_lost=lambda: self._router.is_lost):
+        silent_s = self.streams.silent_s if self.streams is not None else lambda _node: math.inf
+        for node in self._members.lost(self._router, states.deadlines.link, silent_s):
             states.lose(node, self._router.loss())
 
     def _take_report(self, query: zenoh.Query) -> None:

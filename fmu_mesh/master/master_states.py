@@ -33,7 +33,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import msgspec
 
@@ -121,7 +121,6 @@ class MasterStates:
             plan.system.config.timeouts, max(len(node.instances) for node in plan.nodes.values())
         )
         self.registrations = Registrations(plan)
-        self._met: Collection[str] = ()
         self.granting = Granting(plan)
         self.hold = 0 if paused else None
         self.reports: dict[str, NodeReport] = {}
@@ -130,7 +129,8 @@ class MasterStates:
         self.warnings: list[str] = []
         self._actions: list[Action] = []
         self._entered_at = 0.0
-        self._moved_at: float | None = None  # None: since the last decision
+        self._moved_at: float | None = None  # when any node has moved; None: since the last decision
+        self._slowest_moved_at: float | None = None
         self._sent_at = 0.0
 
     @property
@@ -156,17 +156,21 @@ class MasterStates:
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
-        waits = self.takes_commands and self.hold is None and self.granting.slowest < self.granting.grant
-        return now - self._moved_at if waits and self._moved_at is not None else 0.0
+        return now - self._moved_at if self._waits and self._moved_at is not None else 0.0
+
+    def slowest_silent_s(self, now: float) -> float:
+        """For how long the slowest node has not moved, in s: others may go on for as long as the window lets them."""
+        return now - self._slowest_moved_at if self._waits and self._slowest_moved_at is not None else 0.0
+
+    @property
+    def _waits(self) -> bool:
+        return self.takes_commands and self.hold is None and self.granting.slowest < self.granting.grant
 
     # --- events
 
-    def meet(self, nodes: Collection[str]) -> None:
-        """The master has met these nodes for row streams."""
-        self._met = nodes
-
     def progress(self, reported: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
         """Nodes, by name, know all outputs up to a point; returns those of which it is news."""
+        before = self.granting.slowest
         try:
             news = self.granting.take(reported)
         except ProtocolBroken as error:
@@ -174,11 +178,14 @@ class MasterStates:
             return []
         if news:
             self._moved_at = None
+        if self.granting.slowest > before:
+            self._slowest_moved_at = None
         return news
 
-    def excuse(self) -> None:
-        """A link is cut: that nobody moves is no fault, until the link has been silent for too long."""
-        self._moved_at = None
+    def excuse(self, now: float) -> None:
+        """A link is cut: that nobody moves or reports is no fault, until the link has been silent for too long."""
+        self._moved_at = self._slowest_moved_at = None
+        self._entered_at = now
 
     def report(self, report: NodeReport) -> None:
         """A node reports its end, or that an FMU ends the simulation."""
@@ -227,7 +234,7 @@ class MasterStates:
                 self._stop(point)
         if command.command in ("resume", "step"):
             self._actions.append(FollowClock(granting.slowest))
-        self._moved_at = None
+        self._moved_at = self._slowest_moved_at = None
         return CommandAnswer(command.command, self.state, granting.slowest, self.hold)
 
     def fail(self, error: FmuMeshError) -> None:
@@ -265,10 +272,12 @@ class MasterStates:
         """What to do now; nothing, if it is to wait.
 
         ``now`` is in seconds since the start in which this process could run, ``paced`` the point that the wall clock
-        allows, and ``stopped``, if `silent_s` exceeds its deadline, the nodes whose processes are stopped.
+        allows, and ``stopped``, if `slowest_silent_s` exceeds its deadline, the nodes whose processes are stopped.
         """
         if self._moved_at is None:
             self._moved_at = now
+        if self._slowest_moved_at is None:
+            self._slowest_moved_at = now
         # What a command has decided is done first: the wall clock that limits the grant may begin anew with it.
         if self.failure is None and not self._actions:
             match self.state:
@@ -291,7 +300,7 @@ class MasterStates:
     def _wait_for_nodes(self, now: float) -> None:
         registrations = self.registrations
         if not registrations.missing:
-            ways = registrations.ways(self._met)
+            ways = registrations.ways()
             self.granting.go(ways)
             self._actions.append(AnswerAll(ways))
             self._enter("initializing", now)
@@ -302,7 +311,7 @@ class MasterStates:
         if self.granting.slowest >= 0:
             self._enter("running" if self.hold is None else "paused", now)
             self._actions.append(FollowClock(0))
-            self._moved_at = now
+            self._moved_at = self._slowest_moved_at = now
             return
         missing = [node for node, point in self.granting.progress.items() if point < 0]
         self._check_deadline(now, self.deadlines.initialize, "Initialization Mode is not over in", missing)
@@ -315,22 +324,24 @@ class MasterStates:
                 self.fail(self.ended_by)
             else:
                 self._enter("stopping", now)
-                self._actions.append(SendToAll(FINISH, granting.last_point))
+                self._send_finish(now)
             return
         grant = min(self.wanted, paced)
         if grant > granting.grant:
             if granting.slowest >= granting.grant:  # they had nothing to do until now, because of the wall clock
-                self._moved_at = now
+                self._moved_at = self._slowest_moved_at = now
             granting.raise_to(grant)
             self._actions.append(RaiseGrant(grant))
         self._send_grant(now)
-        silent_s = self.silent_s(now)
-        if silent_s > self.deadlines.silence or (stopped and silent_s > self.deadlines.step):
+        silent_s = self.slowest_silent_s(now) if stopped else self.silent_s(now)
+        if silent_s > (self.deadlines.step if stopped else self.deadlines.silence):
             self.fail(granting.no_progress(silent_s, stopped))
 
     def _wait_for_reports(self, now: float) -> None:
         if missing := [node for node in self.plan.nodes if node not in self.reports]:
             self._check_deadline(now, self.deadlines.stop, "the end was not reported by", missing)
+            if now - self._sent_at >= self.deadlines.heartbeat:  # a router that was lost has passed nothing on
+                self._send_finish(now)
         else:
             self.state = "done"
 
@@ -342,6 +353,10 @@ class MasterStates:
         if (grown and self.granting.messages) or now - self._sent_at >= self.deadlines.heartbeat:
             self._sent_at = now
             self._actions.append(SendToAll(GRANT, owed))
+
+    def _send_finish(self, now: float) -> None:
+        self._sent_at = now
+        self._actions.append(SendToAll(FINISH, self.granting.last_point))
 
     def _check_deadline(self, now: float, limit_s: float, what: str, missing: Sequence[str]) -> None:
         if now - self._entered_at > limit_s:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from ..rings.row_streams import CounterEnd, RowsEnd, RowStreams, StreamEnd
 from ..system.plan import MASTER, RECORDER, Link, NodePlan, Plan
 from ..wire.frames import SourceRows, of_numbers
 from ..wire.meeting import Meeting
-from ..wire.messages import GRANT, PROGRESS
+from ..wire.messages import FINISH, GRANT, PROGRESS
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.streamed_rows import incoming_rows, why_not
 from ..wire.ways import Ways
@@ -64,7 +65,7 @@ class MasterStreams:
                 if recorder
                 else []
             )
-            told = [CounterEnd(GRANT, 0, memory.sent)]
+            told = [CounterEnd(GRANT, 0, memory.sent), CounterEnd(FINISH, 0, memory.finish)]
             if recorder is not None:
                 number, stride = memory.map.number_of(RECORDER), recorder.progress_stride
                 told.append(CounterEnd(PROGRESS, number, memory.progress[RECORDER], stride))
@@ -75,6 +76,15 @@ class MasterStreams:
             self._streams = RowStreams(memory, ends, plan.grid.last_point)
             self._thread.start()
             self._keeper = StreamKeeper(self._streams, self._meeting, [end.peer for end in ends], self._post)
+
+    @property
+    def round_trip_s(self) -> float:
+        """From any thread: the longest round trip to a node, in s."""
+        return self._keeper.round_trip_s if self._keeper is not None else 0.0
+
+    def silent_s(self, node: str) -> float:
+        """From any thread: for how long nothing has come from a node, in s; infinite without a row stream."""
+        return self._streams.silent_s(node) if self._streams is not None else math.inf
 
     def check(self) -> bool:
         """From any thread: whether a stream is cut, so that nobody may be able to go on.

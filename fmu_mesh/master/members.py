@@ -7,6 +7,7 @@ All of it runs on the main thread: what arrives on threads of Zenoh is posted to
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 
 import msgspec
@@ -22,13 +23,17 @@ from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import ABORT, HEADER, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
-from ..wire.session import tokens, undeclare_all
+from ..wire.session import RouterLink, tokens, undeclare_all
 from ..wire.ways import Ways
 from .registrations import Registrations
 
 __all__ = ["Followers", "Members"]
 
 log = logging.getLogger(__name__)
+
+_SILENT_S = 1.0
+_AGAIN_S = 0.25
+"""How often in s the question about a token that went is asked again."""
 
 
 class Members:
@@ -55,7 +60,7 @@ class Members:
         self._meeting = meeting
         self._waiting: dict[str, zenoh.Query] = {}
         self._shared: tuple[str, ...] = ()
-        self._doubted: set[str] = set()
+        self._doubted: dict[str, float] = {}
         self._present: set[str] = set()
         self._grant_keys = keys.grants([*nodes.plan.nodes])
         self._grants = [
@@ -103,26 +108,40 @@ class Members:
             return
         self._present.discard(node)
         if node in self._nodes.admitted:
-            self._doubted.add(node)
+            self._doubted[node] = 0.0
 
     @property
     def have_left(self) -> bool:
         """Whether no node of a model has a token any more."""
         return self._present <= {RECORDER}
 
-    def lost(self, *, router_is_lost: Callable[[], bool]) -> list[str]:
-        """The nodes whose processes are gone. On this host the process itself shows it, elsewhere its token."""
-        found = []
-        for node in [*self._doubted]:
-            if here := node in self._shared:
-                gone = router_is_lost() or not is_alive(self._nodes.admitted[node].pid)
-            else:
-                gone = not tokens(self._session, self._keys.node(node))
-            if gone or not here:  # the question about a process of this host stays until the process has ended
-                self._doubted.discard(node)
-            if gone:
-                found.append(node)
+    def lost(self, router: RouterLink, link_s: float, silent_s: Callable[[str], float]) -> list[str]:
+        """The nodes whose processes are gone.
+
+        On this host the process itself shows it, elsewhere its token, unless its row stream is not silent. Without a
+        router that was there nobody has a token: that is no verdict for ``link_s`` seconds.
+        """
+        found, now = [], time.monotonic()
+        for node in [node for node, at in self._doubted.items() if at <= now]:
+            match self._is_lost(node, router, link_s, silent_s):
+                case None:
+                    self._doubted[node] = now + _AGAIN_S
+                case gone:
+                    del self._doubted[node]
+                    if gone:
+                        found.append(node)
         return found
+
+    def _is_lost(self, node: str, router: RouterLink, link_s: float, silent_s: Callable[[str], float]) -> bool | None:
+        """Whether a node whose token went is gone; None: that is not known yet."""
+        if node in self._shared:
+            gone = not is_alive(self._nodes.admitted[node].pid)
+            return gone or (router.is_lost and not router.may_come_back(link_s)) or None
+        if silent_s(node) <= _SILENT_S:
+            return None
+        if tokens(self._session, self._keys.node(node)):
+            return False
+        return None if router.may_come_back(link_s) else True
 
     def stopped(self) -> list[str]:
         """The nodes on this host whose processes are stopped."""

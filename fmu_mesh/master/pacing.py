@@ -6,7 +6,6 @@ import math
 import time
 
 from ..system.plan import Plan
-from ..system.window import STEADY_POINTS
 
 __all__ = ["CLOCK", "PAUSE", "GrantWatch", "Pacer", "Reach", "RunClock"]
 
@@ -17,8 +16,10 @@ PAUSE = "@pause"
 """Name of what limits the grant while the mesh is paused."""
 
 _STEADY_S = 0.05
-_SPEED_S = 0.01
+_LATE = 4
+"""After so many times of what a grant should take, fewer points are granted. TCP begins slowly, too."""
 _TICK_S = 1e-6
+_MOST_POINTS = 1 << 40
 
 
 class RunClock:
@@ -46,25 +47,38 @@ class RunClock:
 class Reach:
     """How many points a grant that cannot be taken back may be ahead of the slowest instance.
 
-    A pause takes effect at such a grant. So more than the window, and more than 1024 points, are granted only if they
-    take less than 50 ms at the present speed.
+    A pause takes effect at such a grant. So it reaches as far as the nodes come in 50 ms, and in the time that a grant
+    and the answer are on their way. It begins with one point, and is measured again each time the nodes have used it.
     """
 
-    def __init__(self, window: int) -> None:
-        self._least = self._points = min(window, STEADY_POINTS)
-        self._slowest = 0
+    def __init__(self) -> None:
+        self._points = self._fresh = 1
+        self._slowest = self._granted = self._mark = -1
         self._since = 0.0
+        self._shortest_s = math.inf
 
-    def points(self, slowest: int, now: float) -> int:
+    def points(self, slowest: int, now: float, round_trip_s: float | None = None) -> int:
         """Number of points the grant may lead the slowest instance, at ``slowest``; ``now`` is monotonic, in s.
 
-        The speed is unknown at the start. It is measured every 10 ms, and when half of the last answer is used.
+        Without a known round trip, it is at most the shortest time in which the nodes have used a grant.
         """
-        gone, elapsed = slowest - self._slowest, now - self._since
-        if elapsed >= _SPEED_S or gone >= self._points // 2:
-            wanted = gone * _STEADY_S / max(elapsed, _TICK_S)
-            self._points = max(self._least, int(wanted))
+        elapsed_s = now - self._since
+        if is_used := slowest >= self._mark:
+            self._shortest_s = min(self._shortest_s, elapsed_s)
+        if is_used or elapsed_s >= _LATE * (_STEADY_S + (round_trip_s or 0.0)):
+            gone, on_way_s = slowest - self._slowest, self._shortest_s if round_trip_s is None else round_trip_s
+            passing = gone / max(elapsed_s, _TICK_S)
+            # Who has used a far grant soon had waited for it, and steps faster than points have come.
+            stepping_s = max(elapsed_s - (round_trip_s or 0.0), _TICK_S)
+            waited = is_used and stepping_s < _STEADY_S / 2
+            speed = max(passing, self._fresh / stepping_s) if waited else passing
+            wanted = speed * _STEADY_S + passing * on_way_s
+            least = 1 if is_used else self._points // 2  # what is late may be on its way
+            self._points = max(1, least, math.ceil(min(wanted, _MOST_POINTS)))
             self._slowest, self._since = slowest, now
+            self._mark = max(self._granted + 1, slowest + self._points)  # nobody can be there before this round trip
+            self._fresh = self._mark - self._granted
+        self._granted = max(self._granted, slowest + self._points)
         return self._points
 
 

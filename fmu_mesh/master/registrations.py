@@ -31,6 +31,7 @@ class Registrations:
         self.admitted: dict[str, Registration] = {}
         self.ready: dict[str, NodeReady] = {}
         self._refused: list[str] = []
+        self._met: Collection[str] = ()
 
     def register(self, registration: Registration) -> str | None:
         """Admit a process as a node of this run; if it is not part of the run, return why."""
@@ -61,11 +62,15 @@ class Registrations:
             raise MessageRefused("its sender is not the process that has registered")
         self.ready[node] = ready
 
-    def ways(self, met: Collection[str]) -> Ways:
-        """How rows go between the ready nodes, of which the master has ``met`` these for row streams."""
+    def meet(self, nodes: Collection[str]) -> None:
+        """The master has met these nodes for row streams."""
+        self._met = nodes
+
+    def ways(self) -> Ways:
+        """How rows go between the ready nodes."""
         ready = {node: self.ready[node] for node in self.plan.nodes if node in self.ready}
         shared = tuple(node for node, own in ready.items() if own.shared)
-        met = {MASTER: set(met)} | {node: set(own.streams) for node, own in ready.items()}
+        met = {MASTER: set(self._met)} | {node: set(own.streams) for node, own in ready.items()}
         pairs = {pair(one, other) for one, others in met.items() for other in others if one in met.get(other, ())}
         return Ways(shared, tuple(sorted(pairs)))
 

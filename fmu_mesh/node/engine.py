@@ -209,6 +209,7 @@ class BurstEngine(Engine):
             peers=self._peers,
             n_peers=len(self._windows),
             ceiling=memory.grant.address,
+            finish=memory.finish.address if streams is not None else None,
             progress=self._progress.address,
             last_point=self._last_point,
             slice_ns=int(_SLICE_S * 1e9),

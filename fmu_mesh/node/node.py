@@ -142,12 +142,14 @@ class Node:
         self._engine: Engine | None = None
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
-        self._membership = Membership(plan, session, self._inbox, launch, router, meeting=meeting)
+        silent_s = self._stream_silent_s
+        self._membership = Membership(
+            plan, session, self._inbox, launch, router, meeting=meeting, stream_silent_s=silent_s
+        )
         self._meeting = meeting
         self._ways = Ways()
         self._streams: RowStreams | None = None
         self._keeper: StreamKeeper | None = None
-        self._mirrors: Mapping[int, SourceRows] = {}
         self._profiler: Profiler | None = None
         self._activity = Activity(plan, self._inbox.refusals)
         self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self._tell_set)
@@ -171,7 +173,7 @@ class Node:
             for runner in self._runners.values():
                 runner.instance.close()  # before the report, because afterwards nobody would get its log messages
             self.server.close()  # the last samples, while the master is there to route them to clients
-            self._tell_end(None, self._plan.timeouts.stop)
+            self._tell_end(None, self._plan.timeouts.stop + self._plan.timeouts.link)  # the link may be cut
         except FmuMeshError as error:
             located = self._located(error)
             aborted = isinstance(error, _Aborted)
@@ -259,7 +261,9 @@ class Node:
             layout = link.layout if ways.way(plan.node, link.target_node) == "zenoh" else of_text(link.layout)
             links = self._initialization.out_links if link.initial_only else runner.out_links
             links.append(OutLink(link, layout, runner.outputs, put))
-        self._receivers, self._mirrors = connect(plan, self._runners, self._memory, self._own_memory, ways)
+        self._receivers, mirrors = connect(plan, self._runners, self._memory, self._own_memory, ways)
+        if self._meeting is not None:
+            self._open_streams(self._meeting, mirrors)
         self._put_progress = membership.sender(keys.progress(plan.node))
         self._put_set = membership.sender(keys.settings(plan.node))
 
@@ -269,17 +273,13 @@ class Node:
         plan = self._plan
         self._initialization.run(self._runners.values())
         units = [[self._runners[name] for name in names] for names in plan.units]
-        self._streams = streams = self._make_streams()
-        if streams is not None and self._meeting is not None:
-            peers = self._ways.streams_of(plan.node)
-            self._keeper = StreamKeeper(streams, self._meeting, peers, self._inbox.post)
         self._engine = engine = self._make_engine(
             plan,
             units,
             self._memory,
             self._windows(),
             spins=not ONE_CORE,
-            streams=streams,
+            streams=self._streams,
         )
         self._inbox.move_to(self._memory, engine)
         self._activity.steps_with(engine)
@@ -303,18 +303,25 @@ class Node:
             if name in (counters := known.get(ways_of.get(name, "zenoh"), {}))
         ]
 
-    def _make_streams(self) -> RowStreams | None:
-        if self._meeting is None:
-            return None
-        ways, sockets = self._ways, self._meeting.sockets
-        return streams_of(self._plan, ways, sockets, self._runners, self._mirrors, self._memory, self._own_memory)
+    def _open_streams(self, meeting: Meeting, mirrors: Mapping[int, SourceRows]) -> None:
+        """Use the sockets to those that were met; from now on each side notices if the other is silent."""
+        plan, ways, memory = self._plan, self._ways, self._memory
+        streams = streams_of(plan, ways, meeting.sockets, self._runners, mirrors, memory, self._own_memory)
+        if streams is not None:
+            self._streams = streams
+            self._keeper = StreamKeeper(streams, meeting, ways.streams_of(plan.node), self._inbox.post)
+
+    def _stream_silent_s(self) -> float:
+        return self._streams.silent_s(MASTER) if self._streams is not None else math.inf
 
     def _check_streams(self) -> None:
-        """Whether each stream can still be used.
+        """Look for what streams have brought, and whether each can still be used.
 
         Raises:
             FmuMeshError: one has brought what is no part of this run.
         """
+        if self._streams is not None and (end := self._memory.finish.value):
+            self._finish_at = end - 1
         for peer, state, about, row in self._streams.states() if self._streams is not None else ():
             if (error := why_not(peer, state, about, row, (*self._plan.links_in, *self._plan.links_out))) is not None:
                 raise error
@@ -433,7 +440,7 @@ class Node:
     def _end_without_master(self) -> None:
         """The master's token is gone: raise why it ended the run, which may still arrive, or that it is gone."""
         if not self._membership.master_is_gone:
-            self._token_went = self._membership.master_runs  # then it is asked again whether it runs
+            self._token_went = self._membership.doubts_master  # then it is asked again
             return
         error = self._membership.without_master(self._clock() - self._heard)
         deadline = time.monotonic() + _LAST_WORD_S

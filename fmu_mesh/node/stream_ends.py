@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Final
 
 from ..rings.host_memory import HostMemory
 from ..rings.row_streams import CounterEnd, RowsEnd, RowStreams, StreamEnd
 from ..system.plan import MASTER, RECORDER, NodePlan
 from ..wire.frames import SourceRows, of_numbers
-from ..wire.messages import GRANT, PROGRESS
+from ..wire.messages import FINISH, GRANT, PROGRESS
 from ..wire.streamed_rows import incoming_rows
 from ..wire.ways import Ways
 from .stepping import Runner
 
 __all__ = ["streams_of"]
-
-_RARELY: Final = 1 << 40
-"""The grant of the master reaches far ahead, so it may learn a few milliseconds later how far this node is."""
 
 
 def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connected
@@ -34,13 +30,13 @@ def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connec
     ends, number = [], memory.map.number_of
     for peer in ways.streams_of(plan.node):
         told, heard = [], []
-        if peer in plan.step_sources or peer == MASTER:  # whose windows end at this node
-            stride = plan.progress_stride if peer != MASTER else _RARELY
+        if peer in plan.step_sources or peer == MASTER:  # whose windows end at this node; grants reach far ahead
+            stride = plan.progress_stride if peer != MASTER else 0
             told.append(CounterEnd(PROGRESS, number(plan.node), memory.progress[plan.node], stride))
         if peer in plan.step_targets:
             heard.append(CounterEnd(PROGRESS, number(peer), own_memory.progress[peer]))
         if peer == MASTER:
-            heard.append(CounterEnd(GRANT, 0, own_memory.grant))
+            heard += [CounterEnd(GRANT, 0, own_memory.grant), CounterEnd(FINISH, 0, own_memory.finish)]
             if RECORDER in own_memory.progress:
                 heard.append(CounterEnd(PROGRESS, number(RECORDER), own_memory.progress[RECORDER]))
         incoming = [

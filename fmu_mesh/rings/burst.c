@@ -577,20 +577,23 @@ out:
 static int64_t await(Node *node, int64_t limit_ns) {
   uint32_t seen = bell_seen(&node->place);
   if (atomic_load(&node->attention)) return 0;
-  wake_all(node, 0);
-  Wish wishes[64]; /* of more units, the others look again when one of these may step, or the time is over */
+  Wish wishes[65]; /* of more units, the others look again when one of these may step, or the time is over */
   int64_t n = 0;
+  int by_grant = 0;
   for (int64_t i = 0; i < node->n_units; i++) {
     const Unit *unit = &node->units[i];
     if (unit->stopped || unit->tick >= unit->last_tick) continue;
+    by_grant |= unit->blocked_by == node->ceiling;
     if (n < 64)
       wishes[n++] = (Wish){unit->blocked_by, unit->need};
     else if (limit_ns > 1000000)
       limit_ns = 1000000;
   }
+  wake_all(node, by_grant); /* the master of another host grants more when it knows that this node is there */
   if (node->stride > 1 && limit_ns > node->slice_ns) limit_ns = node->slice_ns;
   int64_t start = now();
-  int64_t is_granted = sleep_on(&node->place, node->streams, seen, wishes, n, limit_ns, &node->late), elapsed = now() - start;
+  wishes[n] = (Wish){node->finish != NULL && value_of(node->finish) == 0 ? node->finish : NULL, 1};
+  int64_t is_granted = sleep_on(&node->place, node->streams, seen, wishes, n + 1, limit_ns, &node->late), elapsed = now() - start;
   node->waited_ns += elapsed;
   if (n == 1 && wishes[0].counter != node->ceiling) adapt(node, is_granted != 0, elapsed);
   return is_granted || bell_seen(&node->place) != seen;

@@ -158,7 +158,7 @@ typedef struct { /* a counter of this process that the other one has, too */
   int64_t kind, number; /* of its frames: GRANT or PROGRESS, and of which process */
   Counter *counter;
   int64_t sent;
-  int64_t stride; /* by how much it grows before it is sent without need */
+  int64_t stride; /* by how much it grows before it is sent; 0: it may wait with all that is lazy */
 } Told;
 
 typedef struct { /* a counter of the other process */
@@ -220,6 +220,7 @@ typedef struct { /* all units of a process */
   Peer *peers;
   int64_t n_peers;
   Counter *ceiling;  /* the grant of the master */
+  Counter *finish;   /* above 0: the run is over; NULL: that comes another way */
   Counter *progress; /* of this node */
   int64_t last_point, slice_ns;
   int64_t wait_ns;   /* how long to sleep where nothing can step */

@@ -58,13 +58,16 @@ static inline void lower(_Atomic int64_t *place, int64_t value) {
 /* Of another process, the end of the pipe to write to is opened as its memory was: through /proc. */
 static inline void ring_pipe(const Bell *bell) {
   const int32_t process = atomic_load(&bell->process), pipe = atomic_load(&bell->pipe);
-  char path[64];
-  snprintf(path, sizeof path, "/proc/%d/fd/%d", process, pipe);
-  const int fd = open(path, O_WRONLY | O_NONBLOCK | O_CLOEXEC);
-  if (fd < 0) return; /* it was killed, or it is about to end */
+  int fd = pipe;
+  if (process != getpid()) {
+    char path[64];
+    snprintf(path, sizeof path, "/proc/%d/fd/%d", process, pipe);
+    fd = open(path, O_WRONLY | O_NONBLOCK | O_CLOEXEC);
+    if (fd < 0) return; /* it was killed, or it is about to end */
+  }
   ssize_t written = write(fd, "", 1); /* a full pipe wakes, too */
   (void)written;
-  close(fd);
+  if (fd != pipe) close(fd);
 }
 
 static inline void ring(Bell *bell) {

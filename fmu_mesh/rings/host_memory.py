@@ -82,7 +82,7 @@ class HostMemory:
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
         number = map_.number_of(process)
         self.place = native.Participant(self.address + map_.bells, len(map_.processes), number)
-        self.grant, self.sent = self.counter(map_.grant), self.counter(map_.sent)
+        self.grant, self.sent, self.finish = map(self.counter, (map_.grant, map_.sent, map_.finish))
         self.progress = {
             name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)
         }
@@ -204,7 +204,7 @@ class HostMemory:
 
     def _prepare(self) -> None:
         """Nobody sleeps: no counter wakes anybody."""
-        for counter in (self.map.grant, self.map.sent, *self.map.progress, *self.map.rings):
+        for counter in (self.map.grant, self.map.sent, self.map.finish, *self.map.progress, *self.map.rings):
             self.number(counter + 8)[:] = native.NEVER
 
 

@@ -11,6 +11,7 @@ import math
 import os
 import select
 import socket
+import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -38,8 +39,13 @@ Rows = TypeVar("Rows", native.OutgoingTable, native.IncomingTable)
 _BUFFER_BYTES: Final = 256 * 1024
 """What one call of the system sends or reads; a larger row has a larger buffer."""
 _HEADER_BYTES: Final = 24
+_UNSENT_BYTES: Final = 128 * 1024
+"""What waits in the kernel for the network at most: a grant, or how far a node is, has to wait behind it."""
 _LAZY_S: Final = 0.005
 """How long rows for the recorder, and the progress of a node for the master, may wait for more of their kind."""
+_ROUND_TRIP: Final = struct.Struct("I")
+_ROUND_TRIP_AT: Final = 148
+"""Where `tcpi_min_rtt`, in microseconds, stands in the `tcp_info` of linux/tcp.h."""
 _TURN_S: Final = 0.02
 _LOOK_S: Final = 0.5
 
@@ -80,7 +86,11 @@ class RowsEnd(NamedTuple):
 
 
 class CounterEnd(NamedTuple):
-    """A counter that one process tells another one: frames of a ``kind`` with the ``number`` of a participant."""
+    """A counter that one process tells another one: frames of a ``kind`` with the ``number`` of a participant.
+
+    Attributes:
+        stride: by how much it grows before it is sent; 0: it may wait for a while.
+    """
 
     kind: int
     number: int
@@ -133,8 +143,13 @@ class RowStreams:
         self.address = ctypes.addressof(self._streams)
         self._library.streams_listen(self.address, os.getpid(), self._ring)
         for number, end in enumerate(ends):
-            end.socket.settimeout(0.0)
-            self._library.stream_open(self._at(number), end.socket.fileno())
+            self._open(number, end.socket)
+
+    def _open(self, number: int, own: socket.socket) -> None:
+        own.settimeout(0.0)
+        if own.family != socket.AF_UNIX:
+            own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
+        self._library.stream_open(self._at(number), own.fileno())
 
     def _at(self, number: int) -> int:
         return ctypes.addressof(self._tables[number])
@@ -216,16 +231,26 @@ class RowStreams:
         return {rows.link: rows.known for rows in stream.incoming[: stream.n_incoming]}
 
     def silent_s(self, peer: str) -> float:
-        """From any thread: for how long nothing has come from a peer, in s; infinite if the stream has ended.
+        """From any thread: for how long nothing has come from a peer, in s; infinite if there is no stream any more.
 
         What has come and was not read yet, because a step is under way, counts as a sign of life.
         """
-        number = self._number[peer]
-        stream, own = self._tables[number], self._sockets[number]
-        if stream.state != StreamState.OPEN:
+        number = self._number.get(peer)
+        if number is None or self._tables[number].state != StreamState.OPEN:
             return math.inf
+        stream, own = self._tables[number], self._sockets[number]
         silent_s = time.monotonic() - stream.heard_ns / 1e9
         return 0.0 if silent_s > _LOOK_S and select.select([own], [], [], 0.0)[0] else silent_s
+
+    def round_trip_s(self, peer: str) -> float:
+        """From any thread: the shortest round trip to a peer that its socket has measured, in s; 0 on one host."""
+        own = self._sockets[self._number[peer]]
+        if own.family == socket.AF_UNIX:
+            return 0.0
+        with suppress(OSError, struct.error):
+            (found,) = _ROUND_TRIP.unpack_from(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256), _ROUND_TRIP_AT)
+            return float(found) / 1e6
+        return 0.0
 
     def resume(self, peer: str, own: socket.socket, received: Mapping[int, int]) -> None:
         """Go on with a new socket, after the rows that the peer has."""
@@ -233,11 +258,10 @@ class RowStreams:
         self._library.stream_hold(self._at(number))
         self._sockets[number].close()
         self._sockets[number] = own
-        own.settimeout(0.0)
         stream = self._tables[number]
         for rows in stream.outgoing[: stream.n_outgoing]:
             rows.go_on(received.get(rows.link, 0))
-        self._library.stream_open(self._at(number), own.fileno())
+        self._open(number, own)
 
     def close(self, patience_s: float = 1.0) -> None:
         """Send what is left, for so long at most, and end all streams."""

@@ -43,7 +43,7 @@ typedef struct { /* as `fmu_mesh.wire.messages.HEADER`; in front of each frame *
   int64_t point;
 } Header;
 
-enum { FRAME = 1, GRANT = 3, PROGRESS = 4, LAST = 8, ALIVE = 10 }; /* of frames, as `fmu_mesh.wire.messages` has them */
+enum { FRAME = 1, GRANT = 3, PROGRESS = 4, FINISH = 5, LAST = 8, ALIVE = 10 }; /* of frames, as `fmu_mesh.wire.messages` has them */
 
 /* ---- sending */
 
@@ -83,6 +83,14 @@ static int put_rows(Stream *stream, Outgoing *out, int64_t ready) {
 
 /* Put what is new into the buffer: with `all`, also what may wait. Returns whether something did not fit. */
 static int fill(Stream *stream, int all) {
+  for (int64_t i = 0; i < stream->n_told; i++) { /* before any rows, which may be many: others wait for these numbers */
+    Told *told = &stream->told[i];
+    const int64_t value = value_of(told->counter);
+    if (value <= told->sent || (told->stride > 0 ? value < told->sent + told->stride : !all)) continue;
+    if (room(stream) < 0) return 1;
+    put_header(stream, told->kind, told->number, 0, value);
+    told->sent = value;
+  }
   for (int64_t i = 0; i < stream->n_outgoing; i++) {
     Outgoing *out = &stream->outgoing[i];
     const int64_t ready = value_of(out->counter);
@@ -93,14 +101,6 @@ static int fill(Stream *stream, int all) {
       put_header(stream, LAST, out->link, 0, ready);
       atomic_store(&out->last, SAID);
     }
-  }
-  for (int64_t i = 0; i < stream->n_told; i++) {
-    Told *told = &stream->told[i];
-    const int64_t value = value_of(told->counter);
-    if (value < told->sent + (all ? 1 : told->stride)) continue;
-    if (room(stream) < 0) return 1;
-    put_header(stream, told->kind, told->number, 0, value);
-    told->sent = value;
   }
   return 0;
 }
@@ -130,7 +130,7 @@ static int has_new(const Stream *stream) {
   for (int64_t i = 0; i < stream->n_outgoing; i++)
     if (value_of(stream->outgoing[i].counter) > stream->outgoing[i].sent || stream->outgoing[i].last == UNSAID) return 1;
   for (int64_t i = 0; i < stream->n_told; i++)
-    if (value_of(stream->told[i].counter) > stream->told[i].sent) return 1;
+    if (stream->told[i].stride <= 1 && value_of(stream->told[i].counter) > stream->told[i].sent) return 1;
   return 0;
 }
 
@@ -285,6 +285,7 @@ static void take(const Place *place, Stream *stream) {
       case FRAME:
       case LAST: take_frame(stream, &header); break;
       case GRANT:
+      case FINISH:
       case PROGRESS: take_number(place, stream, &header); break;
       case ALIVE: break;
       default: refuse(stream, REFUSED, header.kind, header.point);

@@ -60,6 +60,7 @@ class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bells: offset of the first bell; each takes 64 bytes.
         grant: the counter of granted points.
         sent: the counter of those points that were granted to processes of other hosts.
+        finish: the counter of the points of the run, from its end on.
         progress: the counters of known points, in the order of ``processes``; the last two have none.
         rings: the counters of complete rows of all instances, and those of their text.
     """
@@ -69,6 +70,7 @@ class MemoryMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bells: int
     grant: int
     sent: int
+    finish: int
     progress: tuple[int, ...]
     rings: tuple[int, ...]
 
@@ -92,7 +94,7 @@ def map_memory(
     everybody = (*processes, MASTER, STREAMS)
     counter = _LINE + 8 * len(everybody)
     bells = ends.take(_LINE * len(everybody))
-    grant, sent = ends.take(counter), ends.take(counter)
+    grant, sent, finish = (ends.take(counter) for _ in range(3))
     progress = tuple(ends.take(counter) for _ in processes)
     counters = {name: (ends.take(counter), ends.take(counter)) for name in rings}
     places = {
@@ -100,7 +102,7 @@ def map_memory(
         for name, (node, points, layout, rows) in rings.items()
     }
     every = tuple(chain.from_iterable(counters.values()))
-    return MemoryMap(everybody, ends.end, bells, grant, sent, progress, every), places
+    return MemoryMap(everybody, ends.end, bells, grant, sent, finish, progress, every), places
 
 
 class _Places:

@@ -12,14 +12,13 @@ from .layout import Layout, row_bytes
 
 __all__ = [
     "AUTO_WINDOW_POINTS",
-    "STEADY_POINTS",
     "recorder_window",
     "rows_for",
     "rows_of_ring",
     "window_of",
 ]
 
-RECORDER_WINDOW = 32768
+RECORDER_WINDOW = 262144
 """Largest number of points that the recorder may be behind. It sleeps while rows accumulate."""
 
 _ROOM_BYTES = 16 * 2**20
@@ -29,12 +28,11 @@ _LEAST_POINTS = 16
 _MOST_BYTES = 32 * 2**20
 """What the rows of a window that is configured may take, unless they are `_LEAST_POINTS` or fewer."""
 
-AUTO_WINDOW_POINTS = 32768
-AUTO_WINDOW_ROWS = 262144
-"""Limit for all instances together."""
-
-STEADY_POINTS = 1024
-"""Points that the grant may be ahead at any speed; more only for fast instances."""
+AUTO_WINDOW_POINTS = 262144
+"""As many as fast instances step while rows and progress travel to another continent and back."""
+AUTO_WINDOW_ROWS = 1048576
+"""Limit for all instances together, unless each has `_STEADY_POINTS` or fewer."""
+_STEADY_POINTS = 1024
 
 
 def recorder_window(window: int, row_sizes: Sequence[int]) -> int:
@@ -55,7 +53,7 @@ def window_of(configured: int | Literal["auto"], outputs: Collection[Layout]) ->
     widest = max(1, *(layout.row_size for layout in outputs))
     if configured != "auto":
         return min(configured, max(_LEAST_POINTS, _MOST_BYTES // widest))
-    points = min(AUTO_WINDOW_POINTS, max(STEADY_POINTS, AUTO_WINDOW_ROWS // len(outputs)))
+    points = min(AUTO_WINDOW_POINTS, max(_STEADY_POINTS, AUTO_WINDOW_ROWS // len(outputs)))
     return max(_LEAST_POINTS, min(points, _ROOM_BYTES // widest))
 
 

@@ -11,10 +11,12 @@ There are three steps; each is a query with an answer:
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import ExitStack
@@ -63,6 +65,9 @@ _SILENCE_S = 2.0
 """Longer than a live master is silent: it says something twice a second."""
 
 _GRACE_S = 1.0
+_HEARD_S = 1.0
+_AGAIN_S = 0.25
+"""How often in s the question whether the master is there is asked again."""
 
 
 class Registration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -141,11 +146,13 @@ class Membership:
         inbox: its inbox; opened by `join`.
         memory: the shared memory, for a participant in the process of the master.
         meeting: where it meets others for row streams; None: all of its rows go by rings and by Zenoh.
+        stream_silent_s: for how long the master has sent nothing by a row stream, in s.
 
     Attributes:
         memory: the shared memory, from the admission on; None if this process does not share any.
         lost_master: whether the master was found to be gone, or does not answer.
         lost_link: whether only the link to it may be lost, so that nobody else can say it.
+        doubts_master: whether `master_is_gone` could not be sure that it is there.
 
     Call sequence: `register`, then `join` once, then `sender` for each receiver, and `close` at the end.
     """
@@ -159,11 +166,14 @@ class Membership:
         router: RouterLink | None = None,
         memory: HostMemory | None = None,
         meeting: Meeting | None = None,
+        stream_silent_s: Callable[[], float] = lambda: math.inf,
     ) -> None:
         self._plan = plan
         self._meeting = meeting
         self._router = router or RouterLink(session)
-        self.lost_master = self.lost_link = False
+        self.lost_master = self.lost_link = self.doubts_master = False
+        self._asked_at = -math.inf
+        self._stream_silent_s = stream_silent_s
         self._stopped_s = 0.0
         self._session = session
         self._inbox = inbox
@@ -223,9 +233,19 @@ class Membership:
     def master_is_gone(self) -> bool:
         """Whether the master is gone. This may send a query, so do not call it in a callback of Zenoh.
 
-        On this host its process tells. Elsewhere its token does.
+        On this host its process tells. Elsewhere its token does, unless its row stream is not silent. Without a router
+        that was there, nobody has a token: that is no verdict for as long as a link may be silent.
         """
-        return not self.master_runs and self._keys is not None and not tokens(self._session, self._keys.master)
+        self.doubts_master = True
+        if self.master_runs or self._keys is None or self._stream_silent_s() <= _HEARD_S:
+            return False
+        if (now := time.monotonic()) - self._asked_at < _AGAIN_S:
+            return False
+        self._asked_at = now
+        if tokens(self._session, self._keys.master):
+            self.doubts_master = False
+            return False
+        return not self._router.may_come_back(self._plan.timeouts.link)
 
     @property
     def master_runs(self) -> bool:
@@ -257,6 +277,7 @@ class Membership:
             DeadlineExceeded: a step may not take so long.
         """
         timeouts, pid = self._plan.timeouts, self._master_pid
+        silent_s = min(silent_s, self._stream_silent_s())
         if silent_s <= min(timeouts.link, timeouts.step):
             self._stopped_s = 0.0
             return
@@ -383,7 +404,7 @@ class Membership:
     def _has_nothing_to_join(self) -> bool:
         if self._master_went and not self.given_up:
             self.given_up = self.master_is_gone
-            self._master_went = self.master_runs and not self.given_up  # then it is asked again
+            self._master_went = self.doubts_master and not self.given_up  # then it is asked again
         return self.given_up
 
 

@@ -18,6 +18,7 @@ import msgspec
 import zenoh
 from zenoh.handlers import Callback
 
+from ..awake import AwakeClock
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 from .values import json_encoding
 
@@ -94,6 +95,8 @@ _TOKENS_S = 2.0
 _TOKENS_TRIES = 10
 _LINK_S = 1.0
 _UNLINK_S = 0.2
+_BACK_S = 3.0
+"""How long in s the processes behind a router that is back may need until all see all tokens again."""
 _LINK_CHECK_S = 0.01
 
 
@@ -260,6 +263,9 @@ class RouterLink:
         self._session = session
         self.endpoints = tuple(endpoints)
         self._had_router = False
+        self._lost_at: float | None = None
+        self._back_at: float | None = None
+        self._clock = AwakeClock()
 
     def wait(self) -> None:
         """Wait a moment for the link: a session in peer mode is open before the link is."""
@@ -276,6 +282,26 @@ class RouterLink:
     def is_lost(self) -> bool:
         """Whether the router was there, and is not there now."""
         return self._had_router and not self.look()
+
+    def may_come_back(self, limit_s: float) -> bool:
+        """Whether what is missing may be missing only because the router was lost less than ``limit_s`` seconds ago.
+
+        When it is back, the other processes need a moment to connect to it again.
+        """
+        now = self._clock()
+        if self._lost_at is None:
+            if self.loss() is None:
+                return False
+            self._lost_at, self._back_at = now, None
+        if not self.look():
+            self._back_at = None
+            return now - self._lost_at < limit_s
+        if self._back_at is None:
+            self._back_at = now
+        if now - self._back_at < _BACK_S:
+            return True
+        self._lost_at = None
+        return False
 
     def loss(self) -> str | None:
         """A text that says that the router is lost; None if it is there, or if there was none.

@@ -42,6 +42,9 @@ class StreamKeeper:
 
     Args:
         post: lets the thread that reads the streams do something.
+
+    Attributes:
+        round_trip_s: the longest one to a peer, in s.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class StreamKeeper:
         self._meeting = meeting
         self._peers = peers
         self._post = post
+        self.round_trip_s = self._round_trip_s()
         self._cut_since: dict[str, float] = {}
         self._clock = AwakeClock()
         self._closing = threading.Event()
@@ -90,12 +94,16 @@ class StreamKeeper:
             if now - beaten >= _BEAT_S:
                 beaten = now
                 self._streams.beat()
+                self.round_trip_s = self._round_trip_s()
             for peer in self._peers:
                 if self._streams.silent_s(peer) > _SILENT_S:
                     self._cut_since.setdefault(peer, now)
                     self._meeting.dial(peer, again=True)
                 else:
                     self._cut_since.pop(peer, None)
+
+    def _round_trip_s(self) -> float:
+        return max(map(self._streams.round_trip_s, self._peers), default=0.0)
 
     def received(self, peer: str) -> dict[int, int]:
         """See `fmu_mesh.wire.meeting.Returns`."""

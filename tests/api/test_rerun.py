@@ -98,7 +98,7 @@ def test_a_steered_and_stopped_run_is_run_again_to_its_last_row(folder: Path) ->
     assert again["free.y"].max() > 0.0
 
 
-@pytest.mark.parametrize("window", [16, 32768])  # the free instance is thousands of points ahead of the rows
+@pytest.mark.parametrize("window", [16, 262144])  # the free instance is thousands of points ahead of the rows
 def test_what_a_killed_run_has_kept_is_run_again(place: Place, folder: Path, window: int) -> None:
     launched = place.start("launch", endless(folder, window=window))
     with fmu_mesh.attach("pair", wait=DEADLINE_S, timeout=DEADLINE_S) as run:

@@ -38,7 +38,11 @@ FAR_S = 1_000_000.0
 
 
 def started(
-    place: Place, simulation: dict[str, float], rows: int, timeouts: dict[str, float] | None = None
+    place: Place,
+    simulation: dict[str, float],
+    rows: int,
+    timeouts: dict[str, float] | None = None,
+    way: Mapping[str, bool] = {},
 ) -> tuple[Launched, Path]:
     """A pendulum and a delay that run, and their result file with ``rows`` rows or more."""
     config = write_config(
@@ -47,6 +51,7 @@ def started(
         stop_time=FAR_S,
         simulation=simulation,
         timeouts=timeouts or {},
+        zenoh=way,
     )
     launched = place.start("launch", config)
     result = config.with_suffix(".csv")
@@ -71,11 +76,18 @@ def point_in(message: str) -> int:
 
 
 @pytest.mark.parametrize("victim", ["pendulum", "delay", "master"])
-@pytest.mark.parametrize(("simulation", "rows"), [FAST, PACED])
+@pytest.mark.parametrize(
+    ("simulation", "rows", "way"),
+    [
+        pytest.param({}, 2000, {}, id="as fast as possible"),
+        pytest.param({"real_time_factor": 1}, 300, {}, id="in real time"),
+        pytest.param({"real_time_factor": 1}, 300, BY_STREAMS, id="by streams"),
+    ],
+)
 def test_killed_process_ends_run_within_two_seconds_and_rows_before_are_kept(
-    place: Place, victim: str, simulation: dict[str, float], rows: int
+    place: Place, victim: str, simulation: dict[str, float], rows: int, way: Mapping[str, bool]
 ) -> None:
-    launched, result = started(place, simulation, rows)
+    launched, result = started(place, simulation, rows, way=way)
 
     launched.child(victim).kill()
 

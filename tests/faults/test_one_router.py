@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
-from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
+from tests.helpers import BY_STREAMS, Launched, Place, row_count, rows_of, wait_until, write_config
 
 POINTS = 10_000
 
@@ -29,10 +30,22 @@ def endpoint_of(router: Launched) -> str:
     return router.output.split("router at ")[1].split()[0].rstrip(",")
 
 
-def through(router: Launched, place: Place, mode: str, name: str = "pair.yaml") -> Path:
+def through(
+    router: Launched,
+    place: Place,
+    mode: str,
+    name: str = "pair.yaml",
+    zenoh: Mapping[str, bool] = MappingProxyType({}),
+    link_s: float = 30.0,
+) -> Path:
     """A mesh of some seconds whose processes meet on the router, or on this host and the router."""
-    zenoh = {"mode": mode, "connect": [endpoint_of(router)]}
-    config = write_config(place.folder, stop_time=POINTS * 0.001, simulation={"real_time_factor": 1}, zenoh=zenoh)
+    config = write_config(
+        place.folder,
+        stop_time=POINTS * 0.001,
+        simulation={"real_time_factor": 1},
+        timeouts={"link": link_s},
+        zenoh={"mode": mode, "connect": [endpoint_of(router)], **zenoh},
+    )
     return config.rename(place.folder / name)
 
 
@@ -94,7 +107,7 @@ def test_a_second_process_for_a_node_is_refused_without_disturbing_the_first(pla
 
 
 def test_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place, router: Launched) -> None:
-    config = through(router, place, "client")
+    config = through(router, place, "client", link_s=2.0)
     result = place.folder / "pair.csv"
     first = place.start("launch", config, "--no-progress")
     wait_until(lambda: row_count(result) > 100, "100 rows")
@@ -104,6 +117,29 @@ def test_router_that_is_gone_is_named_and_what_was_recorded_is_kept(place: Place
     assert first.wait() == 4
     assert f"the link to the router at {endpoint_of(router)} was lost" in first.message
     assert len(rows_of(result)) > 100
+
+
+@pytest.mark.parametrize("zenoh", [{}, BY_STREAMS], ids=["by rings", "by streams"])
+def test_a_router_that_comes_back_costs_nothing(place: Place, router: Launched, zenoh: Mapping[str, bool]) -> None:
+    config = through(router, place, "client", zenoh=zenoh)
+    result = place.folder / "pair.csv"
+    first = place.start("launch", config, "--no-progress")
+    wait_until(lambda: row_count(result) > 100, "100 rows")
+
+    endpoint = endpoint_of(router)
+    router.signal(signal.SIGKILL)
+    router.wait()
+    rows = row_count(result)
+    wait_until(lambda: row_count(result) > rows + 3000, "rows without a router")
+    again = place.start("router", "--listen", endpoint)
+
+    assert_ends_well(first, result)
+    assert "was lost" not in first.errors
+    again.signal(signal.SIGTERM)
+    assert again.wait() == 0
+    expected = place.run("launch", config, "--local", "--output", "local.csv", "--no-progress")
+    assert expected.wait() == 0
+    assert result.read_bytes() == (place.folder / "local.csv").read_bytes()
 
 
 def test_every_run_has_an_id_of_its_own(place: Place) -> None:

@@ -10,10 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
-from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
-from tests.network_hosts import NEEDS_HOSTS, NetworkHost, two_hosts
+from tests.all_systems import written_system
+from tests.helpers import Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
+from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_apart, two_hosts
 from tests.pages.blocks import ROOT, blocks_of
 
 pytestmark = NEEDS_HOSTS
@@ -89,43 +91,55 @@ def test_nodes_of_another_host_connect_to_a_master_that_listens(tmp_path: Path) 
         assert (first.folder / RESULT).read_bytes() == expected
 
 
-PACED = "configs/paced.yaml"
+UNREACHED = """
+import sys
+
+def refuse(event, arguments):
+    if event == "socket.connect" and isinstance(arguments[1], tuple):
+        raise ConnectionRefusedError
+
+sys.addaudithook(refuse)
+"""
+"""In each process: the doors of row streams at a port cannot be reached, and Zenoh, which is no Python, can."""
 
 
-def paced(host: NetworkHost, example: str) -> list[str]:
-    """Write an example that takes 4 s there, and return the names of its two nodes."""
-    made = (ROOT / "configs" / example).read_text(encoding="utf-8")
-    made = re.sub(r"stop_time: \d+.0", "stop_time: 4.0", made)
-    made = made.replace("simulation:", "simulation:\n  real_time_factor: 1")
-    (host.folder / "own-clone" / PACED).write_text(made, encoding="utf-8")
-    return re.findall(r"^  (\w+):\n    fmu:", made, re.MULTILINE)
+def test_hosts_whose_doors_cannot_be_reached_are_told_and_use_zenoh(tmp_path: Path) -> None:
+    with two_hosts(tmp_path) as hosts:
+        first, second = hosts
+        expected = reference(second)
+        (tmp_path / "shared" / "sitecustomize.py").write_text(UNREACHED, encoding="utf-8")
 
-
-@pytest.mark.parametrize("cut_s", [0.5, 3.0])
-@pytest.mark.parametrize("example", ["cycle2.yaml", "pendulum_delay.yaml"])
-def test_a_link_that_is_cut_for_a_while_costs_only_time(tmp_path: Path, example: str, cut_s: float) -> None:
-    with two_hosts(tmp_path) as (first, second):
-        near, far = paced(first, example)
-        paced(second, example)
-        result = first.folder / "out.csv"
-        by_hand = [
-            started(first, f"fmu-mesh master {PACED} --listen tcp/0.0.0.0:7447 --output ../out.csv"),
-            started(first, f"fmu-mesh node {PACED} {near}"),
-            started(second, f"fmu-mesh node {PACED} {far} --connect tcp/router:7447"),
-        ]
-        wait_until(lambda: row_count(result) > 100, "some rows")
-
-        assert second.start("ip", "link", "set", "wire", "down").wait() == 0
-        begun = time.monotonic()
-        wait_until(lambda: time.monotonic() - begun > cut_s, "the end of the cut")
-        rows = row_count(result)
-        assert second.start("ip", "link", "set", "wire", "up").wait() == 0
-        wait_until(lambda: row_count(result) > rows, "more rows")
+        by_hand = started_apart(hosts, Path(CONFIG), ["pendulum", "delay"], environment={"PYTHONPATH": "/mnt"})
 
         assert ended(by_hand) == [0, 0, 0], "".join(one.story() for one in by_hand)
-        alone = started(second, f"fmu-mesh launch {PACED} --local --no-progress --output ../alone.csv")
-        assert alone.wait() == 0
-        assert result.read_bytes() == (second.folder / "alone.csv").read_bytes()
+        told = "cannot reach each other: their rows go by Zenoh"
+        assert re.findall(rf"WARNING: (.*) {told}", by_hand[0].errors) == [
+            "the master, node 'delay'",
+            "node 'delay', node 'pendulum'",
+        ], by_hand[0].story()
+        assert (first.folder / RESULT).read_bytes() == expected
+
+
+@pytest.mark.parametrize("victim", ["pendulum", "delay"])
+def test_a_process_that_is_killed_is_named_by_the_others_within_two_seconds(tmp_path: Path, victim: str) -> None:
+    with two_hosts(tmp_path) as hosts:
+        config = Path("endless", "system.yaml")
+        systems = [
+            written_system("pendulum_delay", host.folder / "own-clone" / "endless", lasts_s=60.0) for host in hosts
+        ]
+        by_hand = started_apart(hosts, config, ["pendulum", "delay"])
+        wait_until(lambda: row_count(systems[0].with_suffix(".csv")) > 100, "some rows")
+        killed = by_hand[("master", "pendulum", "delay").index(victim)]
+
+        begun = time.monotonic()
+        for process in psutil.Process(killed.pid).children(recursive=True):
+            process.kill()
+
+        others = [one for one in by_hand if one is not killed]
+        assert ended(others) == [4, 4], "".join(one.story() for one in by_hand)
+        assert time.monotonic() - begun < on_a_busy_machine(2.0)
+        for one in others:
+            assert f"node '{victim}' was lost" in one.message
 
 
 def test_two_processes_of_two_hosts_with_equal_names_and_numbers_are_two(place: Place) -> None:

@@ -201,7 +201,119 @@ def test_after_each_cut_rows_go_on_where_the_reader_is(cuts: list[tuple[int, int
     target.streams.close(0.0)
 
 
-def test_a_silent_peer_is_noticed_and_what_was_not_read_is_a_sign_of_life(both: tuple[End, End]) -> None:
+def test_after_a_cut_at_each_byte_rows_counters_and_the_end_are_there() -> None:
+    """The bytes of some rows, a counter and the end of a link; the reader gets so many of them, and no more."""
+    length, cut = 1, 0
+    while cut < length:
+        source, target = ends(rows=16)
+        source.write(0, 5)
+        source.memory.progress["source"].raise_to(3)
+        source.streams.say_last(LINK)
+        data = target.socket.recv(100_000)
+        assert data.count(HEADER.pack(LAST, LINK, 0, 5)) == 1
+        length = len(data)
+        torn, reader = socket.socketpair()
+        torn.sendall(data[:cut])
+        torn.close()
+        target.streams.resume("source", reader, {})
+        turn(target, until=lambda: [state for _, state, *_ in target.streams.states()] == [StreamState.CUT])  # noqa: B023  used here
+        here, there = socket.socketpair()
+
+        source.streams.resume("target", here, target.streams.received("source"))
+        target.streams.resume("source", there, {})
+
+        turn(source, target, until=lambda: [*target.streams.ended_links()] == [LINK])  # noqa: B023  used here
+        turn(source, target, until=lambda: target.memory.progress["source"].value == 3)  # noqa: B023  used here
+        assert [target.values(row) for row in range(5)] == [source.values(row) for row in range(5)]
+        assert [*target.streams.states()] == []
+        for end in (source, target):
+            end.streams.close(0.0)
+        cut += 1
+
+
+@given(order=st.permutations(range(5)), sizes=st.lists(st.integers(1, 8), min_size=5, max_size=5))
+@settings(max_examples=60, deadline=None)
+def test_frames_in_another_order_are_refused_and_no_row_is_wrong(order: list[int], sizes: list[int]) -> None:
+    source, target = ends()
+    firsts = [sum(sizes[:number]) for number in range(6)]
+
+    source.socket.send(b"".join(frame(firsts[number], sizes[number]) for number in order))
+    target.streams.serve(0.0)
+
+    in_order = next((place for place, number in enumerate(order) if place != number), 5)
+    assert target.counter.value == firsts[in_order]
+    assert [target.values(row) for row in range(firsts[in_order])] == [
+        [True, -row, row / 3, row * 1e300] for row in range(firsts[in_order])
+    ]
+    assert [state for _, state, *_ in target.streams.states()] == ([] if in_order == 5 else [StreamState.GAP])
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+@given(place=st.integers(0, 10_000), value=st.integers(0, 255))
+@settings(max_examples=200, deadline=None)
+def test_a_forged_byte_changes_nothing_that_came_before_it(place: int, value: int) -> None:
+    """What comes after it may be other rows or other counters, of this run, or is refused."""
+    source, target = ends()
+    frames = [frame(row, 1) for row in range(8)]
+    data = bytearray(b"".join(frames) + HEADER.pack(PROGRESS, 0, 0, 3) + HEADER.pack(LAST, LINK, 0, 0))
+    place %= len(data)
+    data[place] = value
+
+    source.socket.send(bytes(data))
+    target.streams.serve(0.0)
+
+    right = min(place // len(frames[0]), 8)
+    assert right <= target.counter.value <= LAST_POINT + 1
+    assert [target.values(row) for row in range(right)] == [[True, -row, row / 3, row * 1e300] for row in range(right)]
+    assert 0 <= target.memory.progress["source"].value <= LAST_POINT + 1
+    assert {state for _, state, *_ in target.streams.states()} <= {
+        StreamState.REFUSED,
+        StreamState.GAP,
+        StreamState.TWICE,
+    }
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+@pytest.mark.parametrize("reads", [0, 1, 2, 8, 20])
+def test_a_cut_while_a_thread_sends_large_rows_costs_no_byte(reads: int) -> None:
+    """The kernel takes a tenth of a row at once, so each read ends within one."""
+    source, target = ends(rows=8, wide=2_000_000)
+    values = np.frombuffer(os.urandom(2_000_000), np.uint8)
+    for row in range(4):
+        source.ring.put(row, "wide", values)
+        source.ring.stamp(row)
+    source.counter.raise_to(4)
+    source.streams.serve(0.0)
+    for _ in range(reads):
+        target.streams.serve(0.0)
+    here, there = socket.socketpair()
+
+    source.streams.resume("target", here, target.streams.received("source"))
+    target.streams.resume("source", there, {})
+
+    turn(source, target, until=lambda: target.counter.value == 4)
+    assert all((target.ring.array("wide")[row] == values).all() for row in range(4))
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+def test_a_peer_that_reads_nothing_does_not_hold_the_end_up() -> None:
+    source, target = ends(rows=8, wide=8_000_000)
+    source.ring.put(0, "wide", np.zeros(8_000_000, np.uint8))
+    source.ring.stamp(0)
+    source.counter.raise_to(1)
+    source.streams.serve(0.0)
+    begun = time.monotonic()
+
+    source.streams.close(0.3)
+
+    assert 0.3 <= time.monotonic() - begun < 5.0
+    target.streams.close(0.0)
+
+
+def test_a_silent_peer_is_noticed_and_unread_bytes_are_life(both: tuple[End, End]) -> None:
     source, target = both
     assert target.streams.silent_s("source") < 0.5
 

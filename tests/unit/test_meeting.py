@@ -83,7 +83,7 @@ def test_the_earlier_name_dials_where_the_later_one_cannot(make: Make, tmp_path:
     assert_connected(one, other)
 
 
-def test_a_door_at_all_addresses_is_tried_where_there_is_a_connection_already(make: Make) -> None:
+def test_a_door_at_all_addresses_is_found_by_a_connection(make: Make) -> None:
     one = make("a", "0.0.0.0")  # noqa: S104  the door is at all addresses
     other = make("b", "127.0.0.1", connected=("127.0.0.1",))
     assert one.door_for("b").addresses[0].startswith("tcp:*:")
@@ -94,7 +94,7 @@ def test_a_door_at_all_addresses_is_tried_where_there_is_a_connection_already(ma
     assert_connected(one, other)
 
 
-def test_who_cannot_be_reached_is_given_up_and_no_door_needs_no_wait(make: Make, tmp_path: Path) -> None:
+def test_who_cannot_be_reached_is_given_up_soon(make: Make, tmp_path: Path) -> None:
     one = make("a")
     one.knows("b", Door((f"unix:{tmp_path / 'nobody'}", "tcp:127.0.0.1:1"), "secret"))
     one.knows("c", None)
@@ -129,7 +129,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("name", STRANGE)
-def test_a_stranger_who_comes_first_is_sent_away_and_the_peer_gets_in(make: Make, name: str, tmp_path: Path) -> None:
+def test_a_stranger_who_comes_first_does_not_keep_a_peer_out(make: Make, name: str, tmp_path: Path) -> None:
     one, other = make("a"), make("b")
     introduce(one, other)
     with socket.socket(socket.AF_UNIX) as stranger:
@@ -173,6 +173,44 @@ def test_the_secret_of_one_peer_does_not_open_the_door_for_another(make: Make, t
     assert one.sockets == {}
 
 
+@pytest.mark.parametrize("answer", [greeting("b", "0" * 64), greeting("c", "0" * 64), b"\x05\0\0\0hello", b""], ids=str)
+def test_a_door_that_a_stranger_has_taken_is_left_soon(make: Make, tmp_path: Path, answer: bytes) -> None:
+    """He hears the secret of that door, and not that of the other one: so he does not come in."""
+    one = make("a")
+    with socket.socket(socket.AF_UNIX) as taken:
+        taken.bind(str(tmp_path / "taken"))
+        taken.listen()
+        taken.settimeout(LIMIT_S)
+        one.knows("b", Door((f"unix:{tmp_path / 'taken'}",), "secret"))
+        begun = time.monotonic()
+        dialing = threading.Thread(target=one.dial, args=["b"])
+        dialing.start()
+        with taken.accept()[0] as stranger:
+            stranger.sendall(answer)
+            dialing.join(LIMIT_S)
+
+    assert not dialing.is_alive()
+    assert one.sockets == {}
+    assert time.monotonic() - begun < LIMIT_S / 2
+
+
+def test_a_greeting_in_slow_pieces_does_not_stretch_the_second(make: Make, tmp_path: Path) -> None:
+    one, other = make("a"), make("b")
+    introduce(one, other)
+    with socket.socket(socket.AF_UNIX) as slow:
+        slow.settimeout(0.1)
+        slow.connect(str(tmp_path / "a.rows"))
+        begun, said = time.monotonic(), b"\0\0\x01\0" + b" " * 1000
+        with suppress(ConnectionError):  # the door was closed while this spoke
+            for place in range(len(said)):
+                slow.sendall(said[place : place + 1])
+                with suppress(TimeoutError):
+                    if slow.recv(1) == b"":
+                        break
+
+        assert module._PATIENCE_S / 2 < time.monotonic() - begun < LIMIT_S / 2
+
+
 def test_a_closed_door_leaves_no_socket(make: Make, tmp_path: Path) -> None:
     one = make("a")
     assert [*tmp_path.iterdir()] == [tmp_path / "a.rows"]
@@ -209,4 +247,23 @@ def test_who_comes_again_is_handed_on_with_what_he_has(make: Make) -> None:
     assert other.dial("a", again=True)
 
     assert (here.came, there.came) == ([("b", {2: 7})], [("a", {1: 5})])
+    assert_connected(one, other)
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_a_stranger_who_comes_again_is_not_handed_on(make: Make, name: str, tmp_path: Path) -> None:
+    one, other = make("a"), make("b")
+    introduce(one, other)
+    settled(one, other)
+    here = Again({1: 5})
+    one.wait_for_returns(here)
+    with socket.socket(socket.AF_UNIX) as stranger:
+        stranger.settimeout(LIMIT_S)
+        stranger.connect(str(tmp_path / "a.rows"))
+        stranger.sendall(STRANGE[name])
+
+        with suppress(ConnectionResetError):  # of bytes that nobody has read
+            assert stranger.recv(1) == b""
+
+    assert here.came == []
     assert_connected(one, other)

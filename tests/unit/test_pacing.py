@@ -95,26 +95,32 @@ def test_a_run_that_keeps_up_has_no_overruns(tmp_path: Path, wall: Wall) -> None
     assert (reached, paced.overruns) == (81, 0)
 
 
-@pytest.mark.parametrize(
-    ("points_per_s", "expected"), [(10.0, 1024), (20_000.0, 1024), (50_000.0, 2500), (1_000_000.0, 50_000)]
-)
-def test_the_grant_reaches_50_ms_at_the_present_speed_or_1024_points(points_per_s: float, expected: int) -> None:
-    reach = Reach(4096)
-    reach.points(0, 1000.0)
+@pytest.mark.parametrize("round_trip_s", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize("points_per_s", [2.0, 30.0, 1_000.0, 5_000_000.0])
+def test_the_grant_reaches_50_ms_and_one_round_trip(points_per_s: float, round_trip_s: float) -> None:
+    reach, granted, stood = Reach(), [0], 0.0
+    for tick in range(3000):  # of 1 ms; what they have heard by now, the master has granted a round trip ago
+        granted.append(int(stood) + reach.points(int(stood), 1000.0 + tick / 1000, round_trip_s))
+        heard = max(granted[: max(1, len(granted) - round(round_trip_s * 1000))])
+        stood = min(heard, stood + points_per_s / 1000)
 
-    assert reach.points(round(points_per_s), 1001.0) == expected
-
-
-def test_fast_start_is_not_held_up_until_speed_is_measured_next_time() -> None:
-    reach = Reach(4096)
-
-    assert reach.points(0, 1000.0) == 1024
-    assert reach.points(511, 1000.001) == 1024
-    assert reach.points(512, 1000.001) == 25_600  # in the last millisecond it took 512 points
-    assert reach.points(512, 1000.012) == 1024
+    aim = points_per_s * (0.05 + round_trip_s)
+    assert granted[1] == 1
+    assert granted[-1] - int(stood) == pytest.approx(aim, rel=0.5, abs=1.0)  # the clock has ticks of 1 ms
 
 
-def test_a_small_window_is_always_used_as_a_whole() -> None:
-    reach = Reach(16)
+def test_a_fast_start_over_a_far_link_takes_five_round_trips() -> None:
+    reach, slowest, now = Reach(), 0, 1000.0
 
-    assert [reach.points(point, 1000.0 + point) for point in range(5)] == [16] * 5
+    for _ in range(5):
+        slowest += reach.points(slowest, now, 0.05)
+        now += 0.05 + 0.005  # they need less than 5 ms, and nobody knows how much less
+
+    assert reach.points(slowest, now, 0.05) > 100_000
+
+
+def test_a_grant_that_is_used_late_is_halved() -> None:
+    reach = Reach()
+    fast = [reach.points(round(1e6 * (now - 1000.0)), now, 0.0) for now in (1000.0, 1000.001, 1000.002)]
+
+    assert [reach.points(2001, now, 0.0) for now in (1000.2, 1000.203)] == [fast[-1], fast[-1] // 2]

@@ -110,15 +110,15 @@ def test_rings_hold_what_can_be_under_way(window: int, slowest: int) -> None:
 def test_an_automatic_window_is_large_and_one_that_is_given_counts() -> None:
     system = Scenario(("a -> b",)).plan().system
 
-    assert make_plan(system).window == 32768
+    assert make_plan(system).window == 262144
     assert make_plan(system, window=3).window == 3
 
 
 @pytest.mark.parametrize(
     ("window", "row_sizes", "expected"),
     [
-        (16, [8, 24], 32768),
-        (40_000, [8], 40_000),
+        (16, [8, 24], 262144),
+        (400_000, [8], 400_000),
         (16, [80_000], 2**24 // 80_000),
         (16, [10**6], 16),
         (16, [16] * 40, 2**24 // (40 * 16)),
@@ -134,7 +134,7 @@ def test_the_automatic_window_of_many_instances_is_smaller() -> None:
     names = [f"i{number}" for number in range(50)]
     system = Scenario(tuple(f"{a} -> {b}" for a, b in pairwise(names))).plan().system
 
-    assert make_plan(system).window == 262144 // 50
+    assert make_plan(system).window == 2**20 // 50
 
 
 @pytest.mark.parametrize("window", [1, 4, 5, 12, 13, 100, 1024])
