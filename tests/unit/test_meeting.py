@@ -15,6 +15,7 @@ import pytest
 from fmu_mesh.rings import native
 from fmu_mesh.wire import meeting as module
 from fmu_mesh.wire.meeting import Door, Meeting
+from tests.helpers import wait_until
 
 pytestmark = pytest.mark.skipif(native.library is None, reason="there is no library of C")
 
@@ -104,6 +105,24 @@ def test_who_cannot_be_reached_is_given_up_soon(make: Make, tmp_path: Path) -> N
 
     assert one.sockets == {}
     assert time.monotonic() - started < LIMIT_S / 2  # a second and a little
+
+
+def test_all_peers_are_dialled_at_the_same_time(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    together, peers = threading.Barrier(20), [f"b{number}" for number in range(20)]
+    dialled: list[str] = []
+
+    def dial(_self: Meeting, peer: str) -> None:
+        together.wait(LIMIT_S)  # raises if the others are not dialled until this ends
+        dialled.append(peer)
+
+    monkeypatch.setattr(Meeting, "dial", dial)
+    last = make("c")
+    for peer in peers:
+        last.knows(peer, Door((), ""))
+
+    last.settle(peers, LIMIT_S)
+
+    assert sorted(dialled) == sorted(peers)
 
 
 def test_a_wait_for_who_never_comes_ends_when_the_run_is_over(make: Make) -> None:
@@ -245,6 +264,7 @@ def test_who_comes_again_is_handed_on_with_what_he_has(make: Make) -> None:
     other.wait_for_returns(there)
 
     assert other.dial("a", again=True)
+    wait_until(lambda: here.came, "the other one to be handed on")  # the one that dials does not wait for this
 
     assert (here.came, there.came) == ([("b", {2: 7})], [("a", {1: 5})])
     assert_connected(one, other)
