@@ -259,6 +259,13 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
             "their own, where they can reach each other; false: through Zenoh."
         ),
     ] = True
+    rows_address: Annotated[
+        Annotated[str, Meta(min_length=1)] | None,
+        Meta(
+            description="Address of this host at which other hosts reach it for row streams; each host has its own, so "
+            "set it with --set-config; null: the one from which the master or the router in `connect` is reached.",
+        ),
+    ] = None
     config: Annotated[
         str | None,
         Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),

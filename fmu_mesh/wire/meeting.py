@@ -19,6 +19,7 @@ from typing import Final, Protocol
 
 import msgspec
 
+from ..errors import ConfigurationError
 from ..rings import native
 from .runtime import rows_socket
 from .session import Wiring
@@ -123,7 +124,7 @@ class Meeting:
             own.bind(str(place))
             address = f"unix:{place}"
         else:
-            own = socket.create_server((place, 0), family=socket.AF_INET6 if ":" in place else socket.AF_INET)
+            own = socket.create_server((place, 0), family=_family(place))
             address = f"tcp:{'*' if place in _ANY else place}:{own.getsockname()[1]}"
         own.listen(_STRANGERS)
         self._listening.append(own)
@@ -326,14 +327,31 @@ def _heard(of: socket.socket) -> _Greeting:
     return msgspec.json.decode(read(size), type=_Greeting)
 
 
-def meeting_of(name: str, folder: Path, wiring: Wiring) -> Meeting | None:
-    """The meeting of a participant whose session has this wiring; None where there is no library for row streams."""
+def meeting_of(name: str, folder: Path, wiring: Wiring, address: str | None = None) -> Meeting | None:
+    """The meeting of a participant whose session has this wiring; None where there is no library for row streams.
+
+    Its door is at this ``address``, if one is given, besides its Unix socket.
+
+    Raises:
+        ConfigurationError: this host does not have the address.
+    """
     if native.library is None:
         return None
     connected = [host for endpoint in wiring.connect if (host := _host_of(endpoint)) is not None]
+    if address is not None:
+        try:
+            socket.create_server((address, 0), family=_family(address)).close()
+        except OSError as error:
+            text = f"cannot listen for row streams at '{address}': {error.strerror or error}"
+            raise ConfigurationError(text, hint="`zenoh.rows_address` is an address of this host.") from error
+        return Meeting(name, [rows_socket(folder, name), address], dict.fromkeys(connected))
     listening = [host for endpoint in wiring.listen if (host := _host_of(endpoint)) is not None]
     hosts = dict.fromkeys([*listening, *filter(None, map(_own_address, connected))])
     return Meeting(name, [rows_socket(folder, name), *hosts], dict.fromkeys(connected))
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def _host_of(endpoint: str) -> str | None:

@@ -12,9 +12,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
 from fmu_mesh.wire import meeting as module
-from fmu_mesh.wire.meeting import Door, Meeting
+from fmu_mesh.wire.meeting import Door, Meeting, meeting_of
+from fmu_mesh.wire.session import Wiring
 from tests.helpers import wait_until
 
 pytestmark = pytest.mark.skipif(native.library is None, reason="there is no library of C")
@@ -228,6 +230,25 @@ def test_a_greeting_in_slow_pieces_does_not_stretch_the_second(make: Make, tmp_p
                         break
 
         assert module._PATIENCE_S / 2 < time.monotonic() - begun < LIMIT_S / 2
+
+
+def test_an_address_that_is_given_is_the_only_one_of_the_network(tmp_path: Path) -> None:
+    wiring = Wiring(listen=("tcp/0.0.0.0:7447",), connect=("tcp/localhost:7447",))
+    own = meeting_of("a", tmp_path, wiring, "127.0.0.2")
+    assert own is not None
+
+    local, port = own.door_for("b").addresses
+    own.close()
+
+    assert local.startswith(f"unix:{tmp_path}")
+    assert port.startswith("tcp:127.0.0.2:")
+
+
+def test_an_address_of_another_host_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"at '192\.0\.2\.1'") as refused:
+        meeting_of("a", tmp_path, Wiring(), "192.0.2.1")
+
+    assert "zenoh.rows_address" in str(refused.value.hint)
 
 
 def test_a_closed_door_leaves_no_socket(make: Make, tmp_path: Path) -> None:
