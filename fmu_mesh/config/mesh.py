@@ -262,8 +262,8 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
     rows_address: Annotated[
         Annotated[str, Meta(min_length=1)] | None,
         Meta(
-            description="Address of this host at which other hosts reach it for row streams; each host has its own, so "
-            "set it with --set-config; null: the one from which the master or the router in `connect` is reached.",
+            description="Address at which other hosts reach this host for row streams. Each host has its own, so it is "
+            "an option of each process. null: the one from which it reaches the master or the router in `connect`."
         ),
     ] = None
     config: Annotated[
