@@ -33,7 +33,10 @@ __all__ = ["PlannedRerun", "planned_rerun", "rerun"]
 log = logging.getLogger("fmu_mesh.run")
 
 _SET = "set"
-_ALONE: Mapping[str, Any] = {"zenoh": {"mode": "peer", "listen": [], "connect": [], "config": None}, "ros": None}
+_ALONE: Mapping[str, Any] = {
+    "zenoh": {"mode": "peer", "listen": [], "connect": [], "rows_address": None, "config": None},
+    "ros": None,
+}
 """What a rerun has of its own: nobody else reaches it or sends anything to it."""
 
 

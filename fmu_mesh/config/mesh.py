@@ -259,6 +259,13 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
             "their own, where they can reach each other; false: through Zenoh."
         ),
     ] = True
+    rows_address: Annotated[
+        Annotated[str, Meta(min_length=1)] | None,
+        Meta(
+            description="Address at which other hosts reach this host for row streams. Each host has its own, so it is "
+            "an option of each process. null: the one from which it reaches the master or the router in `connect`."
+        ),
+    ] = None
     config: Annotated[
         str | None,
         Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),

@@ -33,8 +33,8 @@ from ..wire.values import (
     encode_value,
     json_encoding,
 )
-from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView
-from ..wire.ways import Way, Ways
+from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView, Way
+from ..wire.ways import Ways
 from .activity import Activity
 from .inputs import set_input
 from .stepping import Runner

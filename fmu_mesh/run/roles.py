@@ -123,7 +123,7 @@ class _NodeProcess:
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
         router = RouterLink(session, run.zenoh.connect)
-        meeting = meeting_of(plan.node, process.folder, own) if plan.row_streams else None
+        meeting = meeting_of(plan.node, process.folder, own, run.zenoh.rows_address) if plan.row_streams else None
         if meeting is not None:
             process.stack.callback(meeting.close)
         self._node = node = Node(
@@ -210,7 +210,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 profile=run.profile,
                 paused=run.paused,
             )
-            meeting = meeting_of(MASTER, process.folder, own) if config.zenoh.row_streams else None
+            meeting = meeting_of(MASTER, process.folder, own, zenoh.rows_address) if zenoh.row_streams else None
             if meeting is not None:
                 process.stack.callback(meeting.close)
             router = RouterLink(session, config.zenoh.connect)
@@ -237,6 +237,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     growth=GrowthWatch(plan),
                     notes=process.folder if process.is_child else None,
                     launch=process.launch,
+                    router=RouterLink(session, config.zenoh.connect),
                     memory=master.memory_for(RECORDER),
                     mirror_of=master.streams.mirror if master.streams is not None else lambda _link: None,
                 )

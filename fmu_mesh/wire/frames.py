@@ -24,7 +24,7 @@ from ..system.memory_map import RingPlace
 from ..system.plan import RECORDER, Link
 from ..variables.value_types import DTYPES, Value, VariableType, is_text
 from .messages import HEADER, MAX_MESSAGE_SIZE
-from .ways import Way
+from .views import Way
 
 __all__ = [
     "FrameReceiver",

@@ -19,6 +19,7 @@ from typing import Final, Protocol
 
 import msgspec
 
+from ..errors import ConfigurationError
 from ..rings import native
 from .runtime import rows_socket
 from .session import Wiring
@@ -27,8 +28,8 @@ __all__ = ["Door", "Meeting", "Returns", "meeting_of"]
 
 # Who meets here: two processes, over a socket, and the threads of each. `door` accepts, and gives each connection a
 # thread that has a second to hear who it is; at most `_STRANGERS` of them. A thread of Zenoh notes the doors of others
-# (`knows`); the thread that joins the mesh calls `settle`. All of them meet at one condition, which nobody holds while
-# it waits for the network. ADR 74.
+# (`knows`); the thread that joins the mesh calls `settle`, which starts a thread for each peer, as one that cannot be
+# reached takes a second. All of them meet at one condition, which nobody holds while it waits for the network. ADR 74.
 #
 # What may go wrong:
 # * Both dial at once: there would be two sockets. So the later name dials; the other one waits, and dials when nobody
@@ -106,7 +107,7 @@ class Meeting:
         self._key = secrets.token_bytes()
         self._connected = tuple(connected)
         self._doors: dict[str, Door | None] = {}
-        self._dialing: str | None = None
+        self._dialing: set[str] = set()
         self._changed = threading.Condition()
         self._strangers = threading.BoundedSemaphore(_STRANGERS)
         self._listening: list[socket.socket] = []
@@ -123,7 +124,7 @@ class Meeting:
             own.bind(str(place))
             address = f"unix:{place}"
         else:
-            own = socket.create_server((place, 0), family=socket.AF_INET6 if ":" in place else socket.AF_INET)
+            own = socket.create_server((place, 0), family=_family(place))
             address = f"tcp:{'*' if place in _ANY else place}:{own.getsockname()[1]}"
         own.listen(_STRANGERS)
         self._listening.append(own)
@@ -145,17 +146,28 @@ class Meeting:
         ``over`` is asked now and then; if it is true, this ends.
         """
         end = time.monotonic() + timeout_s
-        for peer in sorted(peers):
+        waiting, meeting = set(peers), []
+        while waiting:
             with self._changed:
-                while not self._changed.wait_for(lambda: peer in self._doors, _LOOK_S):  # noqa: B023 used here
-                    if over() or time.monotonic() > end:
-                        return
-                if self._doors[peer] is None:
-                    continue
-                patience = _PATIENCE_S / 2 if self.name < peer else 0.0
-                if self._changed.wait_for(lambda: peer in self.sockets, patience):  # noqa: B023 used here
-                    continue
-            self.dial(peer)
+                self._changed.wait_for(lambda: not waiting.isdisjoint(self._doors), _LOOK_S)  # noqa: B023 used here
+                known = waiting.intersection(self._doors)
+            if not known and (over() or time.monotonic() > end):
+                break
+            waiting -= known
+            for peer in known:
+                if self._doors[peer] is not None:
+                    meeting.append(threading.Thread(target=self._meet, args=(peer,), name=f"meet {peer}", daemon=True))
+                    meeting[-1].start()
+        for thread in meeting:
+            thread.join()
+
+    def _meet(self, peer: str) -> None:
+        """Let a peer whose name is later come first, then dial."""
+        with self._changed:
+            patience = _PATIENCE_S / 2 if self.name < peer else 0.0
+            if self._changed.wait_for(lambda: peer in self.sockets, patience):
+                return
+        self.dial(peer)
 
     def wait_for_returns(self, returns: Returns) -> None:
         """From now on, a peer that was met may come again."""
@@ -167,7 +179,7 @@ class Meeting:
             door = self._doors.get(peer)
             if (peer in self.sockets and not again) or door is None:
                 return peer in self.sockets
-            self._dialing = peer
+            self._dialing.add(peer)
         every = [
             address.replace("tcp:*:", f"tcp:{host}:", 1)
             for address in door.addresses
@@ -175,7 +187,7 @@ class Meeting:
         ]
         found = next(filter(None, (self._greet(peer, address, door) for address in every)), None)
         with self._changed:
-            self._dialing = None
+            self._dialing.discard(peer)
             if found is not None:
                 self._keep(peer, *found)
             elif not again and self._changed.wait_for(lambda: peer in self.sockets, _PATIENCE_S):  # it dials late
@@ -251,7 +263,7 @@ class Meeting:
                     return
                 if (door := self._doors[peer]) is None:
                     return
-                busy = self._dialing == peer and self.name > peer
+                busy = peer in self._dialing and self.name > peer
                 _say(made, _Greeting(self.name, door.secret, self._received(peer), busy))
                 if not busy:
                     kept = self._keep(peer, made, greeting.received)
@@ -315,14 +327,31 @@ def _heard(of: socket.socket) -> _Greeting:
     return msgspec.json.decode(read(size), type=_Greeting)
 
 
-def meeting_of(name: str, folder: Path, wiring: Wiring) -> Meeting | None:
-    """The meeting of a participant whose session has this wiring; None where there is no library for row streams."""
+def meeting_of(name: str, folder: Path, wiring: Wiring, address: str | None = None) -> Meeting | None:
+    """The meeting of a participant whose session has this wiring; None where there is no library for row streams.
+
+    Its door is at this ``address``, if one is given, besides its Unix socket.
+
+    Raises:
+        ConfigurationError: this host does not have the address.
+    """
     if native.library is None:
         return None
     connected = [host for endpoint in wiring.connect if (host := _host_of(endpoint)) is not None]
+    if address is not None:
+        try:
+            socket.create_server((address, 0), family=_family(address)).close()
+        except OSError as error:
+            text = f"cannot listen for row streams at '{address}': {error.strerror or error}"
+            raise ConfigurationError(text, hint="`zenoh.rows_address` is an address of this host.") from error
+        return Meeting(name, [rows_socket(folder, name), address], dict.fromkeys(connected))
     listening = [host for endpoint in wiring.listen if (host := _host_of(endpoint)) is not None]
     hosts = dict.fromkeys([*listening, *filter(None, map(_own_address, connected))])
     return Meeting(name, [rows_socket(folder, name), *hosts], dict.fromkeys(connected))
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def _host_of(endpoint: str) -> str | None:

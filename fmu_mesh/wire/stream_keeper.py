@@ -5,9 +5,11 @@ Says each other process twice a second that this one lives, so that a silent lin
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from ..awake import AwakeClock
 from ..errors import MeshLost
@@ -17,9 +19,9 @@ from .meeting import Meeting
 
 __all__ = ["StreamKeeper"]
 
-# Who meets here: two processes whose link was cut; and a thread, `keeper`, which says that this process lives and
-# dials, with the one that reads the streams. A new socket, its own or one that came to the door, is posted to that one,
-# because nobody else may change a stream. ADR 74.
+# Who meets here: two processes whose link was cut; and a thread, `keeper`, which says that this process lives, and one
+# for each silent peer, which dials, with the thread that reads the streams. A new socket, its own or one that came to
+# the door, is posted to that one, because nobody else may change a stream. ADR 74.
 #
 # What may go wrong:
 # * A link is cut for a moment. TCP would repeat what was lost after pauses that double: after a cut of 20 s only after
@@ -58,6 +60,7 @@ class StreamKeeper:
         self._cut_since: dict[str, float] = {}
         self._clock = AwakeClock()
         self._closing = threading.Event()
+        self._dialing: dict[str, threading.Thread] = {}
         meeting.wait_for_returns(self)
         self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
         self._thread.start()
@@ -90,6 +93,8 @@ class StreamKeeper:
         """End."""
         self._closing.set()
         self._thread.join()
+        for dialing in self._dialing.values():
+            dialing.join()
 
     def _run(self) -> None:
         beaten = 0.0
@@ -100,11 +105,19 @@ class StreamKeeper:
                 self._streams.beat()
                 self.round_trip_s = self._round_trip_s()
             for peer in self._peers:
-                if self._streams.silent_s(peer) > _SILENT_S:
-                    self._cut_since.setdefault(peer, now)
-                    self._meeting.dial(peer, again=True)
+                if (silent_s := self._streams.silent_s(peer)) > _SILENT_S:
+                    self._cut_since.setdefault(peer, now - (silent_s if silent_s < math.inf else 0.0))
+                    self._dial(peer)
                 else:
                     self._cut_since.pop(peer, None)
+
+    def _dial(self, peer: str) -> None:
+        """Dial, unless this is under way; in a thread, because a peer that cannot be reached takes a second."""
+        dialing = self._dialing.get(peer)
+        if dialing is None or not dialing.is_alive():
+            dial = partial(self._meeting.dial, peer, again=True)
+            self._dialing[peer] = threading.Thread(target=dial, name=f"dial {peer}", daemon=True)
+            self._dialing[peer].start()
 
     def _round_trip_s(self) -> float:
         return max(map(self._streams.round_trip_s, self._peers), default=0.0)

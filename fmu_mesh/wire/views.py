@@ -11,7 +11,6 @@ from ..simtime import ENDLESS
 from ..text import counted
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
-from .ways import Way
 
 __all__ = [
     "GOING_ON",
@@ -27,9 +26,13 @@ __all__ = [
     "RosView",
     "SetAnswer",
     "VariableView",
+    "Way",
 ]
 
 MeshState = Literal["starting", "initializing", "running", "paused", "stopping", "done", "failed"]
+
+Way = Literal["ring", "stream", "zenoh"]
+"""How rows go between two processes: by memory that both share, by a row stream, or in messages of Zenoh."""
 
 GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "running", "paused"))
 """The states of a mesh that has not ended."""

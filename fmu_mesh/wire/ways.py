@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
 
 import msgspec
 
 from ..system.memory_map import MASTER, RECORDER
+from .views import Way
 
-__all__ = ["Way", "Ways", "pair"]
-
-Way = Literal["ring", "stream", "zenoh"]
-"""By the memory that both share, by a row stream, or in messages of Zenoh."""
+__all__ = ["Ways", "pair"]
 
 
 def pair(one: str, other: str) -> tuple[str, str]:

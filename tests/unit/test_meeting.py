@@ -12,9 +12,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
 from fmu_mesh.wire import meeting as module
-from fmu_mesh.wire.meeting import Door, Meeting
+from fmu_mesh.wire.meeting import Door, Meeting, meeting_of
+from fmu_mesh.wire.session import Wiring
 from tests.helpers import wait_until
 
 pytestmark = pytest.mark.skipif(native.library is None, reason="there is no library of C")
@@ -105,6 +107,24 @@ def test_who_cannot_be_reached_is_given_up_soon(make: Make, tmp_path: Path) -> N
 
     assert one.sockets == {}
     assert time.monotonic() - started < LIMIT_S / 2  # a second and a little
+
+
+def test_all_peers_are_dialled_at_the_same_time(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    together, peers = threading.Barrier(20), [f"b{number}" for number in range(20)]
+    dialled: list[str] = []
+
+    def dial(_self: Meeting, peer: str) -> None:
+        together.wait(LIMIT_S)  # raises if the others are not dialled until this ends
+        dialled.append(peer)
+
+    monkeypatch.setattr(Meeting, "dial", dial)
+    last = make("c")
+    for peer in peers:
+        last.knows(peer, Door((), ""))
+
+    last.settle(peers, LIMIT_S)
+
+    assert sorted(dialled) == sorted(peers)
 
 
 def test_a_wait_for_who_never_comes_ends_when_the_run_is_over(make: Make) -> None:
@@ -212,6 +232,25 @@ def test_a_greeting_in_slow_pieces_does_not_stretch_the_second(make: Make, tmp_p
         assert module._PATIENCE_S / 2 < time.monotonic() - begun < LIMIT_S / 2
 
 
+def test_an_address_that_is_given_is_the_only_one_of_the_network(tmp_path: Path) -> None:
+    wiring = Wiring(listen=("tcp/0.0.0.0:7447",), connect=("tcp/localhost:7447",))
+    own = meeting_of("a", tmp_path, wiring, "127.0.0.2")
+    assert own is not None
+
+    local, port = own.door_for("b").addresses
+    own.close()
+
+    assert local.startswith(f"unix:{tmp_path}")
+    assert port.startswith("tcp:127.0.0.2:")
+
+
+def test_an_address_of_another_host_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"at '192\.0\.2\.1'") as refused:
+        meeting_of("a", tmp_path, Wiring(), "192.0.2.1")
+
+    assert "zenoh.rows_address" in str(refused.value.hint)
+
+
 def test_a_closed_door_leaves_no_socket(make: Make, tmp_path: Path) -> None:
     one = make("a")
     assert [*tmp_path.iterdir()] == [tmp_path / "a.rows"]
@@ -246,8 +285,8 @@ def test_who_comes_again_is_handed_on_with_what_he_has(make: Make) -> None:
     other.wait_for_returns(there)
 
     assert other.dial("a", again=True)
+    wait_until(lambda: here.came, "the other one to be handed on")  # the one that dials does not wait for this
 
-    wait_until(lambda: here.came, "who has come")  # the other one may know it first
     assert (here.came, there.came) == ([("b", {2: 7})], [("a", {1: 5})])
     assert_connected(one, other)
 
