@@ -35,6 +35,8 @@ from tests.network_hosts import NetworkHost, two_hosts
 __all__ = ["JOBS", "LINKS", "FarJob", "FarRuns", "main"]
 
 _MOST_S: Final = 120.0
+_NOT_MET: Final = "their rows go by Zenoh"
+"""The end of a warning: processes did not meet for a row stream in time."""
 _SUMMARY: Final = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
 
 
@@ -152,8 +154,9 @@ class FarRuns:
         seconds, rate = float(found[2]), int(found[3])  # rounded: the first one is finer where a run is slow
         measured.costs.append(seconds / measured.points if seconds > 1 else 1 / rate)
         equal = filecmp.cmp(reference, result, shallow=False)
+        by_zenoh = ", by Zenoh" if _NOT_MET in running[0].errors else ""
         if not measured.result.startswith("DIFFERS"):
-            measured.result = "all bytes equal" if equal else "DIFFERS"
+            measured.result = f"all bytes equal{by_zenoh}" if equal else "DIFFERS"
 
     def _send(self, measured: Measured, running: list[Launched]) -> None:
         """Send as many bytes as a chain of these points needs."""

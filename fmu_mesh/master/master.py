@@ -52,6 +52,7 @@ from ..errors import (
 from ..rings.host_memory import HostMemory, can_share
 from ..system.memory_map import STREAMS
 from ..system.plan import MASTER, RECORDER, Plan
+from ..system.round_trip import round_trip_cost
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
 from ..wire.meeting import Meeting
@@ -73,6 +74,9 @@ from .registrations import spoken
 __all__ = ["Master", "MasterSettings"]
 
 log = logging.getLogger(__name__)
+
+_FAR_S = 0.001
+"""From such a round trip on, it is said what lockstep costs."""
 
 _LAST_WORDS_S = 1.0
 """For how long a run that fails waits until its nodes have left: what they said before comes in this time."""
@@ -265,6 +269,9 @@ class Master:
             self.streams.start(ways)
             for both in self._states.registrations.unmet(ways):
                 log.warning("%s cannot reach each other: their rows go by Zenoh", spoken(*both))
+            plan, round_trip_s = self._states.plan, self.streams.round_trip_s
+            if plan.window == 1 and round_trip_s > _FAR_S:
+                log.warning("a round trip takes %.3g s: %s", round_trip_s, *round_trip_cost(plan, round_trip_s))
             if not ways.streams_of(MASTER):
                 self._meeting.close()  # nobody needs its door
 

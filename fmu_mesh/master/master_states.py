@@ -210,6 +210,8 @@ class MasterStates:
         if node in self.reports:
             return
         why = f"{spoken(node)} was lost: its process does not answer any more"
+        if node not in self.granting.seen:  # only Zenoh says so
+            why += ", or the link between it and the master is cut"
         why = why if loss is None else f"{loss}, and {spoken(node)} with it"
         point = max(self.granting.progress[node], 0)
         error = MeshLost(why, instance=self.granting.instances_of(node))

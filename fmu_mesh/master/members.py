@@ -7,6 +7,7 @@ All of it runs on the main thread: what arrives on threads of Zenoh is posted to
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 
@@ -31,7 +32,6 @@ __all__ = ["Followers", "Members"]
 
 log = logging.getLogger(__name__)
 
-_SILENT_S = 1.0
 _AGAIN_S = 0.25
 """How often in s the question about a token that went is asked again."""
 
@@ -118,8 +118,8 @@ class Members:
     def lost(self, router: RouterLink, link_s: float, silent_s: Callable[[str], float]) -> list[str]:
         """The nodes whose processes are gone.
 
-        On this host the process itself shows it, elsewhere its token, unless its row stream is not silent. Without a
-        router that was there nobody has a token: that is no verdict for ``link_s`` seconds.
+        On this host the process itself shows it, elsewhere its token, unless its row stream has not ended, but is only
+        silent. Without a router that was there nobody has a token: that is no verdict for ``link_s`` seconds.
         """
         found, now = [], time.monotonic()
         for node in [node for node, at in self._doubted.items() if at <= now]:
@@ -137,7 +137,7 @@ class Members:
         if node in self._shared:
             gone = not is_alive(self._nodes.admitted[node].pid)
             return gone or (router.is_lost and not router.may_come_back(link_s)) or None
-        if silent_s(node) <= _SILENT_S:
+        if silent_s(node) < math.inf:
             return None
         if tokens(self._session, self._keys.node(node)):
             return False

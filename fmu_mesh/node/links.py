@@ -67,6 +67,11 @@ class OutLink:
                 self._put(message)
             self.sent += len(numbers)
 
+    def send_again(self, end: int) -> None:
+        """Send all rows again that are still there; the target knows which it has."""
+        self.sent = max(0, min(self.sent, end - self._outputs.rows + 1))
+        self.flush(end)
+
     def send_last(self, end: int) -> None:
         """The run ends early: send the remaining rows up to own step ``end - 1``, and that no more will come."""
         self.flush(end)

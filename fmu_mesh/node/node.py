@@ -94,6 +94,9 @@ _LAST_WORD_S = 0.3
 _NO_MASTER_S = 1.0
 """How long in s the report of a failure waits for a master that was never seen."""
 
+_LOOK_S = 0.5
+"""How often in s it looks whether its router is there."""
+
 _LAZY_S = 0.05
 """How long in s rows that no step needs may wait for more rows while this node steps: each frame wakes a process."""
 
@@ -136,6 +139,8 @@ class Node:
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
         self._progress_sent = -1
+        self._router = router or RouterLink(session)
+        self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
         self._receivers: dict[int, FrameReceiver | Link] = {}
         self._memory = self._own_memory = HostMemory.private(plan.memory, plan.node)
@@ -144,7 +149,7 @@ class Node:
         self._inbox = Inbox(self._own_memory)
         silent_s = self._stream_silent_s
         self._membership = Membership(
-            plan, session, self._inbox, launch, router, meeting=meeting, stream_silent_s=silent_s
+            plan, session, self._inbox, launch, self._router, meeting=meeting, stream_silent_s=silent_s
         )
         self._meeting = meeting
         self._ways = Ways()
@@ -344,6 +349,8 @@ class Node:
                 stepped = True
                 self._end_early(engine, asked)
             self._check_streams()
+            if self._clock() > self._look_at:
+                self._look_at_router()
             if self._profiler is not None:
                 self._profiler.look(engine)
             with engine.sending:
@@ -377,6 +384,15 @@ class Node:
             runner.flush(lazy=lazy)
         return lazy
 
+    def _look_at_router(self) -> None:
+        """If it was lost and is back, send again what may be lost. What others have got already does not matter."""
+        self._look_at = self._clock() + _LOOK_S
+        if self._router.endpoints and self._router.is_back:
+            for runner in self._runners.values():
+                runner.send_again()
+            if self._progress_sent >= 0:
+                self._put_progress(HEADER.pack(PROGRESS, 0, 0, self._progress_sent))
+
     def _wait_for_message(self, left_s: float) -> None:
         if (message := self._inbox.wait(left_s)) is not None:
             self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
@@ -388,7 +404,8 @@ class Node:
         if link is None or link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to this node")
         if kind == FRAME and isinstance(receiver, FrameReceiver):
-            receiver.take(point, count, data)
+            if point <= receiver.received or not self._router.is_unsteady():  # else its source will send it again
+                receiver.take(point, count, data)
         elif kind == INITIAL:
             self._initialization.take(link, point, data)
         else:

@@ -124,6 +124,11 @@ class Runner:
             if lazy or not link.to_recorder or self.step >= self.last_step:
                 link.flush(end)
 
+    def send_again(self) -> None:
+        """Frames may be lost: send all rows again that are still there."""
+        for link in self.out_links:
+            link.send_again(self.step + 1)
+
     def send_last(self, end: int) -> None:
         """The run ends early: send the recorder the remaining rows before own step ``end``, and that no more come."""
         for link in self.out_links:

@@ -64,6 +64,7 @@ from ..wire.messages import (
     SetValue,
     decode_json,
 )
+from ..wire.session import RouterLink
 from ..wire.ways import Ways
 
 __all__ = ["RecordedSource", "Recorder"]
@@ -109,6 +110,7 @@ class Recorder:
         growth: GrowthWatch | None = None,
         notes: Path | None = None,
         launch: str | None = None,
+        router: RouterLink | None = None,
         memory: HostMemory | None = None,
         mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
     ) -> None:
@@ -130,7 +132,8 @@ class Recorder:
         self._cause: BaseException | None = None
         self._ended: set[str] = set()
         self._inbox = Inbox(self._memory)
-        self._membership = Membership(plan, session, self._inbox, launch, memory=memory)
+        self._router = router or RouterLink(session)
+        self._membership = Membership(plan, session, self._inbox, launch, self._router, memory=memory)
         self._put_progress: Callable[[bytes], None]
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
@@ -224,6 +227,7 @@ class Recorder:
                 if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
                     self._flushed = now
                     self._files.flush()
+                    self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:
                     continue
                 message = self._inbox.wait(_REST_S if self._complete() >= self._written else _LONGEST_SLEEP_S, wishes)
@@ -258,7 +262,8 @@ class Recorder:
         if source is None or source.link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to the recorder")
         if kind == FRAME and source.receiver is not None:
-            source.receiver.take(point, count, data)
+            if point <= source.receiver.received or not self._router.is_unsteady():  # else its source sends it again
+                source.receiver.take(point, count, data)
         elif kind == LAST:
             self._ended.add(source.link.source)
         elif kind != INITIAL:

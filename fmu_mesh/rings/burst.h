@@ -137,7 +137,7 @@ typedef struct { /* the rows of one link for the other process */
   Piece *pieces;
   int64_t n_pieces;
   int64_t row_bytes; /* of all pieces */
-  int64_t sent;      /* rows that are on their way */
+  _Atomic int64_t sent; /* rows that are on their way */
   int64_t lazy;      /* they may wait for a while: nobody steps with them */
   _Atomic int64_t last;
 } Outgoing;
@@ -157,7 +157,7 @@ typedef struct { /* the rows of one link from the other process */
 typedef struct { /* a counter of this process that the other one has, too */
   int64_t kind, number; /* of its frames: GRANT or PROGRESS, and of which process */
   Counter *counter;
-  int64_t sent;
+  _Atomic int64_t sent;
   int64_t stride; /* by how much it grows before it is sent; 0: it may wait with all that is lazy */
 } Told;
 

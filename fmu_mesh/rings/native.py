@@ -286,8 +286,15 @@ class Piece(Structure):
     """Bytes of a row that go over the wire, and whether they are Booleans."""
 
 
+class _Counted(_WithArrays):
+    @property
+    def known(self) -> int:
+        """How many rows are here."""
+        return int(library.counter_value(self.counter)) if library is not None else 0
+
+
 @_declared("Outgoing")
-class OutgoingTable(_WithArrays):
+class OutgoingTable(_Counted):
     """The rows of one link for another process."""
 
     last: int
@@ -295,7 +302,7 @@ class OutgoingTable(_WithArrays):
 
     def go_on(self, received: int) -> None:
         """While nobody sends: send all rows from here on, and once more that they are the last."""
-        self.sent = received
+        self.sent = received if 0 <= received <= self.known else 0
         if self.last == Last.SAID:
             self.last = Last.UNSAID
 
@@ -308,15 +315,10 @@ class OutgoingTable(_WithArrays):
 
 
 @_declared("Incoming")
-class IncomingTable(_WithArrays):
+class IncomingTable(_Counted):
     """The rows of one link from another process."""
 
     ended: int
-
-    @property
-    def known(self) -> int:
-        """How many of them are here."""
-        return int(library.counter_value(self.counter)) if library is not None else 0
 
     def take_end(self) -> bool:
         """Whether no more rows come, and nobody knows that yet."""

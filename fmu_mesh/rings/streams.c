@@ -19,7 +19,10 @@
  *   - Somebody sends other bytes: each length and number is compared before it is used, a row that is missing is a GAP,
  *     and anything else is REFUSED. A row that overwrites one that is still needed clears its stamp, and its reader
  *     sees that (burst.c, "Rows").
- *   - A row is overwritten before it was sent: its stamp says so, and `state` is LATE. The windows forbid it.
+ *   - A row is overwritten before it was sent: its stamp says so. The windows allow that only where its reader has it:
+ *     the connection before this one has healed after the reader had said how many rows it has. So the next frame
+ *     begins at the oldest row of the ring, and a reader that lacks one finds a GAP. If no row can have replaced it,
+ *     `state` is LATE.
  *   - The process ends while the other thread sends: who closes the stream shuts the socket down, and takes the flag.
  *
  * Waiting. `poll` does not wait for a futex. So a process with streams, before it polls, says so in its bell, and looks
@@ -61,22 +64,30 @@ static int64_t room(const Stream *stream) { return stream->send_size - stream->s
 
 /* Put rows of a ring into the buffer, as many as fit. Returns whether some are left. */
 static int put_rows(Stream *stream, Outgoing *out, int64_t ready) {
-  while (out->sent < ready) {
+  int64_t next = out->sent;
+  while (next < ready) {
     int64_t count = room(stream) / out->row_bytes;
     if (count <= 0) return 1;
-    if (count > ready - out->sent) count = ready - out->sent;
-    put_header(stream, FRAME, out->link, count, out->sent);
-    for (int64_t end = out->sent + count; out->sent < end; out->sent++) {
-      _Atomic int64_t *stamp = stamp_of(out->rows, out->stride, out->mask, out->sent);
+    if (count > ready - next) count = ready - next;
+    const int64_t begin = stream->send_to, end = next + count;
+    put_header(stream, FRAME, out->link, count, next);
+    for (; next < end; next++) {
+      _Atomic int64_t *stamp = stamp_of(out->rows, out->stride, out->mask, next);
       const char *row = (const char *)stamp;
       for (int64_t i = 0; i < out->n_pieces; i++) put(stream, row + out->pieces[i].place, out->pieces[i].size);
       atomic_thread_fence(memory_order_acquire);
-      if (atomic_load_explicit(stamp, memory_order_relaxed) != out->sent + 1) {
+      if (atomic_load_explicit(stamp, memory_order_relaxed) == next + 1) continue;
+      const int64_t oldest = value_of(out->counter) - out->mask - 1; /* may be overwritten just now */
+      if (oldest < next) { /* it is in the ring, and no writer leaves it like this */
         stream->about = out->link;
         atomic_store(&stream->state, LATE);
         return 0;
       }
+      stream->send_to = begin;
+      next = oldest > next ? oldest : next + 1;
+      break;
     }
+    atomic_store(&out->sent, next);
   }
   return 0;
 }
@@ -139,16 +150,26 @@ static int take_flag(Stream *stream) {
   return atomic_compare_exchange_strong(&stream->sending, &nobody, 1);
 }
 
+/* Take the flag, or ask the thread that has it to send once more what is new. */
+static int take_flag_or_ask(Stream *stream) {
+  for (;;) {
+    int64_t seen = 0;
+    if (atomic_compare_exchange_strong(&stream->sending, &seen, 1)) return 1;
+    if (seen == 2 || atomic_compare_exchange_strong(&stream->sending, &seen, 2)) return 0;
+  }
+}
+
 static void *send_rest(void *argument) {
   Stream *stream = argument;
+  int64_t own;
   do {
+    atomic_exchange(&stream->sending, 1); /* sees what was new when somebody asked */
     while (send_new(stream, 1)) {
       struct pollfd one = {(int)stream->fd, POLLOUT, 0};
       poll(&one, 1, 100);
     }
-    atomic_store(&stream->sending, 0);
-    /* What became new while the others found the flag taken. */
-  } while (atomic_load(&stream->state) == OPEN && has_new(stream) && take_flag(stream));
+    own = 1; /* without the flag, the stream may be freed: nothing may look at it any more */
+  } while (!atomic_compare_exchange_strong(&stream->sending, &own, 0));
   return NULL;
 }
 
@@ -171,7 +192,7 @@ static void write_stream(const Streams *streams, Stream *stream, int all) {
   if (atomic_load(&stream->state) != OPEN) return;
   if (!all && now() - stream->flushed_ns > streams->lazy_ns) all = 1;
   if (all) stream->flushed_ns = now(); /* also if the other thread sends it */
-  if (!take_flag(stream)) return;
+  if (!take_flag_or_ask(stream)) return;
   if (send_new(stream, all))
     send_on(stream);
   else
@@ -453,7 +474,7 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
 
 /* From any thread: tell the other process that this one lives, and all that is new. */
 PUBLIC void stream_beat(Stream *stream) {
-  if (atomic_load(&stream->state) != OPEN || !take_flag(stream)) return;
+  if (atomic_load(&stream->state) != OPEN || !take_flag_or_ask(stream)) return;
   if (room(stream) >= 0) put_header(stream, ALIVE, 0, 0, 0);
   if (send_new(stream, 1))
     send_on(stream);

@@ -237,6 +237,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     growth=GrowthWatch(plan),
                     notes=process.folder if process.is_child else None,
                     launch=process.launch,
+                    router=RouterLink(session, config.zenoh.connect),
                     memory=master.memory_for(RECORDER),
                     mirror_of=master.streams.mirror if master.streams is not None else lambda _link: None,
                 )

@@ -65,7 +65,6 @@ _SILENCE_S = 2.0
 """Longer than a live master is silent: it says something twice a second."""
 
 _GRACE_S = 1.0
-_HEARD_S = 1.0
 _AGAIN_S = 0.25
 """How often in s the question whether the master is there is asked again."""
 
@@ -233,11 +232,12 @@ class Membership:
     def master_is_gone(self) -> bool:
         """Whether the master is gone. This may send a query, so do not call it in a callback of Zenoh.
 
-        On this host its process tells. Elsewhere its token does, unless its row stream is not silent. Without a router
-        that was there, nobody has a token: that is no verdict for as long as a link may be silent.
+        On this host its process tells. Elsewhere its token does, unless its row stream has not ended, but is only
+        silent. Without a router that was there, nobody has a token: that is no verdict for as long as a link may be
+        silent.
         """
         self.doubts_master = True
-        if self.master_runs or self._keys is None or self._stream_silent_s() <= _HEARD_S:
+        if self.master_runs or self._keys is None or self._stream_silent_s() < math.inf:
             return False
         if (now := time.monotonic()) - self._asked_at < _AGAIN_S:
             return False

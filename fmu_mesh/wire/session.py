@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import queue
 import re
 import threading
@@ -288,20 +289,31 @@ class RouterLink:
 
         When it is back, the other processes need a moment to connect to it again.
         """
+        if self._lost_at is None and self.loss() is not None:
+            self._lost_at = self._clock()
+        return self.is_unsteady(limit_s)
+
+    def is_unsteady(self, limit_s: float = math.inf) -> bool:
+        """Whether the router is lost for less than ``limit_s`` seconds, or is back for a moment only.
+
+        Messages of this time may be lost. Call it again and again: it notices only what it sees.
+        """
         now = self._clock()
-        if self._lost_at is None:
-            if self.loss() is None:
-                return False
-            self._lost_at, self._back_at = now, None
-        if not self.look():
-            self._back_at = None
+        if self.is_lost:
+            self._lost_at, self._back_at = self._lost_at or now, None
             return now - self._lost_at < limit_s
-        if self._back_at is None:
-            self._back_at = now
+        if self._lost_at is None:
+            return False
+        self._back_at = self._back_at or now
         if now - self._back_at < _BACK_S:
             return True
         self._lost_at = None
         return False
+
+    @property
+    def is_back(self) -> bool:
+        """Whether it is back for a moment only: then what may be lost has to be sent again."""
+        return self.is_unsteady() and self._back_at is not None
 
     def loss(self) -> str | None:
         """A text that says that the router is lost; None if it is there, or if there was none.

@@ -121,7 +121,7 @@ def test_hosts_whose_doors_cannot_be_reached_are_told_and_use_zenoh(tmp_path: Pa
 
 
 @pytest.mark.parametrize("victim", ["pendulum", "delay"])
-def test_a_process_that_is_killed_is_named_by_the_others_within_two_seconds(tmp_path: Path, victim: str) -> None:
+def test_a_killed_process_is_named_by_the_others_within_two_seconds(tmp_path: Path, victim: str) -> None:
     with two_hosts(tmp_path) as hosts:
         config = Path("endless", "system.yaml")
         systems = [

@@ -301,6 +301,11 @@ NOT_RUN = [
     ),
     ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
     (
+        "docs/performance.md",
+        ".venv/bin/python -m benchmarks.far",
+        "it needs root, and takes minutes; tests/faults/test_far_link.py runs it over one network",
+    ),
+    (
         "docs/profiling.md",
         "$ pgrep -af '^fmu-mesh'",
         "it lists the processes of all meshes of this host; tests/faults/test_fork_server.py reads the titles",

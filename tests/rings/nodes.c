@@ -8,7 +8,8 @@
  *   MODE    quiet: threads, nothing else happens. disturbed: a master that grants little, attention, bells that nobody
  *           needs, needs that a killed sleeper has left. forged: threads, and somebody writes wrong counters. killed:
  *           processes that are stopped, or killed and started again, at random moments. streamed: threads of which each has a
- *           memory of its own, and streams to its neighbours with small buffers
+ *           memory of its own, and streams to its neighbours with small buffers. cut: the same, and somebody replaces their
+ *           connections at random moments, also by one that knows only what the reader had some time ago
  *
  * Runs of POINTS points follow each other for SECONDS. The rings are as small as the window allows. Each float is
  * compared with those of a plain loop. Prints `runs R late L wrong W us U best B`: lost wake-ups, runs with a wrong
@@ -184,15 +185,22 @@ static void leave_need(Participant *p) {
 }
 
 static uint64_t seed = 88172645463325252u;
-static enum { QUIET, DISTURBED, FORGING, KILLED, STREAMED } mode;
-static _Atomic int64_t is_over, n_forged;
+static enum { QUIET, DISTURBED, FORGING, KILLED, STREAMED, CUTTING } mode;
+static _Atomic int64_t is_over, n_forged, n_done;
 static int64_t master_late, n_pauses, n_overrun;
 static Participant participants[MAX_NODES];
+
+static void go_on(Participant *p);
 
 static void *run_node(void *argument) {
   Participant *p = argument;
   for (;;) {
     int64_t result = node_run(&p->node);
+    if (mode == CUTTING) go_on(p);
+    if (result == DONE && mode == CUTTING) {
+      for (n_done++; n_done < n_nodes; go_on(p)) streams_serve((Streams *)p->node.streams, 1000000);
+      return NULL;
+    }
     if (result == DONE || (mode == FORGING && atomic_load(&is_over))) return NULL;
     if (result == FORGED && mode == FORGING) { /* end the run */
       n_forged++;
@@ -274,10 +282,17 @@ typedef struct {
   Heard heard[PER_NODE];
   char buffers[2 * PER_NODE][MOST_BYTES];
   struct pollfd polled[PER_NODE + 1];
+  Wish wishes[PER_NODE];
   int bell[2];
+  struct {
+    _Atomic int fd; /* of a new connection, or -1 */
+    int64_t received;
+  } next[PER_NODE];
 } Ends;
 
 static Ends ends[MAX_NODES];
+static int64_t at_source[MAX_NODES], at_reader[MAX_NODES]; /* which stream of its nodes brings the rows for a node */
+static int64_t n_cuts;
 static Piece piece = {8, 8, 0};
 
 /* One end of a stream: of the node that writes the rows, or of the one that reads them. */
@@ -292,6 +307,8 @@ static void add_end(int64_t own, int64_t source, int64_t reader, int fd) {
   e->told[k] = (Told){PROGRESS, own, progress_of(own), -1, window / 4 > 0 ? window / 4 : 1};
   e->heard[k] = (Heard){PROGRESS, other, progress_of(other), points + 1};
   const int64_t size = 64 + (int64_t)(draw(&seed) % (MOST_BYTES - 64));
+  *(own == source ? &at_source[reader] : &at_reader[reader]) = k;
+  e->next[k].fd = -1;
   e->streams[k] = (Stream){.outgoing = &e->out[k], .incoming = &e->in[k], .told = &e->told[k], .heard = &e->heard[k],
                            .n_outgoing = own == source, .n_incoming = own != source, .n_told = 1, .n_heard = 1,
                            .to_send = e->buffers[2 * k], .received = e->buffers[2 * k + 1], .send_size = size,
@@ -302,7 +319,7 @@ static void add_end(int64_t own, int64_t source, int64_t reader, int fd) {
 static void connect_nodes(void) {
   for (int64_t i = 0; i < n_nodes; i++) {
     ends[i].all = (Streams){.place = participants[i].node.place, .streams = ends[i].streams, .polled = ends[i].polled,
-                            .lazy_ns = 5000000};
+                            .wishes = ends[i].wishes, .lazy_ns = 5000000};
     if (pipe(ends[i].bell) != 0) abort();
     fcntl(ends[i].bell[0], F_SETFL, O_NONBLOCK);
     fcntl(ends[i].bell[1], F_SETFL, O_NONBLOCK);
@@ -319,6 +336,47 @@ static void connect_nodes(void) {
   }
 }
 
+/* Take what has come for the streams of a node, as `row_streams.py` does on the thread that reads them. */
+static void go_on(Participant *p) {
+  Ends *e = &ends[p->own];
+  for (int64_t k = 0; k < e->all.n_streams; k++) {
+    Stream *stream = &e->streams[k];
+    const int fd = atomic_load(&e->next[k].fd);
+    if (atomic_load(&stream->state) > CUT) abort();
+    stream->is_known = 1;
+    if (fd < 0) continue;
+    stream_hold(stream);
+    close((int)stream->fd);
+    e->out[k].sent = e->next[k].received;
+    stream_open(stream, fd);
+    atomic_store(&e->next[k].fd, -1);
+  }
+}
+
+/* Replaces connections until all nodes are at the end. */
+static void *cut_streams(void *argument) {
+  uint64_t random = *(uint64_t *)argument;
+  while (atomic_load(&n_done) < n_nodes) {
+    const int64_t i = (int64_t)(draw(&random) % (uint64_t)n_nodes), source = source_of(i);
+    const int small = 4096;
+    struct timespec before = {0, (long)(draw(&random) % 1000000)}, after = {0, (long)(draw(&random) % 300000)};
+    int both[2];
+    nanosleep(&before, NULL);
+    if (source < 0 || atomic_load(&ends[source].next[at_source[i]].fd) >= 0) continue;
+    if (atomic_load(&ends[i].next[at_reader[i]].fd) >= 0) continue;
+    ends[source].next[at_source[i]].received = value_of(ends[i].in[at_reader[i]].counter);
+    if (socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK, 0, both) != 0) abort();
+    for (int j = 0; j < 2; j++) setsockopt(both[j], SOL_SOCKET, SO_SNDBUF, &small, sizeof small);
+    if (draw(&random) & 1) nanosleep(&after, NULL); /* what the reader has said is old by then */
+    atomic_store(&ends[source].next[at_source[i]].fd, both[0]);
+    atomic_store(&ends[i].next[at_reader[i]].fd, both[1]);
+    node_attend(&participants[source].node);
+    node_attend(&participants[i].node);
+    n_cuts++;
+  }
+  return NULL;
+}
+
 /* Nobody's row or counter is on its way any more. */
 static void disconnect_nodes(void) {
   for (int64_t i = 0; i < n_nodes; i++) {
@@ -326,14 +384,18 @@ static void disconnect_nodes(void) {
   }
   for (int64_t i = 0; i < n_nodes; i++) {
     for (int64_t k = 0; k < ends[i].all.n_streams; k++) close((int)ends[i].streams[k].fd);
+    for (int64_t k = 0; k < ends[i].all.n_streams; k++)
+      if (ends[i].next[k].fd >= 0) close(ends[i].next[k].fd);
     close(ends[i].bell[0]);
     close(ends[i].bell[1]);
   }
 }
 
 static int run_streamed(int64_t *late) {
-  pthread_t threads[MAX_NODES];
+  pthread_t threads[MAX_NODES], cutter;
+  uint64_t random = draw(&seed);
   int right = 1;
+  n_done = 0;
   for (int64_t i = 0; i < n_nodes; i++) {
     memory = memories[i];
     prepare(points);
@@ -341,10 +403,12 @@ static int run_streamed(int64_t *late) {
   }
   connect_nodes();
   for (int64_t i = 0; i < n_nodes; i++) pthread_create(&threads[i], NULL, run_node, &participants[i]);
+  if (mode == CUTTING) pthread_create(&cutter, NULL, cut_streams, &random);
   for (int64_t i = 0; i < n_nodes; i++) {
     pthread_join(threads[i], NULL);
     *late += participants[i].node.late;
   }
+  if (mode == CUTTING) pthread_join(cutter, NULL);
   disconnect_nodes();
   for (int64_t i = 0; i < n_nodes; i++) {
     memory = memories[i];
@@ -430,9 +494,9 @@ int main(int n, char **arguments) {
   is_jacobi = strcmp(arguments[1], "jacobi") == 0;
   n_nodes = atoll(arguments[2]), window = atoll(arguments[3]), points = atoll(arguments[4]);
   const int64_t seconds = atoll(arguments[5]), end = now() + seconds * 1000000000;
-  const char *modes[] = {"quiet", "disturbed", "forged", "killed", "streamed"};
-  while (mode <= STREAMED && strcmp(arguments[6], modes[mode]) != 0) mode++;
-  if (mode > STREAMED || n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
+  const char *modes[] = {"quiet", "disturbed", "forged", "killed", "streamed", "cut"};
+  while (mode <= CUTTING && strcmp(arguments[6], modes[mode]) != 0) mode++;
+  if (mode > CUTTING || n_nodes < 2 || n_nodes > MAX_NODES || window < 1) return 2;
   for (rows = 1; rows < window + 1; rows *= 2) continue;
   expected = malloc((size_t)((points + 1) * n_nodes) * 8);
   memory = mmap(NULL, memory_bytes(), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
@@ -444,7 +508,7 @@ int main(int n, char **arguments) {
   alarm((unsigned)seconds + 120);
   do {
     int64_t begin = now();
-    wrong += !(mode == KILLED ? run_processes(&kills) : mode == STREAMED ? run_streamed(&late) : run_threads(&late));
+    wrong += !(mode == KILLED ? run_processes(&kills) : mode >= STREAMED ? run_streamed(&late) : run_threads(&late));
     times[runs++] = (double)(now() - begin) / 1e3 / (double)points;
   } while (now() < end && runs < MAX_RUNS);
   qsort(times, (size_t)runs, 8, by_size);
@@ -452,6 +516,7 @@ int main(int n, char **arguments) {
          times[runs / 2], times[0]);
   if (mode == DISTURBED) printf(" overrun %lld pauses %lld", (long long)n_overrun, (long long)n_pauses);
   if (mode == KILLED) printf(" kills %lld", (long long)kills);
+  if (mode == CUTTING) printf(" cuts %lld", (long long)n_cuts);
   if (mode == FORGING) printf(" forged %lld", (long long)n_forged);
   printf("\n");
   return (late > 0 && mode != FORGING) || wrong > 0;

@@ -201,7 +201,42 @@ def test_after_each_cut_rows_go_on_where_the_reader_is(cuts: list[tuple[int, int
     target.streams.close(0.0)
 
 
-def test_after_a_cut_at_each_byte_rows_counters_and_the_end_are_there() -> None:
+def test_rows_that_came_by_the_old_connection_meanwhile_need_not_come_again() -> None:
+    """The reader says how many rows it has; until the writer hears that, the old connection may heal for a moment."""
+    source, target = ends(rows=16)
+    source.write(0, 5)
+    turn(source, target, until=lambda: target.counter.value == 5)
+    received = target.streams.received("source")
+    for first in range(5, 45, 10):
+        source.write(first, first + 10)
+        turn(source, target, until=lambda: target.counter.value == first + 10)  # noqa: B023  used here
+    here, there = socket.socketpair()
+
+    source.streams.resume("target", here, received)
+    target.streams.resume("source", there, {})
+    source.write(45, 55)
+
+    turn(source, target, until=lambda: target.counter.value == 55)
+    assert [*source.streams.states(), *target.streams.states()] == []
+    assert [target.values(row) for row in range(39, 55)] == [source.values(row) for row in range(39, 55)]
+    source.streams.close(0.0)
+    target.streams.close(0.0)
+
+
+@pytest.mark.parametrize("received", [-5, 6, 2**40])
+def test_a_wrong_number_of_rows_gets_those_in_the_ring(both: tuple[End, End], received: int) -> None:
+    source, target = both
+    source.write(0, 5)
+    here, there = socket.socketpair()
+
+    source.streams.resume("target", here, {LINK: received})
+    target.streams.resume("source", there, {})
+
+    turn(*both, until=lambda: target.counter.value == 5 or [*target.streams.states()] != [])
+    assert [*source.streams.states()] == []
+
+
+def test_a_cut_at_each_byte_loses_no_row_counter_or_end() -> None:
     """The bytes of some rows, a counter and the end of a link; the reader gets so many of them, and no more."""
     length, cut = 1, 0
     while cut < length:
