@@ -50,6 +50,7 @@ from ..errors import (
 )
 from ..system.plan import RECORDER, Plan
 from ..wire.messages import FINISH, GRANT, NodeReport
+from ..wire.runtime import OR_CUT
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
 from ..wire.ways import Ways
 from .granting import Granting
@@ -211,7 +212,7 @@ class MasterStates:
             return
         why = f"{spoken(node)} was lost: its process does not answer any more"
         if node not in self.granting.seen:  # only Zenoh says so
-            why += ", or the link between it and the master is cut"
+            why += OR_CUT
         why = why if loss is None else f"{loss}, and {spoken(node)} with it"
         point = max(self.granting.progress[node], 0)
         error = MeshLost(why, instance=self.granting.instances_of(node))

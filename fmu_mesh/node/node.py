@@ -331,7 +331,12 @@ class Node:
             if (error := why_not(peer, state, about, row, (*self._plan.links_in, *self._plan.links_out))) is not None:
                 raise error
         if self._keeper is not None:
-            self._keeper.check(self._plan.node, self._plan.timeouts.link)
+            try:
+                self._keeper.check(self._plan.node, self._plan.timeouts.link)
+            except MeshLost:
+                if MASTER in self._keeper.cut:
+                    self._membership.note_lost_link()
+                raise
 
     # --- from point to point
 

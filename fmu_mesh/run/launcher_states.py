@@ -33,7 +33,7 @@ from msgspec import Struct
 
 from ..config.deadlines import Deadlines
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
-from ..wire.runtime import STOPPED
+from ..wire.runtime import OR_CUT, STOPPED
 from ..wire.views import GOING_ON, MeshStatus
 from .child import how_it_ended
 from .events import Event, Status
@@ -330,7 +330,7 @@ class LaunchStates:
         """Add how the process of a lost node ended to a message of the master; only this process knows it."""
         for name, how in self._how.items():
             lost = f"node '{name}' was lost: its process "
-            message = message.replace(lost + _SILENT, lost + how)
+            message = message.replace(lost + _SILENT + OR_CUT, lost + _SILENT).replace(lost + _SILENT, lost + how)
         return message
 
     def _loss(self) -> FmuMeshError:

@@ -264,10 +264,14 @@ class Membership:
         if loss is not None:
             return MeshLost(f"{loss}, and the master with it")
         if silent_s > _SILENCE_S:
-            self.lost_link = True
+            self.note_lost_link()
             text = f"node '{self._plan.node}' lost its link to the master, which did not answer for {silent_s:.0f} s"
             return MeshLost(text, hint="Is its process stopped, its host suspended, or the network cut?")
         return MeshLost("the master is gone", hint="See the messages of its process.")
+
+    def note_lost_link(self) -> None:
+        """The link to the master is cut for too long: nobody can be told anything."""
+        self.lost_master = self.lost_link = True
 
     def check_silence(self, silent_s: float) -> None:
         """The master has said nothing for ``silent_s`` seconds.

@@ -28,6 +28,7 @@ from ..errors import ConfigurationError, MeshLost
 from ..files import remove_tree
 
 __all__ = [
+    "OR_CUT",
     "MeshNote",
     "enter_run_folder",
     "fmu_folder",
@@ -53,6 +54,7 @@ _ROWS = ".rows"
 _FOLDER_HINT = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
 _PF_EXITING = 0x4
 STOPPED = "is stopped (state T)"
+OR_CUT = ", or the link between it and the master is cut"
 """What a message says of such a process; see `is_stopped`."""
 
 _KILLED = 1 << (signal.SIGKILL - 1)

@@ -5,6 +5,7 @@ Says each other process twice a second that this one lives, so that a silent lin
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -104,8 +105,8 @@ class StreamKeeper:
                 self._streams.beat()
                 self.round_trip_s = self._round_trip_s()
             for peer in self._peers:
-                if self._streams.silent_s(peer) > _SILENT_S:
-                    self._cut_since.setdefault(peer, now)
+                if (silent_s := self._streams.silent_s(peer)) > _SILENT_S:
+                    self._cut_since.setdefault(peer, now - (silent_s if silent_s < math.inf else 0.0))
                     self._dial(peer)
                 else:
                     self._cut_since.pop(peer, None)
