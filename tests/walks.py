@@ -11,8 +11,8 @@ The way of a value to an FMU leads through the process that reads the file, and 
 was forked, until the FMU has it. What other processes, or these later, have of it is not on the way: the metadata of
 the result. The way of an error leads to the terminal, through all processes.
 
-Files and functions at the commit before version 0.3, and with it: a start value 39 and 100, now 30 and 88; a parameter
-of SSP 48 and 119, now 38 and 106; an error 24 and 53, now 27 and 57, because master and launcher decide in modules of
+Files and functions at the commit before version 0.3, and with it: a start value 39 and 100, now 30 and 90; a parameter
+of SSP 48 and 119, now 38 and 108; an error 24 and 53, now 27 and 57, because master and launcher decide in modules of
 their own.
 """
 

@@ -258,8 +258,6 @@ class Node:
         plan, membership = self._plan, self._membership
         keys = membership.keys(plan.timeouts.start)
         self._ways = ways = welcome.ways
-        if self._meeting is not None and not ways.streams_of(plan.node):
-            self._meeting.close()  # nobody needs its door
         for link in plan.links_out:
             runner = self._runners[link.source]
             put = membership.sender(keys.frames(link.source, link.target_node))
@@ -267,8 +265,10 @@ class Node:
             links = self._initialization.out_links if link.initial_only else runner.out_links
             links.append(OutLink(link, layout, runner.outputs, put))
         self._receivers, mirrors = connect(plan, self._runners, self._memory, self._own_memory, ways)
-        if self._meeting is not None:
+        if self._meeting is not None and ways.streams_of(plan.node):
             self._open_streams(self._meeting, mirrors)
+        elif self._meeting is not None:
+            self._meeting.close()  # nobody needs its door
         self._put_progress = membership.sender(keys.progress(plan.node))
         self._put_set = membership.sender(keys.settings(plan.node))
 
@@ -311,10 +311,10 @@ class Node:
     def _open_streams(self, meeting: Meeting, mirrors: Mapping[int, SourceRows]) -> None:
         """Use the sockets to those that were met; from now on each side notices if the other is silent."""
         plan, ways, memory = self._plan, self._ways, self._memory
-        streams = streams_of(plan, ways, meeting.sockets, self._runners, mirrors, memory, self._own_memory)
-        if streams is not None:
-            self._streams = streams
-            self._keeper = StreamKeeper(streams, meeting, ways.streams_of(plan.node), self._inbox.post)
+        self._streams = streams = streams_of(
+            plan, ways, meeting.sockets, self._runners, mirrors, memory, self._own_memory
+        )
+        self._keeper = StreamKeeper(streams, meeting, ways.streams_of(plan.node), self._inbox.post)
 
     def _stream_silent_s(self) -> float:
         return self._streams.silent_s(MASTER) if self._streams is not None else math.inf

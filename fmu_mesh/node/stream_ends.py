@@ -25,8 +25,8 @@ def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connec
     mirrors: Mapping[int, SourceRows],
     memory: HostMemory,
     own_memory: HostMemory,
-) -> RowStreams | None:
-    """The row streams of a node; None if it has none. The ``mirrors`` get the rows of each link."""
+) -> RowStreams:
+    """The row streams of a node, which has at least one. The ``mirrors`` get the rows of each link."""
     ends, number = [], memory.map.number_of
     for peer in ways.streams_of(plan.node):
         told, heard = [], []
@@ -47,7 +47,7 @@ def streams_of(  # noqa: PLR0913, PLR0917  what a node has, and how it is connec
         targets = (peer, RECORDER) if peer == MASTER else (peer,)
         outgoing = [*_outgoing_rows(plan, runners, targets)]
         ends.append(StreamEnd(peer, sockets[peer], outgoing, incoming, told, heard))
-    return RowStreams(memory, ends, plan.grid.last_point) if ends else None
+    return RowStreams(memory, ends, plan.grid.last_point)
 
 
 def _outgoing_rows(plan: NodePlan, runners: Mapping[str, Runner], targets: Iterable[str]) -> Iterator[RowsEnd]:
