@@ -230,6 +230,10 @@ class RowStreams:
         stream = self._tables[self._number[peer]]
         return {rows.link: rows.known for rows in stream.incoming[: stream.n_incoming]}
 
+    def is_local(self, peer: str) -> bool:
+        """From any thread: whether a peer is on this host, where no link is ever cut."""
+        return self._sockets[self._number[peer]].family == socket.AF_UNIX
+
     def silent_s(self, peer: str) -> float:
         """From any thread: for how long nothing has come from a peer, in s; infinite if there is no stream any more.
 

@@ -30,8 +30,8 @@ __all__ = ["StreamKeeper"]
 # * Both dial: the later name does it first, and who dials tells the other that it is busy (`Meeting`).
 # * The peer has ended. Then nobody answers at its door, and this goes on until this process ends, too: whether the
 #   other one is gone, its token says.
-# * It was ended by a stop (SIGSTOP) or a long step: its keeper still says that it lives, or its host is suspended, and
-#   nobody answers.
+# * A long step: its keeper still says that it lives. A stop (SIGSTOP) on this host is no cut: a Unix socket ends with
+#   its process, and is never mute. On another one it cannot be told from a cut, nor can a host that is suspended.
 
 _BEAT_S = 0.5
 _SILENT_S = 1.5
@@ -105,7 +105,8 @@ class StreamKeeper:
                 self._streams.beat()
                 self.round_trip_s = self._round_trip_s()
             for peer in self._peers:
-                if (silent_s := self._streams.silent_s(peer)) > _SILENT_S:
+                silent_s = self._streams.silent_s(peer)
+                if silent_s == math.inf or (silent_s > _SILENT_S and not self._streams.is_local(peer)):
                     self._cut_since.setdefault(peer, now - (silent_s if silent_s < math.inf else 0.0))
                     self._dial(peer)
                 else:

@@ -102,7 +102,7 @@ def relay(place: Place) -> Iterator[tuple[str, Relay]]:
     relay.close()
 
 
-@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "frames"])
+@pytest.mark.parametrize("way", [{}, BY_ZENOH], ids=["shared memory", "frames"])
 def test_a_link_that_is_cut_is_named_by_both_ends(
     place: Place, relay: tuple[str, Relay], way: Mapping[str, bool]
 ) -> None:

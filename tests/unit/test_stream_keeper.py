@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
@@ -39,7 +40,7 @@ class Dialled:
 
 def kept(meeting: Dialled, silent: set[str], peers: list[str]) -> StreamKeeper:
     streams = SimpleNamespace(
-        silent_s=lambda peer: 60.0 if peer in silent else 0.0, beat=lambda: None, round_trip_s=lambda _peer: 0.0
+        silent_s=lambda peer: math.inf if peer in silent else 0.0, beat=lambda: None, round_trip_s=lambda _peer: 0.0
     )
     return StreamKeeper(cast("RowStreams", streams), cast("Meeting", meeting), peers, lambda _action: None)
 
