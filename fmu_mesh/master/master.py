@@ -268,7 +268,7 @@ class Master:
         if self.streams is not None and self._meeting is not None:
             self.streams.start(ways)
             for both in self._states.registrations.unmet(ways):
-                log.warning("%s cannot reach each other: their rows go by Zenoh", spoken(*both))
+                log.warning("%s and %s cannot reach each other: their rows go by Zenoh", *map(spoken, both))
             plan, round_trip_s = self._states.plan, self.streams.round_trip_s
             if plan.window == 1 and round_trip_s > _FAR_S:
                 log.warning("a round trip takes %.3g s: %s", round_trip_s, *round_trip_cost(plan, round_trip_s))
