@@ -153,7 +153,7 @@ def test_what_nobody_records_does_not_narrow_the_recorder(tmp_path: Path) -> Non
     plan = mesh_of(tmp_path, 1_000_000, record=("sum.total",)).plan().plan
 
     rows = {place.instance: place.rows for node in plan.nodes.values() for place in node.rings}
-    assert rows == {"camera": 32, "filter": 32, "sum": 65536}
+    assert rows == {"camera": 32, "filter": 32, "sum": 524288}
 
 
 def test_check_and_launch_say_which_ring_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

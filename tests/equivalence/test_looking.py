@@ -219,7 +219,7 @@ def test_status_and_info_name_meshes_and_instances_in_every_form(call: Call) -> 
         info = json.loads(call("info", key, "--json")[1])
         assert (info["instance"], info["model_name"]) == ("gain", "Gain")
         ends = {"from": "pendulum.a", "to": "gain.u", "delay": 0, "factor": 1.0, "offset": 0.0}
-        assert info["connections"] == [{**ends, "map": [], "initial_only": False}]
+        assert info["connections"] == [{**ends, "map": [], "initial_only": False, "way": "ring"}]
     assert json.loads(call("info", "looked_at", "--json")[1])["instances"] == ["pendulum", "gain", "free"]
     assert call("status")[1].startswith("mesh   looked_at\nstate  running\npoint  ")
     assert "fed by       pendulum.a -> gain.u\n" in call("info", "gain")[1]

@@ -114,8 +114,8 @@ def test_hosts_whose_doors_cannot_be_reached_are_told_and_use_zenoh(tmp_path: Pa
         assert ended(by_hand) == [0, 0, 0], "".join(one.story() for one in by_hand)
         told = "cannot reach each other: their rows go by Zenoh"
         assert re.findall(rf"WARNING: (.*) {told}", by_hand[0].errors) == [
-            "the master, node 'delay'",
-            "node 'delay', node 'pendulum'",
+            "the master and node 'delay'",
+            "node 'delay' and node 'pendulum'",
         ], by_hand[0].story()
         assert (first.folder / RESULT).read_bytes() == expected
 
