@@ -297,15 +297,18 @@ class Node:
         return engine
 
     def _windows(self) -> Windows:
-        """Whose progress is known here, and how far each may be behind; the master keeps the windows of the others."""
+        """Whose progress is known here, and how far each may be behind; the master keeps the windows of the others.
+
+        This node is one of them: an instance of it may not be a window ahead of the others.
+        """
         ways, node, targets = self._ways, self._plan.node, self._plan.step_targets
         told = {name: counter for name, counter in self._own_memory.progress.items() if name in targets}
         known = {"ring": self._memory.progress, "stream": told}
-        ways_of = {name: ways.way(node, name) for name, _ in self._plan.windows if name != node}
+        ways_of = {name: ways.way(node, name) if name != node else "ring" for name, _ in self._plan.windows}
         return [
             (name, counters[name], window)
             for name, window in self._plan.windows
-            if name in (counters := known.get(ways_of.get(name, "zenoh"), {}))
+            if name in (counters := known.get(ways_of[name], {}))
         ]
 
     def _open_streams(self, meeting: Meeting, mirrors: Mapping[int, SourceRows]) -> None:

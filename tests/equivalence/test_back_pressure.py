@@ -49,3 +49,25 @@ def test_a_chain_of_eight_with_slow_end_runs_through_with_nothing_lost(
     write_config(place.folder, instances=members, connections=connections, stop_time=POINTS * 0.001, name="quick")
     PlainRun(prepare(place.folder / "quick.yaml", PlanOptions(output=local))).run()
     assert config.with_suffix(".csv").read_bytes() == local.read_bytes()
+
+
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "zenoh"])
+def test_a_fast_instance_waits_for_a_slow_one_of_its_node(way: Mapping[str, bool], place: Place, faulty: Path) -> None:
+    """Nothing is recorded, so the ring of the fast one has 32 rows; it would overwrite what was not read."""
+    members = {
+        "fast": {"fmu": "Integrator", "start_values": {"u": 1.0}, "group": "both"},
+        "slow": {"fmu": str(faulty), "start_values": {"slow": SLOW_S}, "group": "both"},
+    }
+    config = write_config(
+        place.folder,
+        instances=members,
+        connections=["fast.y -> slow.u"],
+        stop_time=2.0,
+        simulation={"window": 16},
+        zenoh=way,
+        record=[],  # type: ignore[arg-type]  # this section is a list
+    )
+
+    launched = place.run("launch", config, "--no-progress")
+
+    assert launched.wait() == 0, launched.story()
