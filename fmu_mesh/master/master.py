@@ -256,7 +256,8 @@ class Master:
         states = self._states
         if self._meeting is None or self.streams is None:
             return
-        states.registrations.meet(tuple(self._meeting.sockets))
+        if states.state == "starting":
+            states.registrations.meet(tuple(self._meeting.sockets))
         states.granting.measured(self.streams.round_trip_s)
         try:
             if self.streams.check():

@@ -7,7 +7,6 @@ All of it runs on the main thread: what arrives on threads of Zenoh is posted to
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable
 
@@ -24,7 +23,7 @@ from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import ABORT, HEADER, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.runtime import is_alive, is_stopped
-from ..wire.session import RouterLink, tokens, undeclare_all
+from ..wire.session import RouterLink, undeclare_all
 from ..wire.ways import Ways
 from .registrations import Registrations
 
@@ -118,8 +117,7 @@ class Members:
     def lost(self, router: RouterLink, link_s: float, silent_s: Callable[[str], float]) -> list[str]:
         """The nodes whose processes are gone.
 
-        On this host the process itself shows it, elsewhere its token, unless its row stream has not ended, but is only
-        silent. Without a router that was there nobody has a token: that is no verdict for ``link_s`` seconds.
+        On this host the process itself shows it, elsewhere what `RouterLink.has_gone` says.
         """
         found, now = [], time.monotonic()
         for node in [node for node, at in self._doubted.items() if at <= now]:
@@ -137,11 +135,7 @@ class Members:
         if node in self._shared:
             gone = not is_alive(self._nodes.admitted[node].pid)
             return gone or (router.is_lost and not router.may_come_back(link_s)) or None
-        if silent_s(node) < math.inf:
-            return None
-        if tokens(self._session, self._keys.node(node)):
-            return False
-        return None if router.may_come_back(link_s) else True
+        return router.has_gone(self._keys.node(node), silent_s(node), link_s)
 
     def stopped(self) -> list[str]:
         """The nodes on this host whose processes are stopped."""

@@ -19,7 +19,6 @@ _STEADY_S = 0.05
 _LATE = 4
 """After so many times of what a grant should take, fewer points are granted. TCP begins slowly, too."""
 _TICK_S = 1e-6
-_MOST_POINTS = 1 << 40
 
 
 class RunClock:
@@ -74,7 +73,7 @@ class Reach:
             speed = max(passing, self._fresh / stepping_s) if waited else passing
             wanted = speed * _STEADY_S + passing * on_way_s
             least = 1 if is_used else self._points // 2  # what is late may be on its way
-            self._points = max(1, least, math.ceil(min(wanted, _MOST_POINTS)))
+            self._points = max(1, least, math.ceil(wanted))
             self._slowest, self._since = slowest, now
             self._mark = max(self._granted + 1, slowest + self._points)  # nobody can be there before this round trip
             self._fresh = self._mark - self._granted

@@ -248,9 +248,9 @@ class RowStreams:
 
     def round_trip_s(self, peer: str) -> float:
         """From any thread: the shortest round trip to a peer that its socket has measured, in s; 0 on one host."""
-        own = self._sockets[self._number[peer]]
-        if own.family == socket.AF_UNIX:
+        if self.is_local(peer):
             return 0.0
+        own = self._sockets[self._number[peer]]
         with suppress(OSError, struct.error):
             (found,) = _ROUND_TRIP.unpack_from(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256), _ROUND_TRIP_AT)
             return float(found) / 1e6

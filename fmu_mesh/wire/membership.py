@@ -35,7 +35,7 @@ from .meeting import Door, Meeting
 from .messages import NodeReport, decode_json, sealed
 from .refusals import payload_of
 from .runtime import STOPPED, is_alive, is_stopped
-from .session import Question, RouterLink, ask, tokens
+from .session import Question, RouterLink, ask
 from .ways import Ways
 
 __all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
@@ -232,20 +232,17 @@ class Membership:
     def master_is_gone(self) -> bool:
         """Whether the master is gone. This may send a query, so do not call it in a callback of Zenoh.
 
-        On this host its process tells. Elsewhere its token does, unless its row stream has not ended, but is only
-        silent. Without a router that was there, nobody has a token: that is no verdict for as long as a link may be
-        silent.
+        On this host its process tells, elsewhere what `RouterLink.has_gone` says.
         """
         self.doubts_master = True
-        if self.master_runs or self._keys is None or self._stream_silent_s() < math.inf:
+        if self.master_runs or self._keys is None:
             return False
         if (now := time.monotonic()) - self._asked_at < _AGAIN_S:
             return False
         self._asked_at = now
-        if tokens(self._session, self._keys.master):
-            self.doubts_master = False
-            return False
-        return not self._router.may_come_back(self._plan.timeouts.link)
+        gone = self._router.has_gone(self._keys.master, self._stream_silent_s(), self._plan.timeouts.link)
+        self.doubts_master = gone is not False
+        return gone is True
 
     @property
     def master_runs(self) -> bool:

@@ -284,6 +284,18 @@ class RouterLink:
         """Whether the router was there, and is not there now."""
         return self._had_router and not self.look()
 
+    def has_gone(self, key: str, stream_silent_s: float, limit_s: float) -> bool | None:
+        """Whether the process with this token is gone; None: that is not known yet. It may send a query.
+
+        Its token says so, unless its row stream has not ended, but is only silent (``stream_silent_s`` is finite).
+        Without a router that was there nobody has a token: that is no verdict for ``limit_s`` seconds.
+        """
+        if stream_silent_s < math.inf:
+            return None
+        if tokens(self._session, key):
+            return False
+        return None if self.may_come_back(limit_s) else True
+
     def may_come_back(self, limit_s: float) -> bool:
         """Whether what is missing may be missing only because the router was lost less than ``limit_s`` seconds ago.
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from fmu_mesh.rings import native
 from fmu_mesh.rings.host_memory import Counter, HostMemory
@@ -133,13 +134,19 @@ def test_counters_go_both_ways_and_only_grow(both: tuple[End, End]) -> None:
     turn(*both, until=lambda: source.memory.progress["target"].value == 9)
 
 
-def test_rows_larger_than_the_kernel_takes_are_sent_while_nobody_looks() -> None:
-    source, target = ends(rows=8, wide=8_000_000)
-    values = np.frombuffer(os.urandom(8_000_000), np.uint8)
+def ends_with_large_rows(size: int) -> tuple[End, End, NDArray[np.uint8]]:
+    """Two ends; the source has four rows of so many bytes, all with these values."""
+    source, target = ends(rows=8, wide=size)
+    values = np.frombuffer(os.urandom(size), np.uint8)
     for row in range(4):
         source.ring.put(row, "wide", values)
         source.ring.stamp(row)
     source.counter.raise_to(4)
+    return source, target, values
+
+
+def test_rows_larger_than_the_kernel_takes_are_sent_while_nobody_looks() -> None:
+    source, target, values = ends_with_large_rows(8_000_000)
 
     source.streams.serve(0.0)
     turn(target, until=lambda: target.counter.value == 4)
@@ -314,12 +321,7 @@ def test_a_forged_byte_changes_nothing_that_came_before_it(place: int, value: in
 @pytest.mark.parametrize("reads", [0, 1, 2, 8, 20])
 def test_a_cut_while_a_thread_sends_large_rows_costs_no_byte(reads: int) -> None:
     """The kernel takes a tenth of a row at once, so each read ends within one."""
-    source, target = ends(rows=8, wide=2_000_000)
-    values = np.frombuffer(os.urandom(2_000_000), np.uint8)
-    for row in range(4):
-        source.ring.put(row, "wide", values)
-        source.ring.stamp(row)
-    source.counter.raise_to(4)
+    source, target, values = ends_with_large_rows(2_000_000)
     source.streams.serve(0.0)
     for _ in range(reads):
         target.streams.serve(0.0)
