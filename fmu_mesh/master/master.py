@@ -58,8 +58,9 @@ from ..wire.keys import Keys, RunKeys
 from ..wire.meeting import Meeting
 from ..wire.messages import FINISH, PROGRESS, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
+from ..wire.router_link import RouterLink
 from ..wire.runtime import this_host
-from ..wire.session import RouterLink, tokens
+from ..wire.session import tokens
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import Command, MeshInfo, MeshStatus

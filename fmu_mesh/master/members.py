@@ -22,8 +22,9 @@ from ..wire.meeting import Meeting
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import ABORT, HEADER, decode_json, encode_json
 from ..wire.refusals import payload_of
+from ..wire.router_link import RouterLink
 from ..wire.runtime import is_alive, is_stopped
-from ..wire.session import RouterLink, undeclare_all
+from ..wire.session import undeclare_all
 from ..wire.ways import Ways
 from .registrations import Registrations
 

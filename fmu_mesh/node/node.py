@@ -56,7 +56,7 @@ from ..wire.messages import (
     decode_json,
     encode_json,
 )
-from ..wire.session import RouterLink
+from ..wire.router_link import RouterLink
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.streamed_rows import why_not
 from ..wire.ways import Ways

@@ -64,7 +64,7 @@ from ..wire.messages import (
     SetValue,
     decode_json,
 )
-from ..wire.session import RouterLink
+from ..wire.router_link import RouterLink
 from ..wire.ways import Ways
 
 __all__ = ["RecordedSource", "Recorder"]

@@ -28,8 +28,9 @@ from ..results.record_files import open_results
 from ..system.plan import MASTER, RECORDER
 from ..wire.keys import Keys
 from ..wire.meeting import meeting_of
+from ..wire.router_link import RouterLink
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
-from ..wire.session import RouterLink, close_session, is_socket, open_session, own_endpoints
+from ..wire.session import close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, log_line
 from .one_process import is_other_python

@@ -34,8 +34,9 @@ from .keys import RUN_ID_BYTES, Keys, RunKeys
 from .meeting import Door, Meeting
 from .messages import NodeReport, decode_json, sealed
 from .refusals import payload_of
+from .router_link import RouterLink
 from .runtime import STOPPED, is_alive, is_stopped
-from .session import Question, RouterLink, ask
+from .session import Question, ask
 from .ways import Ways
 
 __all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
