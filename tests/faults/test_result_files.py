@@ -123,7 +123,8 @@ def test_a_full_disk_of_one_file_leaves_the_rows_of_the_other(
     records: Any = [
         {**section, "file": "/dev/full"} if index == broken else section for index, section in enumerate(TWO)
     ]
-    config = write_config(place.folder, stop_time=100.0, record=records)
+    # A small window: else the nodes may be at the stop time before the disk is full, and the other file is complete.
+    config = write_config(place.folder, stop_time=100.0, simulation={"window": 1024}, record=records)
 
     launched = place.run("launch", config, *options)
 
