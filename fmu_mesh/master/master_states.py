@@ -45,6 +45,7 @@ from ..errors import (
     MeshLost,
     NotFinite,
     ProtocolBroken,
+    RunReset,
     TerminationRequested,
     from_report,
 )
@@ -219,7 +220,7 @@ class MasterStates:
         self._end_of(node, error.at(point, self.plan.grid.time(point)))
 
     def command(self, command: Command, claimed: int) -> CommandAnswer:
-        """Handle pause, resume, step N and stop, which only change the grant.
+        """Handle pause, resume, step N and stop, which only change the grant, and reset, which ends the run.
 
         Only while it `takes_commands`. No node of this host passes ``claimed`` until the grant is raised again.
         """
@@ -235,10 +236,14 @@ class MasterStates:
                 self.state, self.hold = "paused", (point if before is None else before) + max(1, command.points)
             case "stop":
                 self._stop(point)
+            case "reset":
+                self.hold, slowest = before, granting.slowest
+                self.fail(RunReset("reset by a command", point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
             self._actions.append(FollowClock(granting.slowest))
         self._moved_at = self._slowest_moved_at = None
-        return CommandAnswer(command.command, self.state, granting.slowest, self.hold)
+        where = (granting.slowest, self.hold) if command.command != "reset" else (0, None if before is None else 0)
+        return CommandAnswer(command.command, self.state, *where)
 
     def fail(self, error: FmuMeshError) -> None:
         """The run has to end; the first reason counts."""

@@ -65,7 +65,7 @@ class MasterServer:
         self._status = status
         self._instances = frozenset(instances)
         self._status_published = 0.0
-        self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._entities: dict[str, zenoh.Queryable[None] | zenoh.Subscriber[None]] = {}
         self._log_lines = 0
         self._newest_lines: deque[msgspec.Raw] = deque()
         self._newest_bytes = 0
@@ -76,7 +76,7 @@ class MasterServer:
     def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
         """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason."""
         take = self._inbox.refusals.answering(answer, self._inbox.post)
-        self._entities.append(self._session.declare_queryable(key, take))
+        self._entities[key] = self._session.declare_queryable(key, take)
 
     def show(self, what: Literal["info", "status", "plan", "log"], view: Callable[[], object]) -> None:
         """From now on queries of a key of the mesh are answered with a view."""
@@ -91,19 +91,21 @@ class MasterServer:
     def watch(self, tokens: str, changed: Callable[[zenoh.Sample], None]) -> None:
         """From now on ``changed`` gets every change of these liveliness tokens."""
         post = self._inbox.post
-        self._entities.append(
-            self._session.liveliness().declare_subscriber(
-                tokens, lambda sample: post(lambda: changed(sample)), history=True
-            )
+        self._entities[tokens] = self._session.liveliness().declare_subscriber(
+            tokens, lambda sample: post(lambda: changed(sample)), history=True
         )
+
+    def forget(self, beginning: str) -> None:
+        """From now on nothing is served or watched whose key begins so."""
+        over = [key for key in self._entities if key.startswith(beginning)]
+        undeclare_all([self._entities.pop(key) for key in over])
 
     def hand_on_logs(self) -> None:
         """From now on the log messages of all instances go to `Events.log` and into one log, which is published."""
         self.show("log", lambda: [*self._newest_lines])
         post = self._inbox.post
-        self._entities.append(
-            self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
-        )
+        logs = f"{self._keys.root}/*/log"
+        self._entities[logs] = self._session.declare_subscriber(logs, lambda sample: post(lambda: self._log(sample)))
 
     def _log(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
@@ -138,4 +140,4 @@ class MasterServer:
 
     def close(self) -> None:
         """Undeclare everything."""
-        undeclare_all(self._entities, [self._status_publisher, self._log_publisher])
+        undeclare_all(self._entities.values(), [self._status_publisher, self._log_publisher])

@@ -40,7 +40,7 @@ from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
 from .child import Child, Process
-from .events import Event, OutputLine, Reachable, decode_event
+from .events import Event, OutputLine, Reachable, WasReset, decode_event
 from .fork_server import ForkServer, executed, fork_server
 from .launcher_states import (
     GATEWAY,
@@ -74,7 +74,7 @@ class Launcher:
 
     def __init__(self, run: RunPlan, on_event: Callable[[Event], None]) -> None:
         self.outcome: Outcome | None = None
-        self._run = replace(run, run=run_name())
+        self._run = self._first = replace(run, run=run_name())  # the newest, and the first one
         self._on_event = on_event
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._server: ForkServer | None = None
@@ -182,6 +182,8 @@ class Launcher:
             write_note(self._folder, MeshNote(self._run.mesh, prefix, event.endpoints, os.getpid(), file))
         elif isinstance(event, Outcome):
             self._files = event.files
+        elif isinstance(event, WasReset):
+            self._run = self._first.after_resets(event.number)
         self._states.reported(event, self._clock())
         self._on_event(event)
 

@@ -68,7 +68,11 @@ class Inbox:
         self.refusals = Refusals()
 
     def open(self, session: zenoh.Session, keys: RunKeys, name: str, senders: Mapping[str, str]) -> None:
-        """From now on the participant ``name`` receives messages; ``senders`` are the allowed ones by their keys."""
+        """From now on the participant ``name`` receives messages; ``senders`` are the allowed ones by their keys.
+
+        After `close`, it may be opened for another run: nothing of the one before arrives any more.
+        """
+        self._arrived = arrived = deque[tuple[str, bytes]]()
 
         def take(sample: zenoh.Sample) -> None:
             """On a thread of Zenoh."""
@@ -77,7 +81,7 @@ class Inbox:
             if sender is None:
                 self.refusals.add(key, "no participant of this run sends with this key")
                 return
-            self._arrived.append((sender, sample.payload.to_bytes()))
+            arrived.append((sender, sample.payload.to_bytes()))
             self._sleeper.ring_bell()
 
         self._subscriber = session.declare_subscriber(keys.inbox(name), take)

@@ -225,6 +225,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
         real_time_factor: simulated over wall-clock time since the first point.
         overruns: points by which the run fell behind the wall clock beyond `catch_up`.
         refused: messages that the master refused: malformed ones, and those of unknown senders.
+        resets: how often the mesh was reset.
         cut: the nodes whose row streams to the master are cut, and for how long in s. Who is cut from another node says
             so in the `activity` of its instances.
     """
@@ -241,6 +242,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     overruns: int = 0
     refused: int = 0
     cut: dict[str, float] = {}
+    resets: int = 0
 
 
 class RosView(msgspec.Struct, frozen=True):
@@ -261,10 +263,16 @@ class RosView(msgspec.Struct, frozen=True):
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A query to `…/mesh/command`; ``points`` is for `step` only."""
+    """A query to `…/mesh/command`.
 
-    command: Literal["pause", "resume", "step", "stop"]
+    Attributes:
+        points: for `step` only.
+        start_values: for `reset` only; by `instance.variable`, as in a configuration file.
+    """
+
+    command: Literal["pause", "resume", "step", "stop", "reset"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
+    start_values: dict[str, PlainValue] = {}
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
@@ -273,9 +281,11 @@ class CommandAnswer(msgspec.Struct, frozen=True):
     Attributes:
         point: the last point that every instance has reached.
         hold: the point at which all of them will pause; None if the mesh continues to run.
+        resets: how often the mesh was reset, once it has done what it was told.
     """
 
     command: str
     state: MeshState
     point: int
     hold: int | None = None
+    resets: int = 0

@@ -16,7 +16,7 @@ from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .readings import Target
 
-__all__ = ["go_on", "paused_at", "replay", "rest", "wait_for", "wait_for_start", "wait_until_at"]
+__all__ = ["begun_again", "go_on", "paused_at", "replay", "rest", "wait_for", "wait_for_start", "wait_until_at"]
 
 _START_S: Final = 120.0
 
@@ -62,6 +62,26 @@ def rest(client: MeshClient, command: Command) -> CommandAnswer:
             text = f"mesh '{mesh}' is at point {at}, on its way to point {answer.hold}, where it is going to rest."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
     raise _gone(mesh, what)
+
+
+def begun_again(client: MeshClient, command: Command) -> CommandAnswer:
+    """Reset a mesh; return when it is at its first point again, with its state then.
+
+    Raises:
+        ConfigurationError: it refused, and nothing has changed.
+        MeshLost: it ended meanwhile.
+        DeadlineExceeded: it has not begun in time.
+        FmuMeshError: it has failed meanwhile.
+    """
+    what = "begin again"
+    with client.statuses(_START_S) as statuses:
+        answer, last = client.command(command), None
+        for last in statuses:
+            if last.resets >= answer.resets and last.state not in ("starting", "initializing"):
+                if last.state == "failed":
+                    raise _ended(last, what)
+                return replace(answer, state=last.state, point=last.point)
+    raise _gone(client.keys.mesh, what) if last is None else _ended(last, what)
 
 
 def paused_at(client: MeshClient, command: Command) -> int:
