@@ -25,6 +25,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
 from ..wire.client.waiting import begun_again, replay, rest, wait_for, wait_for_start
 from ..wire.views import (
+    GOING_ON,
     Command,
     CommandAnswer,
     InstanceInfo,
@@ -566,6 +567,8 @@ def _follow(client: MeshClient, future: Future[Result]) -> None:
         file, last = client.info().result_file, None
         with client.statuses(_FOREVER_S) as statuses:
             for status in statuses:
+                if last is not None and status.resets != last.resets and status.state in GOING_ON:
+                    file = client.info().result_file
                 last = status
         if last is not None and last.error is not None:
             future.set_exception(from_report(last.error))

@@ -74,11 +74,11 @@ from ..wire.ways import Ways
 from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
 from .master_streams import MasterStreams
 from .members import Followers, Members
-from .mesh_server import STATUS_S, Events, MasterServer
+from .mesh_server import STATUS_S, Events, MasterServer, MasterSettings
 from .pacing import GrantWatch, Pacer, RunClock
 from .registrations import spoken
 
-__all__ = ["Master", "MasterSettings"]
+__all__ = ["Master"]
 
 log = logging.getLogger(__name__)
 
@@ -87,24 +87,6 @@ _FAR_S = 0.001
 
 _LAST_WORDS_S = 1.0
 """For how long a run that fails waits until its nodes have left: what they said before comes in this time."""
-
-
-class MasterSettings(msgspec.Struct, frozen=True):
-    """How a master runs its mesh, besides the plan.
-
-    Attributes:
-        endpoints: where tools can reach this process, for `mesh/info`.
-        config_file: name of the configuration file, for `mesh/info`.
-        launch: the launcher that started this process; None if it was started manually.
-        profile: whether nodes measure their time, and the master what limits the grant.
-        paused: whether the run begins paused at its first point.
-    """
-
-    endpoints: tuple[str, ...] = ()
-    config_file: str = ""
-    launch: str | None = None
-    profile: bool = False
-    paused: bool = False
 
 
 Replan = Callable[[Mapping[str, PlainValue], int], Plan]
@@ -143,9 +125,11 @@ class Master:
         self._states = MasterStates(plan, paused=settings.paused)
         self._memory = self._made_memory()
         self._inbox = Inbox(self._memory)
+        self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
         self._token: zenoh.LivelinessToken | None = None
         self._prepare(meeting)
+        self._first_keys = self._run_keys
 
     def _made_memory(self) -> HostMemory:
         memory_of = HostMemory.create if self._shares else HostMemory.private
@@ -163,7 +147,6 @@ class Master:
         if meeting is not None:
             self.streams = MasterStreams(plan, self._memory.participant(STREAMS), meeting, self._fail_later)
         self._inbox.open(session, keys, MASTER, {keys.progress(node): node for node in plan.nodes})
-        self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
         offer = self._memory.offer if self._shares else None
         self._members = Members(self._states.registrations, session, keys, offer, settings.launch, meeting)
         self._run_token = session.liveliness().declare_token(keys.master)
@@ -191,6 +174,7 @@ class Master:
             )
         server = self._server
         self._serve_nodes()
+        server.watch(self._first_keys.follower("*"), self._followers.changed)
         server.serve(self._keys.register, lambda query: self._members.register(query))  # noqa: PLW0108  of the newest run
         server.show("info", self._info)
         server.show("status", self.last_status)
@@ -200,12 +184,12 @@ class Master:
         self._token = self._session.liveliness().declare_token(self._keys.master)
 
     def _serve_nodes(self) -> None:
-        """Serve the keys of this run."""
+        """Serve the keys of this run, and no longer those of the one before."""
         server, keys = self._server, self._run_keys
-        server.serve(keys.ready("*"), self._members.ready)
-        server.serve(keys.report("*"), self._take_report)
-        server.watch(keys.node("*"), self._members.token_changed)
-        server.watch(keys.follower("*"), self._followers.changed)
+        server.forget_run()
+        server.serve(keys.ready("*"), self._members.ready, of_run=True)
+        server.serve(keys.report("*"), self._take_report, of_run=True)
+        server.watch(keys.node("*"), self._members.token_changed, of_run=True)
 
     def run(self) -> None:
         """Run the mesh to its last point.
@@ -240,7 +224,6 @@ class Master:
             plan: the last one that ``replan`` has returned.
             meeting: a new one.
         """
-        self._server.forget(self._run_keys.base)
         self._run_token.undeclare()
         self._close_run()
         self._resets += 1
@@ -453,7 +436,7 @@ class Master:
         return MeshInfo(
             mesh=config.mesh,
             version=__version__,
-            run=self._run_keys.run,
+            run=self._first_keys.run,
             config=self._settings.config_file,
             start_time=grid.start_time,
             stop_time=grid.stop_time,

@@ -21,7 +21,8 @@ from ..errors import ConfigurationError, FmuError, FmuMeshError, RunReset, StepF
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
-from ..master.master import Master, MasterSettings
+from ..master.master import Master
+from ..master.mesh_server import MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..results.growth import GrowthWatch

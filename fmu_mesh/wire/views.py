@@ -181,7 +181,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/info`.
 
     Attributes:
-        run: the id of the run, which all its internal keys contain.
+        run: the id of the run, which its internal keys contain; after a reset, of the first run.
         result_file: the first result file; None if nothing is recorded.
         shared_memory: the processes that exchange values, grants and progress through the memory of the master's host.
             Empty until all nodes are ready.
