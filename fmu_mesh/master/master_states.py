@@ -238,7 +238,8 @@ class MasterStates:
                 self._stop(point)
             case "reset":
                 self.hold, slowest = before, granting.slowest
-                self.fail(RunReset("reset by a command", point=slowest, time=self.plan.grid.time(slowest)))
+                text = f"reset by a command at point {slowest}"
+                self.fail(RunReset(text, point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
             self._actions.append(FollowClock(granting.slowest))
         self._moved_at = self._slowest_moved_at = None

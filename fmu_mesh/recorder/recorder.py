@@ -162,7 +162,7 @@ class Recorder:
             try:
                 self._write_rows()
                 if isinstance(error, RunReset):
-                    self._files.note({"reset": {"point": error.point, "time": error.time}})
+                    self._files.note({"ended_by": error.message})
             finally:
                 self._files.close()
         except ConfigurationError:

@@ -55,7 +55,7 @@ from .launcher_states import (
     Start,
 )
 from .one_process import is_other_python
-from .outcome import Outcome, outcome_at
+from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
 
 __all__ = ["Launcher"]
@@ -219,10 +219,9 @@ class Launcher:
             assert outcome is not None
             self.outcome = replace(outcome, warnings=tuple(map(self._states.with_how, outcome.warnings)))
             return self.outcome
-        counted = zip(plan.system.records, files, strict=False)
-        last = max((record.point_of(rows - 1) for record, (_, rows) in counted if rows), default=0)
+        last = last_recorded(plan, files)
         if type(error) in (Interrupted, MeshLost) and last > (error.point or 0):
-            error.at(last, plan.grid.time(last))  # the last progress is older than the last row
+            error.at(last, plan.grid.time(last))
         seconds, warnings = (outcome.seconds, outcome.warnings) if outcome is not None else (0.0, ())
         self.outcome = outcome_at(plan, error.point or 0, files, error, seconds=seconds, warnings=warnings)
         raise error.with_hint(what_is_kept(files))

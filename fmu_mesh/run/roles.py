@@ -39,7 +39,7 @@ from ..wire.session import Wiring, close_session, is_socket, open_session, own_e
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
 from .one_process import is_other_python
-from .outcome import Outcome, outcome_at
+from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
 from .wiring import patient, wiring
@@ -356,12 +356,14 @@ def _outcome_of(
     run: RunPlan, master: Master, recorder: Recorder | None, error: FmuMeshError | None, signal: str | None
 ) -> Outcome:
     files, warnings = (recorder.files, recorder.warnings) if recorder is not None else ((), ())
-    ended_by = master.ended_by if error is None else error if isinstance(error, RunReset) else None
+    point, ended_by = master.last_status().point, master.ended_by if error is None else None
+    if isinstance(error, RunReset):
+        point, error, ended_by = max(point, last_recorded(run.plan, files)), None, error
     outcome = outcome_at(
         run.plan,
-        master.last_status().point,
+        point,
         files,
-        error if ended_by is None else None,
+        error,
         ended_by,
         seconds=master.seconds,
         warnings=(*warnings, *master.warnings),

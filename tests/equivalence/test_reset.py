@@ -40,7 +40,7 @@ def test_every_system_gives_its_floats_again(tmp_path: Path, name: str, way: Map
     [ended] = run.results
     assert ended.outcome is not None
     assert (ended.outcome.point, ended.outcome.rows) == (before, len(ended.times))
-    assert ended.metadata["reset"]["point"] == before
+    assert ended.metadata["ended_by"] == f"reset by a command at point {before}"
     assert last.outcome is not None
     assert last.outcome.rows == len(last.times)
 
