@@ -13,7 +13,6 @@ from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import zenoh
 from msgspec.structs import replace
 from setproctitle import setproctitle
 
@@ -236,8 +235,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
-            session = open_session(own)
-            process.stack.callback(close_session, session)
+            runs = _MasterRuns(run, process, own)
+            session = runs.session
             ends = own_endpoints(session, own) if zenoh.mode == "peer" else ()
             ends = ends or tuple(config.zenoh.connect)  # a client is reached through its router
             settings = MasterSettings(
@@ -247,7 +246,6 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 profile=run.profile,
                 paused=run.paused,
             )
-            runs = _MasterRuns(run, process, own)
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())
             process.stack.callback(master.close)
@@ -264,7 +262,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             recorder = failure = None
             try:
                 if RECORDER in run.plan.nodes:
-                    recorder = runs.recorder(master, session)
+                    recorder = runs.recorder(master)
                 with recorder or nullcontext():
                     master.run()
             except FmuMeshError as error:
@@ -286,11 +284,14 @@ class _MasterRuns:
     """The runs of a master, which follow each other where the mesh is reset.
 
     Attributes:
+        session: of this process.
         run: the plan of the newest.
         resets: how often the mesh was reset.
     """
 
     def __init__(self, run: RunPlan, process: RunProcess, wiring: Wiring) -> None:
+        self.session = open_session(wiring)
+        process.stack.callback(close_session, self.session)
         self.run = self._first = run
         self.resets = 0
         self._process = process
@@ -323,7 +324,7 @@ class _MasterRuns:
         self._meeting = meeting_of(MASTER, *at) if zenoh.row_streams else None
         return self._meeting
 
-    def recorder(self, master: Master, session: zenoh.Session) -> Recorder:
+    def recorder(self, master: Master) -> Recorder:
         """The recorder of the newest run.
 
         Raises:
@@ -333,13 +334,13 @@ class _MasterRuns:
         files, self._files = self._files or _opened_results(self.run), None
         recorder = Recorder(
             plan.nodes[RECORDER],
-            session,
+            self.session,
             files,
             lambda: master.has_begun,
             growth=GrowthWatch(plan),
             notes=process.folder if process.is_child else None,
             launch=process.launch,
-            router=RouterLink(session, self.run.loaded.config.zenoh.connect),
+            router=RouterLink(self.session, self.run.loaded.config.zenoh.connect),
             memory=master.memory_for(RECORDER),
             mirror_of=streams.mirror if streams is not None else lambda _link: None,
         )

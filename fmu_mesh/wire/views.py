@@ -262,7 +262,7 @@ class RosView(msgspec.Struct, frozen=True):
     other_clocks: tuple[str, ...] = ()
 
 
-class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A query to `…/mesh/command`.
 
     Attributes:
