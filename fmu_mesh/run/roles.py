@@ -299,7 +299,13 @@ class _MasterRuns:
         self._files: Sequence[ResultFile] | None = None
         self._meeting: Meeting | None = None
         self._known: KnownModels | None = None
-        process.stack.callback(lambda: self._meeting.close() if self._meeting is not None else None)
+        process.stack.callback(self._close)
+
+    def _close(self) -> None:
+        if self._meeting is not None:
+            self._meeting.close()
+        for file in self._files or ():  # a reset that came too late
+            file.close()
 
     def replanned(self, start_values: Mapping[str, PlainValue], resets: int) -> Plan:
         """Plan the next run, and open its files: what is wrong is found before the mesh is reset.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from tests.all_systems import FEATURES, SYSTEMS, written_system
 from tests.equivalence.test_every_way import in_one_process
 from tests.fmus.helpers import find_fmu
 from tests.helpers import BY_STREAMS, BY_ZENOH, DEADLINE_S, Place, row_count, wait_until, write_config
+from tests.unit.test_repeated import allowing_one, counting_fmu
 
 WAYS = [pytest.param(way, name, id=f"{name}-streams") for name in FEATURES for way in [BY_STREAMS]]
 WAYS += [pytest.param(way, name, id=f"{name}-zenoh") for name in FEATURES for way in [BY_ZENOH]]
@@ -157,6 +159,62 @@ def test_an_instance_that_cannot_begin_again_ends_the_run_with_its_name(tmp_path
         with pytest.raises(FmuError, match="bad"):
             run.wait(DEADLINE_S)
     assert row_count(tmp_path / "rows.csv") == 6
+
+
+MODULE = """
+import fmu_mesh
+
+STEPS = []
+
+class Counter(fmu_mesh.Component):
+    starts = []
+    lag = fmu_mesh.Parameter(0.0)
+    y = fmu_mesh.Output()
+
+    def initialize(self):
+        threading.Event().wait(self.lag)
+        self.starts.append(self)
+        self.y = 1000.0 * len(self.starts)
+
+    def step(self, time, step_size):
+        STEPS.append(time)
+        self.y = 1000.0 * len(self.starts) + len(STEPS)
+"""
+
+
+@pytest.mark.parametrize("description", [str, allowing_one], ids=["many", "one a process"])
+def test_what_code_keeps_outside_of_its_instance_begins_again(
+    tmp_path: Path, description: Callable[[str], str]
+) -> None:
+    (tmp_path / "counter.py").write_text(f"import threading{MODULE}")
+    mesh = fmu_mesh.Mesh("counted", step_size=0.1, stop_time=100.0)
+    mesh.add("component", python=f"{tmp_path / 'counter.py'}:Counter")
+    mesh.add("fmu", fmu=counting_fmu(tmp_path, description))
+    with mesh.start(record=(), paused=True) as run:
+        for _ in range(3):
+            assert (run.get("component.y"), run.get("fmu.y")) == (1000.0, 1001.0)
+            run.step(5)
+            assert (run.get("component.y"), run.get("fmu.y")) == (1005.0, 1001.0)
+            run.reset()
+        run.stop()
+
+
+def test_a_node_that_is_lost_during_a_reset_ends_the_run(tmp_path: Path) -> None:
+    (tmp_path / "counter.py").write_text(f"import threading{MODULE}")
+    instances = {"counter": {"python": "counter.py:Counter"}, "gain": {"fmu": "Gain"}}
+    config = write_config(tmp_path, instances=instances, connections=(), stop_time=1000.0)
+    with fmu_mesh.load(config).start(paused=True) as run, ThreadPoolExecutor() as others:
+        run.step(5)
+        gain = psutil.Process(run.instance_info("gain").pid)
+        reset = others.submit(run.reset, start_values={"counter.lag": 60.0})
+        wait_until(lambda: run.status.resets == 1 and run.status.state == "initializing", "the next run")
+        gain.kill()
+
+        with pytest.raises(MeshLost, match="gain"):
+            reset.result(DEADLINE_S)
+        with pytest.raises(MeshLost, match="'gain' was lost: its process was ended by SIGKILL"):
+            run.wait(DEADLINE_S)
+    assert row_count(config.with_suffix(".csv")) == 6
 
 
 def test_many_resets_take_no_more_memory_and_no_more_threads(tmp_path: Path) -> None:
