@@ -65,6 +65,21 @@ class KnownModels:
         self._keeps_code = keeps_code
         self._models: dict[tuple[str, str, bytes], tuple[str, object]] = {}
 
+    @classmethod
+    def of(cls, run: RunPlan) -> KnownModels:
+        """Those of a run: none of its models is read again as long as its files stay as they are.
+
+        But those whose instances may have other sizes than their model are.
+        """
+        known, config = cls(keeps_code=True), run.loaded.config
+        for name, own in run.plan.system.instances.items():
+            if not own.description.with_causality("structuralParameter"):
+                section = placed(config.instances[name])
+                path = run.loaded.resolve(section.path) if section.path else Path()
+                model = "description", os.path.realpath(path), msgspec.json.encode((section, config.limits))
+                known._models[model] = run.contents[name], own.description
+        return known
+
     def describe(
         self,
         path: Path,
@@ -170,16 +185,14 @@ def planned(
     return run
 
 
-def planned_reset(
-    run: RunPlan, start_values: Mapping[str, PlainValue], resets: int, known: KnownModels | None = None
-) -> RunPlan:
+def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: int, known: KnownModels) -> RunPlan:
     """The plan of a run from its first point again, by the same processes, after so many resets.
 
     Args:
         run: the first run.
         start_values: the start values that differ from those of the first run, by `instance.variable`.
         resets: number of resets, this one included.
-        known: see `planned`.
+        known: its models.
 
     Raises:
         ConfigurationError: a start value is wrong, or more would change than values; carries all findings.

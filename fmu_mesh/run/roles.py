@@ -315,7 +315,7 @@ class _MasterRuns:
         """
         from .preparing import KnownModels, planned_reset  # noqa: PLC0415  most runs are never reset
 
-        self._known = self._known or KnownModels()
+        self._known = self._known or KnownModels.of(self._first)
         run = planned_reset(self._first, start_values, resets, self._known)
         self._files = _opened_results(run)
         self.run, self.resets = run, resets
