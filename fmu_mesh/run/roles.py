@@ -5,6 +5,7 @@ The same functions serve the processes that `launch` starts and those that a per
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import shlex
@@ -146,6 +147,7 @@ class _NodeProcess:
                 launch=process.launch,
                 meeting=self._meeting,
             )
+            gc.collect()  # the memory of the run before a reset is in circles of objects
             if process.interruption.reason is not None:
                 self._interrupt(process.interruption.reason)
             try:
@@ -260,6 +262,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         process.interruption.goes_to(master.interrupt)
         while True:
             recorder = failure = None
+            gc.collect()  # the memory of the run before a reset is in circles of objects
             try:
                 if RECORDER in run.plan.nodes:
                     recorder = runs.recorder(master)
