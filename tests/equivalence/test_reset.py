@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 import fmu_mesh
-from fmu_mesh.errors import ConfigurationError, FmuError, MeshLost
+from fmu_mesh.errors import ConfigurationError, FmuError, FmuMeshError, MeshLost
 from tests.all_systems import FEATURES, SYSTEMS, written_system
 from tests.equivalence.test_every_way import in_one_process
 from tests.fmus.helpers import find_fmu
@@ -133,6 +133,8 @@ def test_a_reset_that_cannot_be_done_changes_nothing(tmp_path: Path) -> None:
         assert len(run.wait(DEADLINE_S).times) == 101
         with pytest.raises(MeshLost, match="has ended"):
             run.reset()
+    with fmu_mesh.load(config).start(processes=False) as local, pytest.raises(FmuMeshError):
+        local.reset()
     assert [path.name for path in sorted(tmp_path.glob("*.csv"))] == ["pair.csv"]
 
 
@@ -217,9 +219,10 @@ def test_a_node_that_is_lost_during_a_reset_ends_the_run(tmp_path: Path) -> None
     assert row_count(config.with_suffix(".csv")) == 6
 
 
-def test_many_resets_take_no_more_memory_and_no_more_threads(tmp_path: Path) -> None:
-    config = write_config(tmp_path, stop_time=10.0)
-    with fmu_mesh.load(config).start(record=(), paused=True) as run:
+@pytest.mark.parametrize("way", [{}, BY_STREAMS, BY_ZENOH], ids=["shared memory", "streams", "zenoh"])
+def test_many_resets_take_no_more_memory_and_threads(tmp_path: Path, way: Mapping[str, bool]) -> None:
+    config = write_config(tmp_path, stop_time=10.0, zenoh=way)
+    with fmu_mesh.load(config).start(paused=True) as run:
         sizes = []
         for count in range(60):
             run.step(5)
