@@ -142,9 +142,12 @@ class Granting:
         self._sent = max(self._sent, owed)
         return self._sent, grown
 
-    def wake_at(self) -> tuple[str, int] | None:
-        """The slowest node of this host, and its point from which on there is something to do for the master."""
-        if not self.seen:
+    def wake_at(self, wanted: int) -> tuple[str, int] | None:
+        """The slowest node of this host, and its point from which on there is something to do for the master.
+
+        Nothing if the grant is below the ``wanted`` point and all have it: only the wall clock lets it grow.
+        """
+        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted):
             return None
         nodes = [node for node in self.seen if node != RECORDER]
         if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:

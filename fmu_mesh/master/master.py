@@ -299,7 +299,7 @@ class Master:
     def _turn(self, timeout_s: float) -> None:
         """Report all that has arrived; wait up to ``timeout_s`` seconds for the first of it."""
         states, memory = self._states, self._memory
-        seen, wake_at = states.granting.seen, states.granting.wake_at()
+        seen, wake_at = states.granting.seen, states.granting.wake_at(states.wanted)
         wishes = []
         if wake_at is not None and states.state != "stopping":
             node, point = wake_at

@@ -386,7 +386,10 @@ static void poll_streams(Streams *streams, Bell *bell, uint32_t seen, const Wish
                          int64_t limit_ns) {
   const int64_t end = now() + limit_ns;
   struct pollfd *polled = streams->polled;
-  while (atomic_load(&bell->rung) == seen && !granted(wishes, n_wishes)) {
+  for (;;) {
+    atomic_store(&bell->polls, 1);
+    atomic_thread_fence(memory_order_seq_cst);
+    if (atomic_load(&bell->rung) != seen || granted(wishes, n_wishes)) return;
     int64_t n = 0, until = end;
     polled[n++] = (struct pollfd){(int)streams->bell_pipe, POLLIN, 0};
     for (int64_t i = 0; i < streams->n_streams; i++)
@@ -398,6 +401,7 @@ static void poll_streams(Streams *streams, Bell *bell, uint32_t seen, const Wish
     if (left < 0) left = 0;
     const struct timespec limit = {left / 1000000000, left % 1000000000};
     const int ready = ppoll(polled, (nfds_t)n, &limit, NULL);
+    atomic_store(&bell->polls, 0); /* what it reads rings its own bell: this needs no pipe */
     if (ready > 0 && polled[0].revents != 0) {
       char bytes[64];
       while (read((int)streams->bell_pipe, bytes, sizeof bytes) == (ssize_t)sizeof bytes) continue;
@@ -422,11 +426,11 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
     if (other == 0 || other > wishes[i].need) atomic_store(&counter->needs[place->own], wishes[i].need);
     lower(&counter->wake_at, wishes[i].need);
   }
-  if (streams != NULL) atomic_store(&bell->polls, 1);
   atomic_thread_fence(memory_order_seq_cst);
   int is_granted = granted(wishes, n), is_late = 0;
   if (!is_granted && streams != NULL) {
     poll_streams(streams, bell, seen, wishes, n, limit_ns);
+    atomic_store(&bell->polls, 0);
     is_granted = granted(wishes, n);
   } else if (!is_granted) {
     futex_wait(bell, seen, limit_ns, &is_late);
@@ -437,7 +441,6 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
       *late += is_late;
     }
   }
-  if (streams != NULL) atomic_store(&bell->polls, 0);
   for (int64_t i = 0; i < n; i++)
     if (wishes[i].counter != NULL) atomic_store(&wishes[i].counter->needs[place->own], 0);
   return is_granted;
