@@ -616,6 +616,7 @@ static int64_t await(Node *node, int64_t limit_ns) {
 /* Step as far as it goes, for about one slice of time. Call it again and again. */
 PUBLIC int64_t node_run(Node *node) {
   int64_t start = now(), begin = start;
+  const int64_t quiet_until = start + node->quiet_ns;
   int any = 0;
   for (;;) {
     int stepped = 0, left = 0, by_grant = 1;
@@ -652,15 +653,16 @@ PUBLIC int64_t node_run(Node *node) {
       return DONE;
     }
     if (!stepped) {
-      /* After a step only a little, as its rows may be streamed, or sent; and not for a grant, which may come with the
-       * next tick of the wall clock. */
-      int64_t limit_ns = !any ? node->wait_ns : node->eager || by_grant ? 0 : node->slice_ns - (begin - start);
+      /* After a step that somebody looks at only a little, as its rows may be streamed, or sent; and not for a grant, which
+       * may come with the next tick of the wall clock. */
+      const int is_first = !any || (node->quiet_ns > 0 && begin < quiet_until);
+      int64_t limit_ns = is_first ? node->wait_ns : node->eager || by_grant ? 0 : node->slice_ns - (begin - start);
       if (limit_ns <= 0 || !await(node, limit_ns)) {
         wake_all(node, by_grant);
         return BLOCKED;
       }
       begin = now();
-      if (!any) start = begin; /* the slice begins with the first step */
+      if (is_first) start = begin; /* the slice begins with the first step */
     }
     if (any && begin - start > node->slice_ns) {
       wake_all(node, 0);

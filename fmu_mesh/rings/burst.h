@@ -225,6 +225,7 @@ typedef struct { /* all units of a process */
   int64_t last_point, slice_ns;
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
+  int64_t quiet_ns;  /* for how long it goes on, waits included, because nobody looks at each step; 0: for a slice */
   int64_t spins;     /* whether it spins before it sleeps */
   int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
   int64_t stride;    /* how many it sleeps for now */
