@@ -288,7 +288,8 @@ class Master:
             case RaiseGrant(point):
                 self._memory.grant.raise_to(point)
             case RaiseSent(point):
-                self._memory.sent.raise_to(point)
+                if self.streams is not None:
+                    self.streams.grant(point)
             case SendToAll(kind, point):
                 if kind == FINISH:
                     self._memory.finish.raise_to(point + 1)

@@ -178,7 +178,8 @@ typedef struct { /* one socket to another process */
   int64_t send_size, send_from, send_to;
   int64_t receive_size, used, filled;
   int64_t frame, row, rows_left; /* of the frame that is being read: its number in `incoming`, and the next row */
-  int64_t flushed_ns, heard_ns;
+  int64_t heard_ns;
+  _Atomic int64_t flushed_ns;
   int64_t about, about_row; /* why `state` is not OPEN: the link or kind, and the row or number */
   int64_t has_ended, is_known; /* what `streams_serve` has told Python */
   _Atomic int64_t state, sending;

@@ -6,8 +6,8 @@
  * on one host, and only who wakes them is different.
  *
  * Threads. Of one process, all streams are read by one thread: the main thread of a node, between and within its waits,
- * or a thread of the master's process, which does nothing else (`streams_serve`). The same thread writes. Where the
- * kernel takes no more bytes, because a large row does not fit or the network is slow, a thread of its own sends the
+ * or a thread of the master's process, which does nothing else (`streams_serve`). The same thread writes, and so does
+ * the main thread of the master, so that a grant wakes no other thread of its process on its way. Where the kernel takes no more bytes, because a large row does not fit or the network is slow, a thread of its own sends the
  * rest, so that a long step holds nothing back, and ends when nothing is left. Who writes has `sending`: a flag that is
  * taken with one instruction, and nobody waits for it: who finds it taken knows that the other one sends everything.
  * Python changes a stream only while it has the flag, on the thread that reads.
@@ -188,19 +188,24 @@ static void send_on(Stream *stream) {
   pthread_attr_destroy(&attributes);
 }
 
+/* Send what is new, give the flag back, and once more if somebody has asked meanwhile. */
+static void send_and_release(Stream *stream, int all) {
+  for (int64_t own = 1;; own = all = 1) {
+    atomic_exchange(&stream->sending, 1);
+    if (send_new(stream, all)) return send_on(stream);
+    if (atomic_compare_exchange_strong(&stream->sending, &own, 0)) return;
+  }
+}
+
 static void write_stream(const Streams *streams, Stream *stream, int all) {
   if (atomic_load(&stream->state) != OPEN) return;
   if (!all && now() - stream->flushed_ns > streams->lazy_ns) all = 1;
   if (all) stream->flushed_ns = now(); /* also if the other thread sends it */
-  if (!take_flag_or_ask(stream)) return;
-  if (send_new(stream, all))
-    send_on(stream);
-  else
-    atomic_store(&stream->sending, 0);
+  if (take_flag_or_ask(stream)) send_and_release(stream, all);
 }
 
-void streams_write(Streams *streams, int all) {
-  for (int64_t i = 0; i < streams->n_streams; i++) write_stream(streams, &streams->streams[i], all);
+void streams_write(Streams *streams, int64_t all) {
+  for (int64_t i = 0; i < streams->n_streams; i++) write_stream(streams, &streams->streams[i], all != 0);
 }
 
 /* ---- receiving */
@@ -467,7 +472,7 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
     for (int64_t i = 0; i < streams->n_streams; i++) {
       const Stream *stream = &streams->streams[i];
       for (int64_t j = 0; j < stream->n_told; j++)
-        wishes[n++] = (Wish){stream->told[j].counter, stream->told[j].sent + stream->told[j].stride};
+        if (stream->told[j].stride > 0) wishes[n++] = (Wish){stream->told[j].counter, stream->told[j].sent + stream->told[j].stride};
     }
     const int64_t left = end - now();
     if (left <= 0 || atomic_exchange(&streams->attention, 0)) return;
@@ -479,10 +484,7 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
 PUBLIC void stream_beat(Stream *stream) {
   if (atomic_load(&stream->state) != OPEN || !take_flag_or_ask(stream)) return;
   if (room(stream) >= 0) put_header(stream, ALIVE, 0, 0, 0);
-  if (send_new(stream, 1))
-    send_on(stream);
-  else
-    atomic_store(&stream->sending, 0);
+  send_and_release(stream, 1);
 }
 
 /* Shut the socket down, wait for the thread that may send, and keep the flag: from now on nobody uses the stream. */
