@@ -224,7 +224,8 @@ class BurstEngine(Engine):
 
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library
-        node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(quiet * _STATE_CHECK_S * 1e9)
+        most_s = _STATE_CHECK_S if quiet else _SLICE_S
+        node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
         started, before = perf_counter(), self._ticks
         while True:
             result = library.run(self._address)
@@ -236,7 +237,7 @@ class BurstEngine(Engine):
             began = perf_counter()
             self._complete(node.unit, runner, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
-            if perf_counter() - started > _SLICE_S:
+            if perf_counter() - started > most_s:
                 library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
         self.waited_s = node.waited_ns / 1e9
