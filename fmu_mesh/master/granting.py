@@ -75,6 +75,11 @@ class Granting:
         self.last_point = min(point, self.last_point)
 
     @property
+    def reached(self) -> int:
+        """The last point that all instances know; the recorder may be far behind."""
+        return min(point for node, point in self.progress.items() if node != RECORDER)
+
+    @property
     def reaches_all(self) -> int:
         """The point up to which all nodes have a grant, also those that get it by messages."""
         return self.grant if self._all_share else self._sent
@@ -136,8 +141,8 @@ class Granting:
         if self._all_share:
             return 0, False
         credit = min(map(operator.add, self.progress.values(), self._windows)) if self._keep_windows else self.grant
-        ahead = min(point for node, point in self.progress.items() if node != RECORDER)
-        owed = min(self.grant, credit, ahead + self._reach.points(ahead, now, self._round_trip_s))
+        reached = self.reached
+        owed = min(self.grant, credit, reached + self._reach.points(reached, now, self._round_trip_s))
         grown = owed > self._sent
         self._sent = max(self._sent, owed)
         return self._sent, grown

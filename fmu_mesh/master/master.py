@@ -235,7 +235,7 @@ class Master:
         while True:
             paced = states.wanted
             if states.takes_commands:
-                paced, pause_s = self._pacer.limit(paced, states.granting.slowest)
+                paced, pause_s = self._pacer.limit(paced, states.granting.reached)
             stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
             before, actions = states.state, states.decide(now, paced, stopped)
             if not states.moves:  # at once: to publish takes as long as thousands of points
