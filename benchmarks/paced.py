@@ -51,7 +51,10 @@ def measured(python: str, way: str, rate: float, seconds: float, folder: Path) -
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as launched:
         try:
             wait_until(lambda: rows.exists() and rows.read_bytes().count(b"\n") > _FIRST_ROWS, "the first rows")
-            children = [(child, child.cmdline()) for child in psutil.Process(launched.pid).children(recursive=True)]
+            children = [
+                (child, " ".join(child.cmdline()).split())
+                for child in psutil.Process(launched.pid).children(recursive=True)
+            ]
             roles = {role: child for child, words in children for role in _ROLES if role in words}
             before, began = {role: cpu_s(process) for role, process in roles.items()}, time.monotonic()
             threading.Event().wait(seconds)  # what is measured
