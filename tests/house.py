@@ -353,6 +353,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         **{f"node/engine.py: member.{name}": _C_STRUCT for name in ("python_at", "stage", "step", "tracks_from")},
         **{f"node/engine.py: place.{name}": _C_STRUCT for name in ("next", "spent_ns", "stopped", "tick")},
         "node/engine.py: node.eager": _C_STRUCT,
+        "node/engine.py: node.quiet_ns": _C_STRUCT,
         "node/engine.py: node.wait_ns": _C_STRUCT,
         "rings/native.py: structure._fields_": "the fields that the header of C declares, by a decorator",
         "node/engine.py: self._units[node.unit].spent_ns": _C_STRUCT,

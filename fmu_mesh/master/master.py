@@ -235,7 +235,7 @@ class Master:
         while True:
             paced = states.wanted
             if states.takes_commands:
-                paced, pause_s = self._pacer.limit(paced, states.granting.slowest)
+                paced, pause_s = self._pacer.limit(paced, states.granting.reached)
             stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
             before, actions = states.state, states.decide(now, paced, stopped)
             if not states.moves:  # at once: to publish takes as long as thousands of points
@@ -288,7 +288,8 @@ class Master:
             case RaiseGrant(point):
                 self._memory.grant.raise_to(point)
             case RaiseSent(point):
-                self._memory.sent.raise_to(point)
+                if self.streams is not None:
+                    self.streams.grant(point)
             case SendToAll(kind, point):
                 if kind == FINISH:
                     self._memory.finish.raise_to(point + 1)
@@ -299,7 +300,7 @@ class Master:
     def _turn(self, timeout_s: float) -> None:
         """Report all that has arrived; wait up to ``timeout_s`` seconds for the first of it."""
         states, memory = self._states, self._memory
-        seen, wake_at = states.granting.seen, states.granting.wake_at()
+        seen, wake_at = states.granting.seen, states.granting.wake_at(states.wanted)
         wishes = []
         if wake_at is not None and states.state != "stopping":
             node, point = wake_at

@@ -236,7 +236,7 @@ class MasterStates:
             case "stop":
                 self._stop(point)
         if command.command in ("resume", "step"):
-            self._actions.append(FollowClock(granting.slowest))
+            self._actions.append(FollowClock(granting.reached))
         self._moved_at = self._slowest_moved_at = None
         return CommandAnswer(command.command, self.state, granting.slowest, self.hold)
 

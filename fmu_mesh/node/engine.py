@@ -102,10 +102,11 @@ class Engine(ABC):
     def refit(self, runner: Runner) -> None:
         """On the main thread, between steps: the runner steps in another way from the next step on."""
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
+    def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
-        If it is ``eager``, it returns instead of waiting when there was a step: its rows have to be sent.
+        If it is ``eager``, it returns instead of waiting when there was a step: its rows have to be sent. If it is
+        ``quiet``, nobody looks at each step: it goes on for 50 ms, because each return takes longer than a small step.
 
         Raises:
             FmuMeshError: a step failed, or a ring has something that its writer never wrote.
@@ -116,7 +117,7 @@ class Engine(ABC):
         self._looked_after = self._looked_after or ProcessState()
         looks = True
         try:
-            stepped = self._burst(wait_s, eager=eager)
+            stepped = self._burst(wait_s, eager=eager, quiet=quiet)
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
@@ -127,7 +128,7 @@ class Engine(ABC):
         return stepped
 
     @abstractmethod
-    def _burst(self, wait_s: float, *, eager: bool) -> bool:
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         """As `run`, which then restores the state of the process."""
 
     @abstractmethod
@@ -221,9 +222,10 @@ class BurstEngine(Engine):
         for runner in self.runners:
             runner.refit()
 
-    def _burst(self, wait_s: float, *, eager: bool) -> bool:
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library
-        node.wait_ns, node.eager = int(wait_s * 1e9), eager
+        most_s = _STATE_CHECK_S if quiet else _SLICE_S
+        node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
         started, before = perf_counter(), self._ticks
         while True:
             result = library.run(self._address)
@@ -235,7 +237,7 @@ class BurstEngine(Engine):
             began = perf_counter()
             self._complete(node.unit, runner, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
-            if perf_counter() - started > _SLICE_S:
+            if perf_counter() - started > most_s:
                 library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
         self.waited_s = node.waited_ns / 1e9
@@ -366,7 +368,7 @@ class PlainEngine(Engine):
     def refit(self, runner: Runner) -> None:
         """Nothing: each step asks the runner itself."""
 
-    def _burst(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:  # noqa: ARG002  it never waits after a step
         started = perf_counter()
         seen = self._memory.seen()
         stepped = False

@@ -349,10 +349,12 @@ class Node:
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
+        quiet = not eager and self._profiler is None and self._ways.way(self._plan.node, MASTER) != "zenoh"
         all_sent = True
         while not self.finished:
             try:  # it waits only when everything is sent: the grant may depend on it
-                stepped = engine.run(_LONGEST_SLEEP_S if all_sent or not eager else 0.0, eager=eager)
+                wait_s, unseen = _LONGEST_SLEEP_S if all_sent or not eager else 0.0, not self.server.is_followed
+                stepped = engine.run(wait_s, eager=eager, quiet=quiet and unseen)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)

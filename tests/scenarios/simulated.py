@@ -341,11 +341,11 @@ class _SimulatedEngine(PlainEngine):
         super().__init__(plan, units, memory, windows)
         self._process = process
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
+    def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         self._process.give_up()
         links = [(runner, link) for runner in self.runners for link in runner.out_links if link.has_frames]
         is_unsent = any(link.sent <= runner.step for runner, link in links)
-        stepped = super().run(wait_s, eager=eager)
+        stepped = super().run(wait_s, eager=eager, quiet=quiet)
         self._process.mesh.waits_before_sending += is_unsent and wait_s > 0 and not stepped
         for _ in range(1, self._process.mesh.burst() if stepped else 1):
             if not super().run(0.0, eager=eager):
