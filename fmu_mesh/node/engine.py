@@ -70,6 +70,7 @@ class Engine(ABC):
         windows: the progress of those whose windows are kept here, and how far each may be behind.
 
     Attributes:
+        is_blocked: whether the last `run` has ended because nothing can step without another row, or a grant.
         sending: held by whoever sends rows: the main thread between bursts, or another one during a long step.
     """
 
@@ -79,6 +80,7 @@ class Engine(ABC):
         self.units = units
         self.runners = [runner for unit in units for runner in unit]
         self.waited_s = 0.0
+        self.is_blocked = False
         self.sending = Lock()
         self._plan = plan
         self._memory = memory
@@ -115,7 +117,7 @@ class Engine(ABC):
         The unit of an instance that raised one of them is not stepped any more.
         """
         self._looked_after = self._looked_after or ProcessState()
-        looks = True
+        looks, self.is_blocked = True, False
         try:
             stepped = self._burst(wait_s, eager=eager, quiet=quiet)
             looks = perf_counter() >= self._look_at
@@ -134,6 +136,10 @@ class Engine(ABC):
     @abstractmethod
     def ring_bell(self) -> None:
         """From any thread: let `run` return after the current step."""
+
+    def note_wait(self, seconds: float) -> None:
+        """The node has waited for so long because nothing could step."""
+        self.waited_s += seconds
 
     def send(self) -> None:
         """While a step is under way, by another thread that holds `sending`: send all rows before it."""
@@ -226,7 +232,7 @@ class BurstEngine(Engine):
         node, library = self._node, self._library
         most_s = _STATE_CHECK_S if quiet else _SLICE_S
         node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
-        started, before = perf_counter(), self._ticks
+        started, before, waited_ns = perf_counter(), self._ticks, node.waited_ns
         while True:
             result = library.run(self._address)
             if result < BurstEnd.PYTHON:
@@ -240,7 +246,8 @@ class BurstEngine(Engine):
             if perf_counter() - started > most_s:
                 library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
-        self.waited_s = node.waited_ns / 1e9
+        self.is_blocked = result in {BurstEnd.BLOCKED, BurstEnd.DONE}
+        self.note_wait((node.waited_ns - waited_ns) / 1e9)
         return self._ticks != before
 
     def send(self) -> None:
@@ -376,12 +383,13 @@ class PlainEngine(Engine):
             advanced = [self._advance(*both, started) for both in zip(self.units, self._units, strict=False)]
             self._progress.raise_to(self.covered + 1)
             stepped = stepped or any(advanced)
-            if not any(advanced) or perf_counter() - started > self.slice_s:
+            self.is_blocked = not any(advanced)
+            if self.is_blocked or perf_counter() - started > self.slice_s:
                 break
         if not stepped and not self._attention:
             began = perf_counter()
             self._memory.sleep(seen, wait_s)
-            self.waited_s += perf_counter() - began
+            self.note_wait(perf_counter() - began)
         self._attention = False
         return stepped
 
