@@ -110,13 +110,11 @@ class TimedInputs(AroundNativeSteps):
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
-            ValueRefused: too many values wait for their time, or this one is too late.
+            ValueRefused: too many values wait for their time.
         """
         now = self._time(self._step)
         when = now if time is None else time
         step = self._grid.step_at(when, self._points)
-        if step >= ENDLESS:
-            raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:
             variable = self.description.variable(name)
             is_input = variable is not None and variable.causality == "input"
@@ -215,8 +213,11 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
 
     Raises:
         FmuError: the FMU refused it.
-        ValueRefused: too many values wait for their time, or this one is too late.
+        ValueRefused: too many values wait for their time, or no step of this run begins at this one or later.
     """
+    if time is not None and time > (latest := runner.grid.latest(runner.point, streamed=False)):
+        what = "the end of the simulation" if runner.grid.stop_time is not None else "1e6 s ahead: is it a Unix time?"
+        raise ValueRefused(f"the time {time:.12g} s is later than {latest:.12g} s, {what}")
     if time is not None and not isinstance(runner.instance, TimedInputs):
         timed = TimedInputs(runner.instance, "hold")
         timed.start(runner.grid, runner.plan.step_points, runner.step)

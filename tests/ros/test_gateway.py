@@ -276,6 +276,31 @@ def test_transforms_go_out_an_element_comes_in_and_none_changes_nothing(place: P
     assert mesh.wait() == 130, mesh.errors
 
 
+@pytest.mark.parametrize("stop_time", [1000.0, None])
+def test_commands_with_unix_times_take_effect_at_once(stop_time: float, place: Place, ros: Ros) -> None:
+    """As a node without `use_sim_time` stamps them; a mesh without a stop time ignored all of them."""
+    twists = Codec(MessageTypes("jazzy"), "geometry_msgs/msg/TwistStamped")
+    command = {"topic": "/cmd", "type": "geometry_msgs/msg/TwistStamped", "fields": {"twist.linear.x": "gain.u"}}
+    topics = [command, {"topic": "/angle", "variable": "gain.y"}]
+    config = configured(place, ros, factor=1, stop_time=stop_time, topics=topics)
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: ros.floats("angle"), "the first output")
+    sent: list[int] = []
+    for number in (1, 2):
+        sent.append(number)
+        message = twists.empty()
+        message["header"]["stamp"] = {"sec": 1_700_000_000 + number, "nanosec": 0}
+        message["twist"]["linear"]["x"] = float(number)
+        ros.session.put("cmd", twists.encode(message))
+        wait_until(lambda: float(sent[-1]) in ros.floats("angle"), "the command at the output")
+
+    assert place.run("stop", "lab").wait() == 0
+    mesh.wait()
+    assert mesh.errors.count("that 'ros /cmd' sends is no simulation time of this run") == 1, mesh.errors
+    assert "Does it run with use_sim_time?" in mesh.errors
+
+
 def test_the_kept_configuration_with_topics_runs(place: Place) -> None:
     config = Path(__file__).resolve().parents[2] / "configs" / "pendulum_ros.yaml"
 

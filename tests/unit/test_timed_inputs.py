@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -17,7 +18,7 @@ from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.native import MemberTable
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import InstancePlan
@@ -106,14 +107,14 @@ def test_value_whose_time_is_past_holds_unless_later_one_is_in_use(hold: Steps) 
     assert hold.go(1) == [8.0]
 
 
-def runner_of(instance: Instance) -> tuple[Runner, MemberTable]:
+def runner_of(instance: Instance, last_point: int = 60) -> tuple[Runner, MemberTable]:
     """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])
     plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
     map_, places = map_memory(["gain", MASTER], {"gain": ("gain", 1, outputs, 64)})
     memory = HostMemory.private(map_, "gain")
     ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
-    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), ring, counter)
+    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, last_point), ring, counter)
     position = MemberTable()
     runner.follow(position)
     runner.bind()
@@ -164,11 +165,29 @@ def test_so_many_values_may_wait_for_their_time_and_no_more(linear: Steps) -> No
         linear.inputs.add("u", 0.0, 1e9)
 
 
-@pytest.mark.parametrize("time", [1e308, 1e20])
-def test_a_time_after_the_end_of_every_run_is_refused(linear: Steps, time: float) -> None:
-    with pytest.raises(ValueRefused, match="is later than any run ends"):
-        linear.inputs.add("u", 1.0, time)
-    assert linear.go(2) == [5.0, 5.0]
+@pytest.mark.parametrize(
+    ("last_point", "time", "why"),
+    [
+        (60, 7.1, "the time 7.1 s is later than 7 s, the end of the simulation"),
+        (ENDLESS, 1.7e9, "the time 1700000000 s is later than 1000001 s, 1e6 s ahead: is it a Unix time?"),
+        (ENDLESS, 1e308, "1e6 s ahead: is it a Unix time?"),
+    ],
+)
+def test_a_time_that_no_step_of_the_run_has_is_refused(linear: Steps, last_point: int, time: float, why: str) -> None:
+    runner, _ = runner_of(linear.inputs, last_point)
+
+    with pytest.raises(ValueRefused, match=re.escape(why)):
+        set_input(runner, "u", 1.0, time)
+    assert set_input(runner, "u", 1.0, 6.9) == 59
+
+
+def test_a_stream_of_values_has_no_time_a_million_seconds_ahead() -> None:
+    a_year, endless = TimeGrid(0.0, 900.0, 35040), TimeGrid(0.0, 0.01, ENDLESS)
+
+    assert a_year.latest(4, streamed=False) == a_year.stop_time == 31_536_000.0
+    assert a_year.latest(4, streamed=True) == 1_003_600.0
+    assert a_year.latest(35000, streamed=True) == a_year.stop_time
+    assert endless.latest(100, streamed=False) == endless.latest(100, streamed=True) == 1_000_001.0
 
 
 def test_a_time_long_before_the_run_is_the_past(hold: Steps) -> None:
