@@ -293,7 +293,7 @@ class _Pending:
 def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
-    sources = runner.plan.sources
+    sources, timeouts = runner.plan.sources, {own.variable: str(own) for own in runner.plan.timeouts}
     nodes = {link.source: link.source_node for link in plan.links_in}
 
     def way_of(source: str, target: str, *, initial_only: bool) -> Way | None:
@@ -329,6 +329,7 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
                 v.maximum,
                 v.items,
                 why_not_settable(v, sources.get(v.name)) is None,
+                timeouts.get(v.name),
             )
             for v in description.variables
             if (kind := kind_of(v)) is not None
