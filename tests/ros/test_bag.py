@@ -16,7 +16,7 @@ from fmu_mesh.ros.bags.playing import Played, schedule
 from fmu_mesh.ros.messages.cdr import Codec
 from fmu_mesh.ros.messages.definitions import MessageTypes
 from fmu_mesh.ros.messages.topics import Port, Topic
-from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.variables.model_description import Variable
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, Launched, Place, rows_of, wait_until, write_config
@@ -247,6 +247,17 @@ def test_a_sample_holds_from_first_point_that_is_not_before_its_stamp(
 
     assert {moment.point: moment.values["gain", "u"] for moment in moments} == points
     assert len(moments) + merged + beyond == len(samples)
+
+
+@pytest.mark.parametrize(("point", "played"), [(0, 1), (2 * 10**8, 5)])
+def test_a_mesh_without_stop_time_has_no_unix_times(point: int, played: int) -> None:
+    """At point 2e8 of 10 ms, two million seconds are nearly over."""
+    grid = TimeGrid(0.0, 0.01, ENDLESS)
+    samples = [BagSample(round(time * 1e9), "gain", "u", 1.0) for time in (5.0, 1.1e6, 1.5e6, 2e6, 2.9e6, 1.7e9)]
+
+    moments, _, beyond = schedule(samples, grid, {"gain": 1}, start=None, point=point)
+
+    assert (len(moments), beyond) == (played, 6 - played)
 
 
 def test_stamps_of_another_clock_are_moved_to_begin_at_the_start() -> None:

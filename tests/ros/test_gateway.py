@@ -67,12 +67,16 @@ def configured(
     factor: float,
     stop_time: float = 3.0,
     timeouts: dict[str, float] | None = None,
+    inputs: dict[str, Any] | None = None,
     **more: Any,  # noqa: ANN401 keys of the section
 ) -> Path:
     return write_config(
         place.folder,
         name="lab",
-        instances={"pendulum": {"fmu": "DampedPendulum", "start_values": {"a": 1.3}}, "gain": {"fmu": "Gain"}},
+        instances={
+            "pendulum": {"fmu": "DampedPendulum", "start_values": {"a": 1.3}},
+            "gain": {"fmu": "Gain", "inputs": inputs or {}},
+        },
         connections=[],
         stop_time=stop_time,
         simulation={"step_size": 0.01, "real_time_factor": factor},
@@ -274,6 +278,50 @@ def test_transforms_go_out_an_element_comes_in_and_none_changes_nothing(place: P
     assert stamps[0] == stamps[1] > 0.1
     assert place.run("stop", "lab").wait() == 0
     assert mesh.wait() == 130, mesh.errors
+
+
+@pytest.mark.parametrize("stop_time", [1000.0, None])
+def test_commands_with_unix_times_take_effect_at_once(stop_time: float, place: Place, ros: Ros) -> None:
+    """As a node without `use_sim_time` stamps them; a mesh without a stop time ignored all of them."""
+    twists = Codec(MessageTypes("jazzy"), "geometry_msgs/msg/TwistStamped")
+    command = {"topic": "/cmd", "type": "geometry_msgs/msg/TwistStamped", "fields": {"twist.linear.x": "gain.u"}}
+    topics = [command, {"topic": "/angle", "variable": "gain.y"}]
+    config = configured(place, ros, factor=1, stop_time=stop_time, topics=topics)
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: ros.floats("angle"), "the first output")
+    sent: list[int] = []
+    for number in (1, 2):
+        sent.append(number)
+        message = twists.empty()
+        message["header"]["stamp"] = {"sec": 1_700_000_000 + number, "nanosec": 0}
+        message["twist"]["linear"]["x"] = float(number)
+        ros.session.put("cmd", twists.encode(message))
+        wait_until(lambda: float(sent[-1]) in ros.floats("angle"), "the command at the output")
+
+    assert place.run("stop", "lab").wait() == 0
+    mesh.wait()
+    assert mesh.errors.count("that 'ros /cmd' sends is no simulation time of this run") == 1, mesh.errors
+    assert "Does it run with use_sim_time?" in mesh.errors
+
+
+def test_a_joystick_that_dies_does_not_steer_for_ever(place: Place, ros: Ros) -> None:
+    inputs = {"u": {"timeout": {"after": 0.5, "then": "start"}}}
+    topics = [{"topic": "/command", "variable": "gain.u"}, {"topic": "/angle", "variable": "gain.y"}]
+    config = configured(place, ros, factor=1, stop_time=1000.0, inputs=inputs, topics=topics)
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: ros.floats("angle"), "the first output")
+    for _ in range(3):
+        seen = len(ros.floats("angle"))
+        ros.session.put("command", struct.pack("<4xd", 2.0).replace(bytes(4), b"\0\1\0\0", 1))
+        wait_until(lambda: len(ros.floats("angle")) > seen + 30, "less than the timeout")  # noqa: B023  it waits here
+    wait_until(lambda: ros.floats("angle")[-1] == 0.0, "the start value")
+
+    values = [value for value, _ in groupby(ros.floats("angle"))]
+    assert values == [0.0, 2.0, 0.0]
+    assert place.run("stop", "lab").wait() == 0
+    mesh.wait()
 
 
 def test_the_kept_configuration_with_topics_runs(place: Place) -> None:

@@ -131,6 +131,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("can", ", ".join(can)),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(map(_connection, info.connections))),
+            ("timeouts", ", ".join(f"{v.name}: {v.timeout}" for v in info.variables if v.timeout)),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
         ]
