@@ -76,8 +76,8 @@ class _Couplings:
         try:
             find_program()
         except GazeboGone as error:
-            found = f"Gazebo classic does not run on this host: {error}"
-            self._problems.warn(FilePlace(str(self._path), line, "world"), found, HOW_TO_GET_IT)
+            found = f"Gazebo classic does not run on this host: {error}. {HOW_TO_GET_IT}"
+            self._problems.warn(FilePlace(str(self._path), line, "world"), found)
         for joint in world.joints:
             names = [*joint.name.split("::"), "pid"]
             self._couple(
