@@ -130,7 +130,7 @@ def test_check_reads_a_published_shape_where_no_gazebo_is(
     assert [f"{one['name']}: {one.get('joint') or one['link']}" for one in found] == coupled
 
 
-def test_step_and_pace_are_those_of_the_world_and_the_end_is_open(world: Callable[..., Path]) -> None:
+def test_step_and_pace_are_those_of_the_world(world: Callable[..., Path]) -> None:
     physics = "<physics type='ode'><max_step_size>0.002</max_step_size>{}</physics>"
     paced = read_configuration(world(physics.format(""), model()))
     fast = read_configuration(world(physics.format("<real_time_update_rate>0</real_time_update_rate>")))
