@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -129,15 +130,17 @@ def joint(name: str, kind: str, parent: str, child: str, more: str = "") -> str:
     return f"<joint name='{name}' type='{kind}'><parent>{parent}</parent><child>{child}</child>{axis}</joint>"
 
 
-def ran(folder: Path, content: str, *efforts: str, stop_time: float = 1.0) -> dict[str, Array]:
-    """A run of a world without gravity but along z, with constant efforts."""
+def ran(
+    folder: Path, content: str, *efforts: str, stop_time: float = 1.0, starts: Mapping[str, float] = {}
+) -> dict[str, Array]:
+    """A run of a world without gravity but along z, with constant efforts and other inputs."""
     path = folder / "world.sdf"
     path.write_text(f"<sdf version='1.6'><world name='w'>{content}</world></sdf>", encoding="utf-8")
-    starts = ", ".join(f"'{effort}.effort': 0.1" for effort in efforts)
+    values = {f"{effort}.effort": 0.1 for effort in efforts} | dict(starts)
     config = folder / "mesh.yaml"
     config.write_text(
         f"mesh: m\nsimulation: {{stop_time: {stop_time}, step_size: 0.001}}\n"
-        f"instances: {{world: {{gazebo_classic: world.sdf, start_values: {{{starts}}}}}}}\n",
+        f"instances: {{world: {{gazebo_classic: world.sdf, start_values: {values}}}}}\n",
         encoding="utf-8",
     )
     return columns(config, folder / "result.csv")
@@ -182,6 +185,24 @@ def test_a_joint_that_has_no_variables_is_simulated(tmp_path: Path) -> None:
 
     assert result["world.b.position_z"][-1] == pytest.approx(2.0, abs=1e-6)
     assert not any(name.startswith("world.ball.") for name in result)
+
+
+@pytest.mark.parametrize("engine", ["ode", "simbody", "dart"])
+def test_a_force_and_a_moment_act_at_the_origin_of_a_link(engine: str, tmp_path: Path) -> None:
+    inertial = "<inertial><pose>0.5 0 0 0 0 0</pose><mass>1</mass></inertial>"  # a moment of inertia of 1 kg m2
+    turned = "1.5707963267948966 0 0"  # about x: y of the link is z of the world, and z is -y
+    body = f"<link name='l'><pose>0 0 0 {turned}</pose>{inertial}</link>"
+    content = f"<gravity>0 0 0</gravity><physics type='{engine}'/><model name='m'>{body}</model>"
+    starts = {"l.force_y": 0.1, "l.force_x": 0.05, "l.moment_z": 0.2}
+
+    result = ran(tmp_path, content, stop_time=0.1, starts=starts)
+
+    # The force at the origin turns the link about its centre by -0.05 N m; what remains of the moment is 0.15 N m.
+    assert result["world.l.angular_velocity_y"][-1] == pytest.approx(-0.015, rel=1e-2)
+    assert result["world.l.angular_velocity_x"][-1] == pytest.approx(0.0, abs=1e-6)
+    # The centre moves with the force, and the origin about it as well: 0.1 m/s2 - 0.5 m * 0.15 rad/s2.
+    assert result["world.l.linear_velocity_z"][-1] == pytest.approx(0.0025, rel=2e-2)
+    assert result["world.l.linear_velocity_x"][-1] == pytest.approx(0.005, rel=2e-2)
 
 
 def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: Place, tmp_path: Path) -> None:
@@ -255,11 +276,14 @@ def test_a_launched_world_has_the_arms_of_figure_20(place: Place) -> None:
     assert not tuned["world.no_actuator_model::joint.effort_applied"].any()  # a controller without gains
 
 
-def test_a_launched_world_brakes_the_cube_whose_model_is_named(place: Place) -> None:
-    world = EXAMPLES / "linear_friction.world"
+@pytest.mark.parametrize("engine", ["ode", "simbody", "dart"])
+def test_a_launched_world_brakes_the_cube_whose_model_is_named(engine: str, place: Place, tmp_path: Path) -> None:
+    text = (EXAMPLES / "linear_friction.world").read_text(encoding="utf-8")
+    path = tmp_path / "linear_friction.world"
+    path.write_text(text.replace('"default">', f'"default"><physics type="{engine}"/>'), encoding="utf-8")
 
-    braked = launched(place, world, 2.0, "floating_cube_fluid_dynamics.gain=10")
-    free = launched(place, world, 2.0, "floating_cube_fluid_dynamics.gain=0")
+    braked = launched(place, path, 2.0, "floating_cube_fluid_dynamics.gain=10")
+    free = launched(place, path, 2.0, "floating_cube_fluid_dynamics.gain=0")
 
     assert 0.096 < braked["world.link.position_x"][-1] < 0.1
     assert free["world.link.position_x"][-1] == pytest.approx(2.0, abs=1e-3)
