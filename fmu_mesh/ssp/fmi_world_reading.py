@@ -11,6 +11,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
+from msgspec import structs
+
+from .. import files
 from ..config.findings import ValueOrigin
 from ..config.loading import PlainConfig
 from ..config.yaml_text import Plain
@@ -73,16 +76,15 @@ class _Couplings:
     def plain(self) -> PlainConfig:
         """All of it."""
         world, line = self._world, self._world.element.sourceline
+        top = FilePlace(str(self._path), line, "world")
         try:
             find_program()
         except GazeboGone as error:
             found = f"Gazebo classic does not run on this host: {error}. {HOW_TO_GET_IT}"
-            self._problems.warn(FilePlace(str(self._path), line, "world"), found)
+            self._problems.warn(top, found)
         for joint in world.joints:
-            names = [*joint.name.split("::"), "pid"]
-            self._couple(
-                "controllers", names, {"controller": "position_pid"}, {"name": joint.name, "joint": joint.name}
-            )
+            instance = self._instance([*joint.name.split("::"), "pid"], {"controller": "position_pid"}, top)
+            self._couple("controllers", {"name": joint.name, "joint": joint.name, "instance": instance}, top)
         entries = [entry for plugin in world.plugins for entry in self._entries(plugin)]
         counts = Counter(entry.name for entry in entries)
         for entry in entries:
@@ -103,7 +105,7 @@ class _Couplings:
         known = ["name", part, "fmu", "variable_names"]
         if part == "joint":
             known += ["enabled", _NO_LIMITS, *_OLD_NAMES]
-        if tag not in self._children(plugin, plugin.element, ("verbose", tag), repeated="actuator"):
+        if tag not in self._children(plugin, plugin.element, ("verbose", tag)):
             self._problems.add(_place(plugin, plugin.element), "a plugin without an entry", f"<{tag}>")
         for element in plugin.element.findall(tag)[: None if part == "joint" else 1]:
             given = self._children(plugin, element, known)
@@ -115,9 +117,7 @@ class _Couplings:
             if not missing and self._flag(plugin, given.get("enabled"), default=True):
                 yield _Entry(plugin, element, _text(given.get("name")) or _text(given[part]), given)
 
-    def _children(
-        self, plugin: GazeboPlugin, element: Element, known: Sequence[str], repeated: str = ""
-    ) -> dict[str, Element]:
+    def _children(self, plugin: GazeboPlugin, element: Element, known: Sequence[str]) -> dict[str, Element]:
         """The first child with each tag; a warning for each one that has no effect."""
         first: dict[str, Element] = {}
         for child in element.iterchildren("*"):
@@ -125,7 +125,7 @@ class _Couplings:
                 near = nearest(child.tag, known)
                 expected = f"<{near}>" if near is not None else f"one of {listed(known)}"
                 self._problems.warn(_place(plugin, child), "the unknown tag has no effect", expected)
-            elif child.tag in first and child.tag != repeated:
+            elif child.tag in first and child.tag != "actuator":
                 self._problems.warn(_place(plugin, child), "a second one has no effect", f"one <{child.tag}>")
             first.setdefault(child.tag, child)
         return first
@@ -144,7 +144,10 @@ class _Couplings:
         fmu = self._fmu(plugin, given["fmu"])
         if found is None or fmu is None:
             return
-        coupling: dict[str, Plain] = {"name": name, part: found.name}
+        place = _place(plugin, entry.element)
+        path = [name] if is_unique and name != WORLD else [*plugin.model.scoped.split("::"), name]
+        instance = self._instance(path, {"fmu": fmu}, place)
+        coupling: dict[str, Plain] = {"name": name, part: found.name, "instance": instance}
         if self._flag(plugin, given.get(_NO_LIMITS)):
             coupling[_NO_LIMITS] = True
         names = {own.tag: own.get("name") for own in given.get("variable_names", ()) if isinstance(own.tag, str)}
@@ -154,11 +157,10 @@ class _Couplings:
                 expected = f'<variable_names><{own} name="{names[own]}"/></variable_names>'
                 self._problems.warn(_place(plugin, given[tag]), "an old tag", expected)
         for own in [own for own in names if not names[own]]:
-            self._problems.add(_place(plugin, entry.element), f"<{own}> without a name", f'<{own} name="..."/>')
+            self._problems.add(place, f"<{own}> without a name", f'<{own} name="..."/>')
         if names:
             coupling["variable_names"] = names
-        path = [name] if is_unique and name != WORLD else [*plugin.model.scoped.split("::"), name]
-        self._couple(plugin.section, path, {"fmu": fmu}, coupling, _place(plugin, entry.element))
+        self._couple(plugin.section, coupling, place)
 
     def _joint(self, entry: _Entry) -> GazeboJoint | None:
         """The joint with a name, or else the first one whose last part is the name, or which ends with it."""
@@ -192,32 +194,27 @@ class _Couplings:
         scheme, _, name = _text(element).rpartition("://")
         folders = folders_of(variable := MODELS if scheme == "model" else _RESOURCES, self._path)
         for folder in folders:
-            if (folder / name).exists():
+            if files.exists(folder / name):
                 return name if folder == self._path.parent else str((folder / name).absolute())
         near = nearest(name, [own.name for folder in folders for own in folder.glob("*.fmu")])
         expected = f"a file beside the world, or in a folder of {variable} ({listed([*map(str, folders[1:])])})"
         self._problems.add(_place(plugin, element), f"no such file '{name}'", expected, near)
         return None
 
-    def _couple(
-        self,
-        section: str,
-        names: Sequence[str],
-        model: Plain,
-        coupling: dict[str, Plain],
-        place: FilePlace | None = None,
-    ) -> None:
-        """Add an instance with these names in its name, and its entry in a section of the world."""
+    def _instance(self, names: Sequence[str], section: Plain, place: FilePlace) -> str:
+        """Add an instance; returns its name, which is made of ``names``."""
         instance = instance_name(names)
         while instance in self._instances:
             instance += "_"
-        self._instances[instance] = model
+        self._instances[instance] = section
+        self._origins[f"instances.{instance}"] = ValueOrigin(*structs.astuple(place))
+        return instance
+
+    def _couple(self, section: str, coupling: Plain, place: FilePlace) -> None:
         entries = self._section.setdefault(section, [])
         assert isinstance(entries, list)  # only made here
-        if place is not None:
-            origin = ValueOrigin(place.file, place.line, place.element)
-            self._origins |= {f"instances.{instance}": origin, f"instances.{WORLD}.{section}[{len(entries)}]": origin}
-        entries.append({**coupling, "instance": instance})
+        self._origins[f"instances.{WORLD}.{section}[{len(entries)}]"] = ValueOrigin(*structs.astuple(place))
+        entries.append(coupling)
 
 
 def _text(element: Element | None) -> str:

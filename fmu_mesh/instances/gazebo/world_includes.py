@@ -19,7 +19,7 @@ from lxml import etree
 
 from ...archives.safe_xml import safe_xml
 from ...errors import LoadFailed
-from ...files import opened
+from ...files import exists, is_file, opened
 from ...text import listed
 
 __all__ = ["MODELS", "Element", "WorldFile", "folders_of"]
@@ -166,14 +166,14 @@ class WorldFile:
         if scheme not in {"", "model", "file"} or not name:
             return None
         places = [folder.absolute() / name for folder in folders_of(MODELS, beside)]  # an absolute name stays as it is
-        place = next((place for place in places if place.exists()), None)
-        if place is None or place.is_file():
+        place = next((place for place in places if exists(place)), None)
+        if place is None or is_file(place):
             return place
         manifest, model = place / "model.config", "model.sdf"
-        if manifest.is_file():
+        if is_file(manifest):
             named = [(own.get("version", ""), own.text or model) for own in self._parsed(manifest).findall("sdf")]
             model = max((own for own in named if own[0] <= _NEWEST), default=("", model))[1].strip()
-        return place / model if (place / model).is_file() else None
+        return place / model if is_file(place / model) else None
 
 
 def folders_of(variable: str, file: Path) -> list[Path]:
