@@ -321,6 +321,7 @@ def test_a_world_becomes_a_file_that_says_the_same(world: Callable[..., Path], t
             "<fmu> of the model 'arm': no such file 'Dampr.fmu'; expected a file beside the world",
         ),
         (actuator(fmu="Dampr.fmu"), f"GAZEBO_RESOURCE_PATH (/nowhere, {FMUS}). Did you mean 'Damper.fmu'?"),
+        (actuator(fmu="a" * 5000), "<fmu> of the model 'arm': no such file 'aaaaaaaa"),
         (actuator(more="<enabled>maybe</enabled>"), "<enabled> of the model 'arm': 'maybe'; expected true or false"),
         (actuator(more="<variable_names><jointTorque/></variable_names>"), "<jointTorque> without a name"),
     ],
@@ -494,6 +495,7 @@ def test_the_content_of_a_world_has_that_of_its_models(
     ("models", "expected"),
     [
         ({}, "includes a model (model://a), not found in "),
+        ({"a": f"<model><include><uri>{'b' * 5000}</uri></include></model>"}, "includes a model (bbbbbbbb"),
         ({"a": "<light name='l'/>"}, "is no SDF file with a model"),
         ({"a": "<model"}, "cannot be read"),
         ({"a": model("<include><uri>model://a</uri></include>")}, "inside more than 100 other models"),
