@@ -140,11 +140,7 @@ class FieldTypes:
     """What messages consist of, and what is at a path in them."""
 
     def fields(self, message: str) -> tuple[tuple[str, FieldType], ...]:
-        """The fields of a message, in order.
-
-        Raises:
-            UnknownType: there is no such type.
-        """
+        """The fields of a message, in order."""
         raise NotImplementedError
 
     def field(self, message: str, path: str) -> FieldType:
@@ -171,15 +167,16 @@ class FieldTypes:
             names: tuple[str, ...] = ()
             usual = reason = ""
             match part:
-                case str() if isinstance(element, Nested):
-                    reason = f"'{reached}' is an array, write an index, such as {reached}[0]{text}"
                 case str():
                     found = None if element is not None else found
+                    if isinstance(element, Nested):
+                        reason = f"'{reached}' is an array, write an index, such as {reached}[0]{text}"
                 case _ if element is None:
                     reason = "it is no array"
                 case Key(field) if field:
                     reason = "" if field in keys else f"'{field}' is no text that tells its elements apart"
-                    names = tuple(f"{reached}[{key}={part.text}]" for key in keys)
+                    rest = path[len(reached) + len(text) :]
+                    names = tuple(f"{reached}[{key}={part.text}]{rest}" for key in keys)
                 case _:
                     reason = _index_problem(kind, part)
                     own = (key for key, at in keys.items() if (at is None) == isinstance(element, Nested))

@@ -28,8 +28,6 @@ _EMPTY: Mapping[str, str | bool] = {"string": "", "bool": False}
 _Rows = dict[str, int]
 """The index of each key in a table."""
 
-_Step = tuple[Part, str, int | None]
-
 
 def by_index(topic: Topic, types: FieldTypes) -> Topic:
     """The same published topic with an index for each key, and with constants for the keys and for what is not mapped.
@@ -114,11 +112,11 @@ class FieldReader:
         self._get = get
         self._strangers: list[str] = []
         self._known: set[str] = set()
-        # Each step has the table of its key: the path to the table, with the field of its keys.
+        # The keys of each table, by the path to it; each part has the table that it belongs to.
         self._tables: dict[str, set[str]] = {}
-        self._paths: list[tuple[str, list[_Step]]] = []
+        self._paths: list[tuple[str, list[tuple[Part, str, int | None]]]] = []
         for port in topic.ports:
-            steps: list[_Step] = []
+            steps: list[tuple[Part, str, int | None]] = []
             reached: list[str] = []
             for part, text, holder in types.resolved(topic.message, port.path).steps:
                 table = f"{''.join(reached[:holder])} {part.field}" if isinstance(part, Key) else ""
@@ -127,6 +125,7 @@ class FieldReader:
                 steps.append((part, table, holder))
                 reached.append(text)
             self._paths.append((port.path, steps))
+        self._found: dict[str, tuple[_Rows, int]] = {}  # in the present message, with the number of its rows
 
     @property
     def warning(self) -> str:
@@ -143,10 +142,10 @@ class FieldReader:
             CdrError: an array has no such index, or is not as long as its keys.
         """
         self._strangers = []
-        tables: dict[str, tuple[_Rows, int]] = {}
-        return [self._value(message, path, steps, tables) for path, steps in self._paths]
+        self._found.clear()
+        return [self._value(message, *own) for own in self._paths]
 
-    def _value(self, message: Any, path: str, steps: list[_Step], tables: dict[str, tuple[_Rows, int]]) -> Any:  # noqa: ANN401 as above
+    def _value(self, message: Any, path: str, steps: Sequence[tuple[Part, str, int | None]]) -> Any:  # noqa: ANN401 as above
         values = [message]
         for part, table, holder in steps:
             value = values[-1]
@@ -155,11 +154,10 @@ class FieldReader:
                 continue
             index: int | None = part if isinstance(part, int) else None
             if isinstance(part, Key):
-                if table not in tables:
+                if table not in self._found:
                     own = self._get(values[holder], part.field) if holder is not None else None
-                    texts = [self._get(element, part.field) for element in value] if own is None else own
-                    tables[table] = self._rows(table, texts), len(texts)
-                rows, length = tables[table]
+                    self._find(table, [self._get(element, part.field) for element in value] if own is None else own)
+                rows, length = self._found[table]
                 if len(value) not in (0, length):
                     raise CdrError(f"'{path}' is one of {len(value)} elements for {length} texts in '{part.field}'")
                 index = rows.get(part.text) if len(value) else None
@@ -172,10 +170,10 @@ class FieldReader:
         is_nan = isinstance(value, float | np.floating) and math.isnan(value)
         return None if is_nan and any(table for _, table, _ in steps) else value
 
-    def _rows(self, table: str, texts: Sequence[str]) -> _Rows:
-        """The index of each key of a table; of two that are equal, the last counts. Notes keys that no path has."""
+    def _find(self, table: str, texts: Sequence[str]) -> None:
+        """Find the rows of a table by the texts in a message; of two that are equal, the last counts."""
         others = [text for text in texts if text not in self._tables[table]]
         self.ignored += len(others)
         self._strangers += [text for text in dict.fromkeys(others) if text not in self._known]
         self._known.update(self._strangers[: _MAX_STRANGERS - len(self._known)])
-        return {text: index for index, text in enumerate(texts)}
+        self._found[table] = {text: index for index, text in enumerate(texts)}, len(texts)

@@ -67,11 +67,7 @@ class RosTypes(FieldTypes):
     """The message types of the ROS of this Python."""
 
     def fields(self, message: str) -> tuple[tuple[str, FieldType], ...]:
-        """The fields of a message, in order.
-
-        Raises:
-            ConfigurationError: ROS has no such type.
-        """
+        """The fields of a message, in order; raises as `message_class` does."""
         kinds: dict[str, str] = message_class(message).get_fields_and_field_types()
         return tuple((name, _field_type(kind)) for name, kind in kinds.items())
 
