@@ -70,7 +70,7 @@ def _ros_plan(run: RunPlan) -> RosPlan:
     """The topics of a configuration that was checked before."""
     findings = run.loaded.findings()
     descriptions = {name: own.description for name, own in run.plan.system.instances.items()}
-    ros_plan = resolve(run.loaded, descriptions, findings)
+    ros_plan = resolve(run.loaded, descriptions, findings, run.loaded.findings())
     findings.raise_any()
     assert ros_plan is not None
     return ros_plan

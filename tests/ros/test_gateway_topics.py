@@ -31,7 +31,8 @@ def plan_of(path: Path) -> RosPlan:
     """The plan of a file, with what its instances say of themselves."""
     plan = prepare(path)
     loaded = examine_data(read_file(path))[0]
-    found = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, loaded.findings())
+    descriptions = {name: own.description for name, own in plan.system.instances.items()}
+    found = resolve(loaded, descriptions, loaded.findings(), loaded.findings())
     assert found is not None
     return found
 
@@ -375,7 +376,7 @@ def test_names_that_collide_or_start_with_a_digit_are_found_together(tmp_path: P
     )
     findings = loaded.findings()
 
-    plan = resolve(loaded, {"pendulum": model, "delay": model}, findings)
+    plan = resolve(loaded, {"pendulum": model, "delay": model}, findings, loaded.findings())
 
     texts = [str(finding) for finding in findings]
     assert len(texts) == 3

@@ -23,7 +23,7 @@ from ...variables.model_description import Causality, ModelDescription, Variabil
 from ...variables.value_types import FMI2_TYPES, VariableType
 from ...wire.views import InstanceInfo, VariableView
 from ..messages.definitions import MessageTypes, is_message_name
-from ..messages.fitting import TopicEntry, check_topic, default_type, index_warnings
+from ..messages.fitting import TopicEntry, check_topic, default_type
 from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
 from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
 
@@ -57,9 +57,7 @@ def message_types(loaded: LoadedConfig, section: RosConfig, findings: Findings) 
         return None
 
 
-def resolve(
-    loaded: LoadedConfig, descriptions: Descriptions, findings: Findings, warnings: Findings | None = None
-) -> RosPlan | None:
+def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings, warnings: Findings) -> RosPlan | None:
     """Make the plan of the `ros` section; ``warnings`` gets what works and may not be meant.
 
     A topic of an instance without a description is not checked.
@@ -80,9 +78,8 @@ def resolve(
         resolver.topics()
         return None
     plan = resolver.plan()
-    if warnings is not None:
-        for warning in resolver.warnings:
-            warnings.add(*warning)
+    for warning in resolver.warnings:
+        warnings.add(*warning)
     return plan
 
 
@@ -295,9 +292,8 @@ class Resolver:
             constants=tuple(entry.item.constants.items()),
         )
         if self._types is not None:
-            topic = check_topic(entry, topic, self._types, self._findings)
+            topic = check_topic(entry, topic, self._types, self._findings, self.warnings)
         if len(self._findings) == before:
-            self.warnings += index_warnings(entry, topic, self._types) if self._types is not None else ()
             yield topic
 
     # --- variables

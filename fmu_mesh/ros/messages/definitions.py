@@ -96,27 +96,27 @@ FieldType = Basic | Nested | Array | Sequence
 
 
 class Key(msgspec.Struct, frozen=True):
-    """A part of a path that finds an element by the text of a field; without ``field`` it is an index that is wrong."""
+    """A part of a path that finds an element by the text of a field; without ``field`` it is an index that is wrong.
+
+    Attributes:
+        table: where the texts of the elements are: a path, which an index follows, and the rest.
+        holder: how many parts lead to the message with an array of the texts; None if each element has its own.
+    """
 
     field: str
     text: str
+    table: tuple[str, str] = ("", "")
+    holder: int | None = None
 
 
 Part = str | int | Key
 
 
 class FieldPath(msgspec.Struct, frozen=True):
-    """A path in the messages of one type.
-
-    Attributes:
-        kind: what is there.
-        steps: each part, its text, and for a key how many parts lead to the message with the array of its texts; None
-            if the elements themselves have their texts.
-        by_key: the path with a key for each index that could be one.
-    """
+    """What a path leads to, its parts with their texts, and the path with a key for each index that could be one."""
 
     kind: FieldType
-    steps: tuple[tuple[Part, str, int | None], ...]
+    steps: tuple[tuple[Part, str], ...]
     by_key: str
 
 
@@ -155,14 +155,14 @@ class FieldTypes:
     def resolved(self, message: str, path: str) -> FieldPath:
         """What a path leads to; raises as `field` does."""
         kind: FieldType = Nested(message)
-        outer: list[tuple[int, str]] = []  # the messages on the way, and how many parts lead to each
-        steps: list[tuple[Part, str, int | None]] = []
+        outer: list[tuple[int, str, str]] = []  # the messages on the way: how many parts lead there, and which
+        steps: list[tuple[Part, str]] = []
         reached = by_key = ""
         for part, text in _pieces(path) or [("", "")]:
             if isinstance(kind, Nested):
-                outer.append((len(steps), kind.message))
+                outer.append((len(steps), reached, kind.message))
             element = kind.element if isinstance(kind, Array | Sequence) else None
-            keys = self._keys(element, outer, steps[-1][0]) if element is not None else {}
+            keys = self._keys(element, outer, reached) if element is not None else {}
             found = dict(self.fields(kind.message)).get(str(part)) if isinstance(kind, Nested) else element
             names: tuple[str, ...] = ()
             usual = reason = ""
@@ -173,17 +173,17 @@ class FieldTypes:
                         reason = f"'{reached}' is an array, write an index, such as {reached}[0]{text}"
                 case _ if element is None:
                     reason = "it is no array"
-                case Key(field) if field:
+                case Key(field, own) if field:
                     reason = "" if field in keys else f"'{field}' is no text that tells its elements apart"
                     rest = path[len(reached) + len(text) :]
-                    names = tuple(f"{reached}[{key}={part.text}]{rest}" for key in keys)
+                    names = tuple(f"{reached}[{key}={own}]{rest}" for key in keys)
                 case _:
                     reason = _index_problem(kind, part)
-                    own = (key for key, at in keys.items() if (at is None) == isinstance(element, Nested))
-                    usual = next(filter(_USUAL_KEY.fullmatch, own), "")
+                    likely = (key for key, (_, at) in keys.items() if (at is None) == isinstance(element, Nested))
+                    usual = next(filter(_USUAL_KEY.fullmatch, likely), "")
             if found is None or reason:
                 raise UnknownField(message, path, names or tuple(self.paths(message)), reason)
-            steps.append((part, text, keys.get(part.field) if isinstance(part, Key) else None))
+            steps.append((Key(part.field, part.text, *keys[part.field]) if isinstance(part, Key) else part, text))
             kind, reached = found, reached + text
             by_key += f"[{usual}=…]" if usual else text
         return FieldPath(kind, tuple(steps), by_key)
@@ -198,14 +198,18 @@ class FieldTypes:
             else:
                 yield f"{prefix}{name}"
 
-    def _keys(self, element: Basic | Nested, outer: list[tuple[int, str]], array: Part) -> dict[str, int | None]:
-        """The keys of an array of such elements, and the holder of their texts, as in `FieldPath`."""
+    def _keys(
+        self, element: Basic | Nested, outer: list[tuple[int, str, str]], array: str
+    ) -> dict[str, tuple[tuple[str, str], int | None]]:
+        """The keys that an array of such elements can have, with the table and the holder of each."""
         own = self.fields(element.message) if isinstance(element, Nested) else ()
-        keys: dict[str, int | None] = {name: None for name, kind in own if getattr(kind, "kind", "") == "string"}
-        for done, message in reversed(outer):
+        texts = (name for name, kind in own if getattr(kind, "kind", "") == "string")
+        keys: dict[str, tuple[tuple[str, str], int | None]] = {name: ((array, f".{name}"), None) for name in texts}
+        for done, reached, message in reversed(outer):
             for name, kind in self.fields(message):
-                if name != array and getattr(getattr(kind, "element", None), "kind", "") == "string":
-                    keys.setdefault(name, done)
+                path = f"{reached}.{name}" if reached else name
+                if path != array and getattr(getattr(kind, "element", None), "kind", "") == "string":
+                    keys.setdefault(name, ((path, ""), done))
         return keys
 
 

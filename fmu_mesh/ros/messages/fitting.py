@@ -6,7 +6,7 @@ message in the same way as the running gateway, so a topic that passes can be se
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import msgspec
 import numpy as np
@@ -25,7 +25,6 @@ from .definitions import (
     Array,
     Basic,
     FieldType,
-    FieldTypes,
     MessageTypes,
     Nested,
     Part,
@@ -37,7 +36,7 @@ from .definitions import (
 from .keyed_rows import by_index
 from .topics import Direction, Port, Topic
 
-__all__ = ["TopicEntry", "carries", "check_topic", "default_type", "index_warnings"]
+__all__ = ["TopicEntry", "carries", "check_topic", "default_type"]
 
 _OTHER_NAMES: Mapping[str, str] = {"byte": "uint8", "char": "uint8", "Boolean": "bool", "Enumeration": "int64"}
 
@@ -89,8 +88,12 @@ def carries(target: str, source: str) -> bool:
     return np.can_cast(of, to) and not (to in FLOATS and of in ("int64", "uint64"))
 
 
-def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> Topic:
+def check_topic(
+    entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings, warnings: list[tuple[str, str, str]]
+) -> Topic:
     """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants.
+
+    The arguments of a finding go to ``warnings`` for each subscribed element by an index that could be a key.
 
     Returns:
         The topic; if it is published, with indexes instead of keys.
@@ -106,6 +109,10 @@ def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: 
         return topic
     for field, value in topic.constants:
         _check_constant(f"{entry.path}.constants.{field}", topic.message, (field, value), types, findings)
+    for path in (port.path for port in topic.ports if port.direction == "in"):
+        if (by_key := types.resolved(topic.message, path).by_key) != path:
+            found = f"'{path}' of '{topic.message}', whose elements may come in any order"
+            warnings.append((f"{entry.path}.fields.{path}", found, f"a key: {by_key}"))
     if len(findings) == before and topic.direction == "out":
         try:
             topic = _check_places(entry, topic, types, findings)
@@ -115,14 +122,6 @@ def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: 
         found = f"'{topic.message}' for '{topic.name}': {reason}"
         findings.add(f"{entry.path}.type", found, "messages that can be sent and received")
     return topic
-
-
-def index_warnings(entry: TopicEntry, topic: Topic, types: FieldTypes) -> Iterator[tuple[str, str, str]]:
-    """The subscribed fields with an index that could be a key, each as the arguments of `Findings.add`."""
-    for path in (port.path for port in topic.ports if topic.direction == "in"):
-        if (by_key := types.resolved(topic.message, path).by_key) != path:
-            found = f"'{path}' of '{topic.message}', whose elements may come in any order"
-            yield f"{entry.path}.fields.{path}", found, f"a key: {by_key}"
 
 
 def _why_not_carried(topic: Topic, types: MessageTypes) -> str | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -28,6 +28,9 @@ _EMPTY: Mapping[str, str | bool] = {"string": "", "bool": False}
 _Rows = dict[str, int]
 """The index of each key in a table."""
 
+_Table = tuple[str, str]
+"""Where the texts of a table are, as in `Key`."""
+
 
 def by_index(topic: Topic, types: FieldTypes) -> Topic:
     """The same published topic with an index for each key, and with constants for the keys and for what is not mapped.
@@ -39,64 +42,48 @@ def by_index(topic: Topic, types: FieldTypes) -> Topic:
     Raises:
         ValueError: two constants have the same key.
     """
-    order = _Order(topic, types)
-    ports = tuple(replace(port, path=order.indexed(port.path)) for port in topic.ports)
-    constants = [(order.indexed(path), value) for path, value in topic.constants]
-    constants += [own for own in order.keyed() if own not in constants]
+    tables, columns = _rows(topic, types)
+
+    def indexed(path: str) -> str:
+        steps = types.resolved(topic.message, path).steps
+        return "".join(f"[{tables[part.table][part.text]}]" if isinstance(part, Key) else text for part, text in steps)
+
+    ports = tuple(replace(port, path=indexed(port.path)) for port in topic.ports)
+    constants = [(indexed(path), value) for path, value in topic.constants]
+    for (head, tail), rows in tables.items():
+        keys = [(indexed(f"{head}[{index}]{tail}"), key) for key, index in rows.items()]
+        constants += [own for own in keys if own not in constants]
     used = {*(path for path, _ in constants), *(port.path for port in ports)}
-    for column, rows in order.columns.items():
-        for path in sorted({f"{column}[{index}]" for index in rows.values()} - used):
+    for column, table in columns.items():
+        for path in sorted({indexed(f"{column}[{index}]") for index in tables[table].values()} - used):
             if isinstance(kind := types.field(topic.message, path), Basic):
                 constants.append((path, math.nan if kind.kind in FLOATS else _EMPTY.get(kind.kind, 0)))
     return replace(topic, ports=ports, constants=tuple(constants))
 
 
-class _Order:
-    """The index of each key in one published message.
+def _rows(topic: Topic, types: FieldTypes) -> tuple[dict[_Table, _Rows], dict[str, _Table]]:
+    """The index of each key in the tables of a published message, and the tables of the arrays that are parallel."""
+    tables: dict[_Table, _Rows] = {}
+    columns: dict[str, _Table] = {}
+    for path in (*(port.path for port in topic.ports), *(path for path, _ in topic.constants)):
+        array = ""
+        for part, text in types.resolved(topic.message, path).steps:
+            if isinstance(part, Key):
+                rows = tables[part.table] = tables.get(part.table) or _fixed_rows(topic, *part.table)
+                rows.setdefault(part.text, next(index for index in count() if index not in rows.values()))
+                columns |= {} if part.holder is None else {array: part.table}
+            array += text
+    return tables, columns
 
-    Attributes:
-        columns: the mapped arrays that are parallel to keys, and the indexes of these.
-    """
 
-    def __init__(self, topic: Topic, types: FieldTypes) -> None:
-        self.columns: dict[str, _Rows] = {}
-        # By where their keys are: at `head[index]` in an array of texts, else at `head[index].tail`.
-        self._tables: dict[tuple[str, str], _Rows] = {}
-        self._topic = topic
-        self._types = types
-
-    def indexed(self, path: str) -> str:
-        """The path with an index for each key."""
-        reached: list[str] = []
-        for part, text, holder in self._types.resolved(self._topic.message, path).steps:
-            if not isinstance(part, Key):
-                reached.append(text)
-                continue
-            head, tail = "".join(reached[:holder]), f".{part.field}"
-            if holder is not None:
-                head, tail = f"{head}{tail}".removeprefix("."), ""
-            if (head, tail) not in self._tables:
-                self._tables[head, tail] = self._fixed(head, tail)
-            rows = self._tables[head, tail]
-            if holder is not None:
-                self.columns["".join(reached)] = rows
-            index = rows.setdefault(part.text, next(n for n in count() if n not in rows.values()))
-            reached.append(f"[{index}]")
-        return "".join(reached)
-
-    def keyed(self) -> Iterator[tuple[str, str]]:
-        """The place of each key, and the key."""
-        for (head, tail), rows in self._tables.items():
-            yield from ((f"{head}[{index}]{tail}", key) for key, index in rows.items())
-
-    def _fixed(self, head: str, tail: str) -> _Rows:
-        """The keys that constants give to a table."""
-        rows: _Rows = {}
-        for path, key in self._topic.constants:
-            found = re.fullmatch(rf"{re.escape(head)}\[(\d+)\]{re.escape(tail)}", path)
-            if found is not None and rows.setdefault(str(key), int(found[1])) != int(found[1]):
-                raise ValueError(f"'{key}' at '{path}', and at '{head}[{rows[str(key)]}]{tail}'")
-        return rows
+def _fixed_rows(topic: Topic, head: str, tail: str) -> _Rows:
+    """The keys that constants give to a table."""
+    rows: _Rows = {}
+    for path, key in topic.constants:
+        found = re.fullmatch(rf"{re.escape(head)}\[(\d+)\]{re.escape(tail)}", path)
+        if found is not None and rows.setdefault(str(key), int(found[1])) != int(found[1]):
+            raise ValueError(f"'{key}' at '{path}', and at '{head}[{rows[str(key)]}]{tail}'")
+    return rows
 
 
 class FieldReader:
@@ -112,27 +99,18 @@ class FieldReader:
         self._get = get
         self._strangers: list[str] = []
         self._known: set[str] = set()
-        # The keys of each table, by the path to it; each part has the table that it belongs to.
-        self._tables: dict[str, set[str]] = {}
-        self._paths: list[tuple[str, list[tuple[Part, str, int | None]]]] = []
-        for port in topic.ports:
-            steps: list[tuple[Part, str, int | None]] = []
-            reached: list[str] = []
-            for part, text, holder in types.resolved(topic.message, port.path).steps:
-                table = f"{''.join(reached[:holder])} {part.field}" if isinstance(part, Key) else ""
-                if isinstance(part, Key):
-                    self._tables.setdefault(table, set()).add(part.text)
-                steps.append((part, table, holder))
-                reached.append(text)
-            self._paths.append((port.path, steps))
-        self._found: dict[str, tuple[_Rows, int]] = {}  # in the present message, with the number of its rows
+        self._paths = [(port.path, types.resolved(topic.message, port.path).steps) for port in topic.ports]
+        self._keys: dict[_Table, set[str]] = {}
+        for part in (part for _, steps in self._paths for part, _ in steps if isinstance(part, Key)):
+            self._keys.setdefault(part.table, set()).add(part.text)
+        self._found: dict[_Table, tuple[_Rows, int]] = {}  # in the present message, with the number of its rows
 
     @property
     def warning(self) -> str:
         """What to say of ignored keys that the last message has brought for the first time; empty if there are none."""
         if not self._strangers:
             return ""
-        found, there = (listed(sorted(own)) for own in (self._strangers, set().union(*self._tables.values())))
+        found, there = (listed(sorted(own)) for own in (self._strangers, set().union(*self._keys.values())))
         return f"elements that no variable has are ignored: {found}; variables have {there}"
 
     def read(self, message: Any) -> list[Any]:  # noqa: ANN401 a message of any type
@@ -145,35 +123,39 @@ class FieldReader:
         self._found.clear()
         return [self._value(message, *own) for own in self._paths]
 
-    def _value(self, message: Any, path: str, steps: Sequence[tuple[Part, str, int | None]]) -> Any:  # noqa: ANN401 as above
+    def _value(self, message: Any, path: str, steps: Sequence[tuple[Part, str]]) -> Any:  # noqa: ANN401 as above
         values = [message]
-        for part, table, holder in steps:
+        for part, _ in steps:
             value = values[-1]
-            if isinstance(part, str):
-                values.append(self._get(value, part))
-                continue
-            index: int | None = part if isinstance(part, int) else None
-            if isinstance(part, Key):
-                if table not in self._found:
-                    own = self._get(values[holder], part.field) if holder is not None else None
-                    self._find(table, [self._get(element, part.field) for element in value] if own is None else own)
-                rows, length = self._found[table]
-                if len(value) not in (0, length):
-                    raise CdrError(f"'{path}' is one of {len(value)} elements for {length} texts in '{part.field}'")
-                index = rows.get(part.text) if len(value) else None
-                if index is None:
-                    return None
-            if index is None or index >= len(value):
-                raise CdrError(f"it has no '{path}'")
-            values.append(value[index])
+            index: int | None = None
+            match part:
+                case str():
+                    values.append(self._get(value, part))
+                    continue
+                case Key(field):
+                    if part.table not in self._found:
+                        self._find(part, values)
+                    rows, length = self._found[part.table]
+                    if len(value) not in (0, length):
+                        raise CdrError(f"'{path}' is one of {len(value)} elements for {length} texts in '{field}'")
+                    index = rows.get(part.text)
+                    if index is None or not len(value):
+                        return None
+                case _ if part >= len(value):
+                    raise CdrError(f"it has no '{path}'")
+            values.append(value[part if index is None else index])
         value = values[-1]
         is_nan = isinstance(value, float | np.floating) and math.isnan(value)
-        return None if is_nan and any(table for _, table, _ in steps) else value
+        return None if is_nan and any(isinstance(part, Key) for part, _ in steps) else value
 
-    def _find(self, table: str, texts: Sequence[str]) -> None:
+    def _find(self, key: Key, values: Sequence[Any]) -> None:
         """Find the rows of a table by the texts in a message; of two that are equal, the last counts."""
-        others = [text for text in texts if text not in self._tables[table]]
+        if key.holder is not None:
+            texts = self._get(values[key.holder], key.field)
+        else:
+            texts = [self._get(element, key.field) for element in values[-1]]
+        others = [text for text in texts if text not in self._keys[key.table]]
         self.ignored += len(others)
         self._strangers += [text for text in dict.fromkeys(others) if text not in self._known]
         self._known.update(self._strangers[: _MAX_STRANGERS - len(self._known)])
-        self._found[table] = {text: index for index, text in enumerate(texts)}, len(texts)
+        self._found[key.table] = {text: index for index, text in enumerate(texts)}, len(texts)
