@@ -161,12 +161,15 @@ def test_keys_that_no_path_has_are_counted_and_told_once() -> None:
     assert fields.ignored == 6
 
 
-def test_keys_of_stranger_do_not_fill_memory() -> None:
+def test_keys_of_stranger_do_not_fill_memory_or_terminal() -> None:
     fields = reader(JOINTS, "position[name=bare]")
+    fields.read(joints(["\x1b[31m" + "x" * 100_000], position=[0.0]))
+    assert "ignored: \\x1b[31mxxx" in fields.warning
+    assert len(fields.warning) < 200
     for number in range(1000):
         fields.read(joints([f"{number}"], position=[0.0]))
 
-    assert fields.ignored == 1000
+    assert fields.ignored == 1001
     assert len(fields._known) == 100
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
+from ...printing import printable
 from ...text import listed
 from .cdr import CdrError
 from .definitions import FLOATS, Basic, FieldTypes, Key, Part
@@ -22,7 +23,7 @@ from .topics import Topic
 
 __all__ = ["FieldReader", "by_index"]
 
-_MAX_STRANGERS = 100
+_MAX_STRANGERS, _MAX_SHOWN = 100, 80
 _EMPTY: Mapping[str, str | bool] = {"string": "", "bool": False}
 
 _Rows = dict[str, int]
@@ -111,7 +112,7 @@ class FieldReader:
         if not self._strangers:
             return ""
         found, there = (listed(sorted(own)) for own in (self._strangers, set().union(*self._keys.values())))
-        return f"elements that no variable has are ignored: {found}; variables have {there}"
+        return printable(f"elements that no variable has are ignored: {found}; variables have {there}")
 
     def read(self, message: Any) -> list[Any]:  # noqa: ANN401 a message of any type
         """The value at each path; None, which keeps the present value, if the message lacks a key or has NaN there.
@@ -156,6 +157,7 @@ class FieldReader:
             texts = [self._get(element, key.field) for element in values[-1]]
         others = [text for text in texts if text not in self._keys[key.table]]
         self.ignored += len(others)
-        self._strangers += [text for text in dict.fromkeys(others) if text not in self._known]
+        shown = dict.fromkeys(text[:_MAX_SHOWN] for text in others)
+        self._strangers += [text for text in shown if text not in self._known]
         self._known.update(self._strangers[: _MAX_STRANGERS - len(self._known)])
         self._found[key.table] = {text: index for index, text in enumerate(texts)}, len(texts)

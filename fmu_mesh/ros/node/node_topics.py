@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -112,20 +111,13 @@ def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> 
     Sequences are made as long as the paths need them.
     """
     _set_stamp(message, time)
-    set_stamp = partial(_set_stamp, time=time)
-    for path, constant in topic.constants:
-        owner, last = _place(message, path, set_stamp)
-        if isinstance(last, int):
-            owner[last] = constant
-        else:
-            setattr(owner, last, constant)
-    for port in topic.ports:
-        owner, last = _place(message, port.path, set_stamp)
-        value = values[port.variable.name]
+    given = [(port.path, values[port.variable.name], port.variable.shape) for port in topic.ports]
+    for path, value, shape in (*given, *((path, value, ()) for path, value in topic.constants)):
+        owner, last = _place(message, path, lambda element: _set_stamp(element, time))
         if isinstance(last, int):
             owner[last] = value
-        elif port.variable.shape:
-            setattr(owner, last, flattened(value, len(port.variable.shape)))
+        elif shape:
+            setattr(owner, last, flattened(value, len(shape)))
         else:
             # A field of a ROS message refuses every type but its own, so an int must become a float.
             setattr(owner, last, type(getattr(owner, last))(value))
