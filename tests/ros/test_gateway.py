@@ -18,6 +18,7 @@ import zenoh
 
 from fmu_mesh.ros.messages.cdr import Codec
 from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
+from fmu_mesh.ros.messages.ros_names import dds_type
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 
@@ -278,8 +279,11 @@ def test_transforms_go_out_an_element_comes_in_and_none_changes_nothing(place: P
     assert mesh.wait() == 130, mesh.errors
 
 
-def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place, ros: Ros) -> None:
-    codec = Codec(MessageTypes("jazzy"), JOINTS)
+@pytest.mark.parametrize("profile", ["ros2dds", "rmw_zenoh"])
+def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place, ros: Ros, profile: str) -> None:
+    types = MessageTypes("jazzy")
+    codec = Codec(types, JOINTS)
+    key = "{}" if profile == "ros2dds" else f"0/{{}}/{dds_type(JOINTS)}/{types.type_hash(JOINTS)}"
     joints = {f"position[name={name}]": f"{name}.y" for name in ("weak", "bare")}
     config = write_config(
         place.folder,
@@ -290,6 +294,7 @@ def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place,
         simulation={"step_size": 0.01, "real_time_factor": 1},
         ros={
             "connect": [f"tcp/127.0.0.1:{ros.port}"],
+            "profile": profile,
             "topics": [
                 {"topic": "/command", "type": JOINTS, "fields": {own: f"{joints[own][:-2]}.u" for own in joints}},
                 {"topic": "/states", "type": JOINTS, "fields": joints},
@@ -299,12 +304,13 @@ def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place,
 
     def send(names: list[str], position: list[float]) -> None:
         data = codec.encode(codec.empty() | {"name": names, "position": position})
-        ros.session.put("command", data, congestion_control=zenoh.CongestionControl.BLOCK)
+        ros.session.put(key.format("command"), data, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def newest() -> tuple[list[str], list[float]]:
-        message = codec.decode(ros.samples["states"][-1])
+        message = codec.decode(states[-1].payload.to_bytes())
         return message["name"], message["position"].tolist()
 
+    states: list[zenoh.Sample] = []
     puts: dict[str, list[float]] = {}
 
     def keep(sample: zenoh.Sample) -> None:
@@ -315,8 +321,9 @@ def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place,
         send(["bare", "weak"], [0.0, 0.0])
         return len(puts) == 2
 
+    ros.session.declare_subscriber(key.format("states"), states.append)
     mesh = place.start("launch", config, "--no-progress")
-    wait_until(lambda: "states" in ros.samples, "the first state")
+    wait_until(lambda: bool(states), "the first state")
     send(["weak", "bare"], [0.5, -0.5])
     wait_until(lambda: newest() == (["weak", "bare"], [0.5, -0.5]), "both commands at their joints")
     send(["bare", "weak"], [-0.25, 0.25])
