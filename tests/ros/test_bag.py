@@ -523,7 +523,7 @@ def test_joints_of_a_bag_are_recorded_and_played_by_their_names(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("choice", "says"),
     [
-        ("/joint_states:position[name=none]=rod.u", "there is no message of /joint_states"),
+        ("/joint_states:position[name=none]=rod.u", "no message of /joint_states in"),
         ("/joint_states:position[nam=rod]=rod.u", "'nam' is no text that tells its elements apart"),
     ],
 )

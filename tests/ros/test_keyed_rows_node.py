@@ -174,6 +174,18 @@ def test_node_of_one_fmu_reads_and_publishes_by_name(ros: Ros, capfd: pytest.Cap
     assert "a message on '/given' was left out: 'position[name=weak]' is one of 1 elements for 2 texts" in said
 
 
+def test_index_where_a_key_is_possible_is_warned_of(ros: Ros, capfd: pytest.CaptureFixture[str]) -> None:
+    fields = {"/given": "{'position[0]': u}", "/taken": "{'position[0]': y}"}
+    messages = [f"{topic}: {{type: {JOINTS}, fields: {own}}}" for topic, own in fields.items()]
+    node = ros.fmu(fmu_path=str(FMUS / "Gain.fmu"), messages=messages)
+
+    node.trigger_configure()
+
+    said = capfd.readouterr().err
+    assert "'position[0]' of '/given', whose elements may come in any order; expected a key: position[name=…]" in said
+    assert "of '/taken'" not in said
+
+
 @pytest.mark.parametrize(
     ("field", "complaint"),
     [
