@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from ...errors import ConfigurationError
 from ...installing import importing
@@ -99,14 +100,12 @@ class Key(msgspec.Struct, frozen=True):
     """A part of a path that finds an element by the text of a field; without ``field`` it is an index that is wrong.
 
     Attributes:
-        table: where the texts of the elements are: a path, which an index follows, and the rest.
-        holder: how many parts lead to the message with an array of the texts; None if each element has its own.
+        table: where the texts are: a path, which an index follows, and the rest; none if they are in a parallel array.
     """
 
     field: str
     text: str
     table: tuple[str, str] = ("", "")
-    holder: int | None = None
 
 
 Part = str | int | Key
@@ -155,12 +154,12 @@ class FieldTypes:
     def resolved(self, message: str, path: str) -> FieldPath:
         """What a path leads to; raises as `field` does."""
         kind: FieldType = Nested(message)
-        outer: list[tuple[int, str, str]] = []  # the messages on the way: how many parts lead there, and which
+        outer: list[tuple[str, str]] = []  # the messages on the way, by their paths
         steps: list[tuple[Part, str]] = []
         reached = by_key = ""
         for part, text in _pieces(path) or [("", "")]:
             if isinstance(kind, Nested):
-                outer.append((len(steps), reached, kind.message))
+                outer.append((reached, kind.message))
             element = kind.element if isinstance(kind, Array | Sequence) else None
             keys = self._keys(element, outer, reached) if element is not None else {}
             found = dict(self.fields(kind.message)).get(str(part)) if isinstance(kind, Nested) else element
@@ -179,11 +178,11 @@ class FieldTypes:
                     names = tuple(f"{reached}[{key}={own}]{rest}" for key in keys)
                 case _:
                     reason = _index_problem(kind, part)
-                    likely = (key for key, (_, at) in keys.items() if (at is None) == isinstance(element, Nested))
+                    likely = (key for key, (_, rest) in keys.items() if bool(rest) == isinstance(element, Nested))
                     usual = next(filter(_USUAL_KEY.fullmatch, likely), "")
             if found is None or reason:
                 raise UnknownField(message, path, names or tuple(self.paths(message)), reason)
-            steps.append((Key(part.field, part.text, *keys[part.field]) if isinstance(part, Key) else part, text))
+            steps.append((replace(part, table=keys[part.field]) if isinstance(part, Key) else part, text))
             kind, reached = found, reached + text
             by_key += f"[{usual}=…]" if usual else text
         return FieldPath(kind, tuple(steps), by_key)
@@ -198,18 +197,15 @@ class FieldTypes:
             else:
                 yield f"{prefix}{name}"
 
-    def _keys(
-        self, element: Basic | Nested, outer: list[tuple[int, str, str]], array: str
-    ) -> dict[str, tuple[tuple[str, str], int | None]]:
-        """The keys that an array of such elements can have, with the table and the holder of each."""
+    def _keys(self, element: Basic | Nested, outer: list[tuple[str, str]], array: str) -> dict[str, tuple[str, str]]:
+        """The keys that an array of such elements can have, with the table of each."""
         own = self.fields(element.message) if isinstance(element, Nested) else ()
-        texts = (name for name, kind in own if getattr(kind, "kind", "") == "string")
-        keys: dict[str, tuple[tuple[str, str], int | None]] = {name: ((array, f".{name}"), None) for name in texts}
-        for done, reached, message in reversed(outer):
+        keys = {name: (array, f".{name}") for name, kind in own if getattr(kind, "kind", "") == "string"}
+        for reached, message in reversed(outer):
             for name, kind in self.fields(message):
                 path = f"{reached}.{name}" if reached else name
                 if path != array and getattr(getattr(kind, "element", None), "kind", "") == "string":
-                    keys.setdefault(name, ((path, ""), done))
+                    keys.setdefault(name, (path, ""))
         return keys
 
 

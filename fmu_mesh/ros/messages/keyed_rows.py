@@ -72,7 +72,7 @@ def _rows(topic: Topic, types: FieldTypes) -> tuple[dict[_Table, _Rows], dict[st
             if isinstance(part, Key):
                 rows = tables[part.table] = tables.get(part.table) or _fixed_rows(topic, *part.table)
                 rows.setdefault(part.text, next(index for index in count() if index not in rows.values()))
-                columns |= {} if part.holder is None else {array: part.table}
+                columns |= {} if part.table[1] else {array: part.table}
             array += text
     return tables, columns
 
@@ -125,36 +125,38 @@ class FieldReader:
         return [self._value(message, *own) for own in self._paths]
 
     def _value(self, message: Any, path: str, steps: Sequence[tuple[Part, str]]) -> Any:  # noqa: ANN401 as above
-        values = [message]
-        for part, _ in steps:
-            value = values[-1]
-            index: int | None = None
+        value, reached = message, ""
+        values = {reached: message}
+        for part, text in steps:
             match part:
                 case str():
-                    values.append(self._get(value, part))
-                    continue
+                    value = self._get(value, part)
                 case Key(field):
                     if part.table not in self._found:
-                        self._find(part, values)
+                        self._find(part, value, values)
                     rows, length = self._found[part.table]
                     if len(value) not in (0, length):
                         raise CdrError(f"'{path}' is one of {len(value)} elements for {length} texts in '{field}'")
                     index = rows.get(part.text)
                     if index is None or not len(value):
                         return None
+                    value = value[index]
                 case _ if part >= len(value):
                     raise CdrError(f"it has no '{path}'")
-            values.append(value[part if index is None else index])
-        value = values[-1]
+                case _:
+                    value = value[part]
+            reached += text
+            values[reached] = value
         is_nan = isinstance(value, float | np.floating) and math.isnan(value)
         return None if is_nan and any(isinstance(part, Key) for part, _ in steps) else value
 
-    def _find(self, key: Key, values: Sequence[Any]) -> None:
+    def _find(self, key: Key, array: Any, values: Mapping[str, Any]) -> None:  # noqa: ANN401 as above
         """Find the rows of a table by the texts in a message; of two that are equal, the last counts."""
-        if key.holder is not None:
-            texts = self._get(values[key.holder], key.field)
+        if key.table[1]:
+            texts = [self._get(element, key.field) for element in array]
         else:
-            texts = [self._get(element, key.field) for element in values[-1]]
+            holder = key.table[0].removesuffix(key.field).removesuffix(".")
+            texts = self._get(values[holder], key.field)
         others = [text for text in texts if text not in self._keys[key.table]]
         self.ignored += len(others)
         shown = dict.fromkeys(text[:_MAX_SHOWN] for text in others)
