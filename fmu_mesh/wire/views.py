@@ -255,6 +255,7 @@ class RosView(msgspec.Struct, frozen=True):
         connected: whether a bridge or router answers.
         activity: the same as text, such as `nobody answers at tcp/127.0.0.1:7447`.
         other_clocks: other publishers of `/clock`, as text.
+        ignored: by topic, how many elements of messages had keys that no variable has.
     """
 
     profile: str
@@ -262,6 +263,7 @@ class RosView(msgspec.Struct, frozen=True):
     connected: bool
     activity: str
     other_clocks: tuple[str, ...] = ()
+    ignored: dict[str, int] = {}
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

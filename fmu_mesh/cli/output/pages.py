@@ -65,6 +65,11 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
+            *(
+                ("ROS", f"{count} elements on {topic} were ignored: no variable has their keys")
+                for view in ros
+                for topic, count in view.ignored.items()
+            ),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )

@@ -77,7 +77,7 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options:
             hint="Say when the first one is, as with `start=0.0`.",
         )
     if not moments:
-        raise ConfigurationError(f"there is no message of {', '.join(names)} in '{bag.path}'.")
+        raise ConfigurationError(f"no message of {', '.join(names)} in '{bag.path}' has a value for the mesh.")
     count, first = play(client, moments, step_points, options.timeout)
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)

@@ -86,11 +86,15 @@ class Gateway:
     The caller closes the session and the profiles; the first of these has `/clock`.
 
     Call `open`, then `run`, then `close`.
+
+    Attributes:
+        ignored: by topic, how many elements of messages had keys that no variable has.
     """
 
     def __init__(
         self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: dict[str, Profile]
     ) -> None:
+        self.ignored: dict[str, int] = {}
         self._plan = plan
         self._mesh = mesh
         self._keys = keys
@@ -251,7 +255,13 @@ class Gateway:
             return
         attachment = encode_origin(stamp / 1_000_000_000 if stamp is not None else None, subscribed.who)
         for key, value in zip(subscribed.keys, values, strict=True):
-            self._publishers[key].put(encode_value(value), attachment=attachment)
+            if value is not None:
+                self._publishers[key].put(encode_value(value), attachment=attachment)
+        fields = subscribed.disassembler.fields
+        if fields.ignored:
+            self.ignored[subscribed.disassembler.topic.name] = fields.ignored
+            if fields.warning:
+                subscribed.warn(fields.warning)
 
     # --- the queue
 
