@@ -59,10 +59,8 @@ def built_types_or_skip() -> dict[str, str]:
         The environment in which another process can import them, too.
     """
     script = Path(__file__).with_name("build_interfaces")
-    command = [script, "--check"]
-    if subprocess.run(
-        command, check=False, env={**os.environ, "PYTHON": sys.executable}, timeout=DEADLINE_S
-    ).returncode:
+    asked = {**os.environ, "PYTHON": sys.executable}
+    if subprocess.run([str(script), "--check"], check=False, env=asked, timeout=DEADLINE_S).returncode:
         pytest.skip(
             "ROS's generator has not built simulation_interfaces; tests/ros/build_interfaces", allow_module_level=True
         )
