@@ -140,13 +140,16 @@ def test_the_executable_gateway_has_the_names_that_the_user_gives(ros: Ros, pack
             process.wait(DEADLINE_S)
 
 
-def test_a_launch_file_hears_that_a_mesh_is_ready(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("arguments", [[], ["--paused"]])
+def test_a_launch_file_hears_that_a_mesh_is_ready(
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str]
+) -> None:
     stand_in(monkeypatch)
     from fmu_mesh_ros.actions import Mesh  # noqa: PLC0415 it imports the stand-in
 
     file = config(tmp_path, stop_time=600.0, real_time_factor=1)
 
-    with Launch(ros, tmp_path, observed(Mesh(config=str(file)))) as launch:
+    with Launch(ros, tmp_path, observed(Mesh(config=str(file), arguments=arguments))) as launch:
         launch.until_over()
 
     assert launch.shut_down == "ready"

@@ -21,7 +21,7 @@ __all__ = ["Mesh", "MeshReady", "OnMeshReady"]
 
 
 class MeshReady(Event):
-    """All instances of a mesh are initialized, and it runs.
+    """All instances of a mesh are initialized: it runs, or it is paused at its first point if that was asked for.
 
     Attributes:
         action: the `Mesh`.
@@ -69,8 +69,9 @@ class Mesh(ExecuteProcess):
         # A pipe is no terminal, and a progress line would fill the log.
         command = [str(folder / "mesh"), config, "--no-progress", *arguments]
         super().__init__(cmd=command, **{"name": "mesh", "output": "screen", **options})
+        state = "paused" if "--paused" in arguments else "running"
         self._waiting = ExecuteProcess(
-            cmd=[str(folder / "wait"), config, "--timeout", f"{ready_timeout:g}"],
+            cmd=[str(folder / "wait"), config, "--state", state, "--timeout", f"{ready_timeout:g}"],
             name="mesh_ready",
             output="screen",
             on_exit=self._waited,
