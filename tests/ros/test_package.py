@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.helpers import DEADLINE_S, FMUS, write_config
+from tests.helpers import DEADLINE_S, FMUS, Place, write_config
 from tests.ros.ros_peer import Ros, ros_or_skip
 
 ros_or_skip()
@@ -35,8 +35,9 @@ sys.exit({name}())
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def package(place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder that has `lib/fmu_mesh_ros`, as `local_setup.sh` makes it known."""
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
     if (installed := os.environ.get("FMU_MESH_ROS_INSTALLED")) is not None:
         assert get_package_prefix("fmu_mesh_ros") == installed
         return Path(installed)

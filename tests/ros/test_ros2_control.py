@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.helpers import DEADLINE_S
+from tests.helpers import DEADLINE_S, Place
 from tests.ros.ros_peer import Ros, ros_or_skip
 
 ros_or_skip()
@@ -27,7 +27,7 @@ pytest.importorskip("sensor_msgs", reason="pip install '.[test-ros]'")
 
 ARM = Path(__file__).parents[2] / "examples/ros/ros2_control_arm.yaml"
 NEAR = 0.02
-"""How near a joint has to come to its target, in rad: the arm has no integral part, and friction only by velocity."""
+"""How near a joint has to come to its target, in rad and rad/s. Every other target is at least 0.4 rad away."""
 
 
 class Hardware:
@@ -75,7 +75,7 @@ class Hardware:
 
 
 @pytest.fixture
-def hardware(tmp_path: Path) -> Iterator[Hardware]:
+def hardware(place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hardware]:
     """The hardware, with the arm and its gateway behind it."""
     config = yaml.safe_load(ARM.read_text(encoding="utf-8"))
     for instance in config["instances"].values():
@@ -84,6 +84,7 @@ def hardware(tmp_path: Path) -> Iterator[Hardware]:
     config["record"]["file"] = str(tmp_path / "arm.csv")
     file = tmp_path / "arm.yaml"
     file.write_text(yaml.safe_dump(config), encoding="utf-8")
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
     with Ros(tmp_path / "log") as ros:
         hardware = Hardware(ros)
         commands = (
