@@ -132,8 +132,14 @@ def test_the_executable_gateway_has_the_names_that_the_user_gives(ros: Ros, pack
     try:
         ros.matched(subscription)
         ros.until(lambda: angles, "an angle")
-        nodes = ros.peer("looking").get_publishers_info_by_topic("/pendulum/a")
-        assert [(node.node_namespace, node.node_name) for node in nodes] == [("/lab", "twin")]
+        looking = ros.peer("looking")
+
+        def named() -> bool:
+            """ROS hears of a publisher before it knows whose that is."""
+            found = looking.get_publishers_info_by_topic("/pendulum/a")
+            return [(own.node_namespace, own.node_name) for own in found] == [("/lab", "twin")]
+
+        ros.until(named, "a publisher of /lab/twin, and no other one")
     finally:
         for process in (mesh, gateway):
             process.terminate()
