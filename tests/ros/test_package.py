@@ -67,24 +67,23 @@ def config(folder: Path, **simulation: Any) -> Path:  # noqa: ANN401 whatever a 
     return write_config(folder, simulation={"stop_time": 2.0, "step_size": 0.01, **simulation})
 
 
-def run(package: Path, name: str, *arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:  # noqa: ANN401
+def run(package: Path, folder: Path, name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [str(package / "lib/fmu_mesh_ros" / name), *arguments]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S, **options)
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S, cwd=folder)
 
 
 def observed(mesh: Any) -> LaunchDescription:  # noqa: ANN401 the class of the package
-    """A launch file with this mesh, which notes in `mesh.seen` what happens."""
+    """A launch file with this mesh that ends everything when it is ready."""
     from fmu_mesh_ros.actions import OnMeshReady  # noqa: PLC0415 it imports the stand-in
 
-    from tests.ros.launching import OnProcessExit, RegisterEventHandler, Shutdown  # noqa: PLC0415 beside it
+    from tests.ros.launching import RegisterEventHandler, Shutdown  # noqa: PLC0415 beside it
 
     ready = OnMeshReady(target_action=mesh, on_ready=[Shutdown(reason="ready")])
-    ended = OnProcessExit(target_action=mesh, on_exit=[])
-    return LaunchDescription([RegisterEventHandler(ready), RegisterEventHandler(ended), mesh])
+    return LaunchDescription([RegisterEventHandler(ready), mesh])
 
 
 def test_the_executable_mesh_runs_a_mesh_to_its_end(package: Path, tmp_path: Path) -> None:
-    done = run(package, "mesh", str(config(tmp_path)), cwd=tmp_path)
+    done = run(package, tmp_path, "mesh", str(config(tmp_path)))
 
     assert done.returncode == 0, done.stderr
     assert "200 points in" in done.stdout
@@ -102,7 +101,7 @@ def test_the_executable_mesh_runs_a_mesh_to_its_end(package: Path, tmp_path: Pat
 def test_an_executable_says_what_is_wrong_with_its_arguments(
     package: Path, tmp_path: Path, name: str, arguments: tuple[str, ...], text: str
 ) -> None:
-    done = run(package, name, *arguments, cwd=tmp_path)
+    done = run(package, tmp_path, name, *arguments)
 
     assert done.returncode == 2
     assert text in done.stderr
