@@ -255,7 +255,8 @@ def undeclare_all(*entities: Iterable[Any]) -> None:
 class Question(msgspec.Struct, frozen=True):
     """A query that waits ``deadline_s`` seconds for its answer; an error names ``whom`` it was for.
 
-    It overtakes messages of a lower ``priority``, and follows earlier ones of the same.
+    It overtakes messages of a lower ``priority``, and follows earlier ones of the same. It is sent ``once`` where its
+    repetition would have an effect: then the loss of the answer ends in the deadline.
     """
 
     key: str
@@ -264,6 +265,7 @@ class Question(msgspec.Struct, frozen=True):
     payload: bytes | None = None
     attachment: bytes | None = None
     priority: zenoh.Priority = zenoh.Priority.DEFAULT
+    once: bool = False
 
 
 def ask(session: zenoh.Session, question: Question, over: Callable[[], bool] = lambda: False) -> bytes:
@@ -287,14 +289,15 @@ def answers(
         MeshLost: the answer was an error, whose text is the message; or the answer is not needed any more.
     """
     end = time.monotonic() + question.deadline_s
-    changed = threading.Event()
+    changed, sent = threading.Event(), False
     encoding = json_encoding if question.payload is not None else None
     with session.declare_querier(question.key, timeout=question.deadline_s, priority=question.priority) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
             while (left := end - time.monotonic()) > 0:
                 changed.clear()
-                if matches(querier):
+                if matches(querier) and not (sent and question.once):
+                    sent = True
                     # Zenoh does not report that the process of the queryable is gone: it would wait for the timeout.
                     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
                     handler = Callback(replies.put, partial(replies.put, None))

@@ -261,10 +261,16 @@ class RosView(msgspec.Struct, frozen=True):
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A query to `…/mesh/command`; ``points`` is for `step` only."""
+    """A query to `…/mesh/command`.
+
+    Attributes:
+        points: for `step` only.
+        wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests.
+    """
 
     command: Literal["pause", "resume", "step", "stop"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
+    wait: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
@@ -273,9 +279,11 @@ class CommandAnswer(msgspec.Struct, frozen=True):
     Attributes:
         point: the last point that every instance has reached.
         hold: the point at which all of them will pause; None if the mesh continues to run.
+        error: why an answer that has waited comes before they have.
     """
 
     command: str
     state: MeshState
     point: int
     hold: int | None = None
+    error: ErrorReport | None = None

@@ -23,8 +23,9 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 import zenoh
+from msgspec.structs import replace
 
-from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
+from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
 from ...text import did_you_mean, is_pattern, listed, matching, shown
 from ..keys import SUBSCRIBED, Keys
 from ..messages import decode_json
@@ -50,6 +51,8 @@ View = TypeVar("View")
 
 # How often a wait for the mesh asks whether it has ended meanwhile; there is no event for both.
 _END_CHECK_S = 0.05
+_ANSWER_S = 0.25
+"""So long before the deadline of `rest` the mesh says what it still waits for, and this answer is in time."""
 
 
 class MeshClient:
@@ -199,7 +202,7 @@ class MeshClient:
             key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
             # An answer may be lost where this process reads too slowly; it is asked for again.
             for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
-                for sample in self._ask(asked, f"the values of instance '{instance}'"):
+                for sample in self._ask(Question(asked, f"the values of instance '{instance}'", self._timeout_s)):
                     if (reading := reading_among(own, sample)) is not None:
                         readings[reading.key] = reading
         return [readings[target.key] for target in targets if target.key in readings]
@@ -218,21 +221,48 @@ class MeshClient:
 
     def command(self, command: Command) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
-        payload = msgspec.json.encode(command)
-        return self._view(self.keys.mesh_key("command"), CommandAnswer, self._who, payload)
+        return self._command(command, self._timeout_s)
+
+    def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
+        """Pause or step the mesh; the answer comes when it has paused, and has the point at which it has.
+
+        Args:
+            command: what it does.
+            timeout_s: the deadline in s, by default that of a query.
+
+        Raises:
+            MeshLost: it ended, was resumed, or was paused by somebody else before, or did not pause in time.
+            FmuMeshError: it has failed before.
+        """
+        timeout_s = timeout_s if timeout_s is not None else self._timeout_s
+        wait_s = max(timeout_s - _ANSWER_S, timeout_s / 2)
+        answer = self._command(replace(command, wait=wait_s), timeout_s)
+        if answer.error is not None:
+            raise from_report(answer.error)
+        return answer
+
+    def _command(self, command: Command, deadline_s: float) -> CommandAnswer:
+        key, payload = self.keys.mesh_key("command"), msgspec.json.encode(command)
+        sample, *_ = self._ask(Question(key, self._who, deadline_s, payload, once=True))
+        return _understood(sample, CommandAnswer, self._who)
 
     @contextmanager
     def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
-        """Every status of the mesh from now on, ten times a second, to the last one; none if the mesh is gone already.
+        """The status of the mesh and every later one to the last; none if the mesh is gone already.
 
-        After ``timeout_s`` seconds (by default the deadline of a query) the iterator raises `DeadlineExceeded`.
+        They come ten times a second, and at once with another state or when the mesh has come to rest. After
+        ``timeout_s`` seconds (by default the deadline of a query) the iterator raises `DeadlineExceeded`.
         """
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
         with Follower[MeshStatus](self.session, self.keys) as follower:
             follower.subscribe({self.keys.mesh_key("status")}, partial(_decoded, kind=MeshStatus))
             there = self._is_there(follower, min(timeout_s, self._timeout_s))
-            yield follower.to_the_last(deadline) if there else iter(())
+            now = []
+            if there:
+                with suppress(FmuMeshError):  # it has just ended, and its last status has come
+                    now.append(self.status())
+            yield chain(now, follower.to_the_last(deadline)) if there else iter(())
 
     @contextmanager
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
@@ -340,15 +370,13 @@ class MeshClient:
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> View:
-        return _understood(self._ask(key, who, payload, attachment)[0], kind, who)
+        return _understood(self._ask(Question(key, who, self._timeout_s, payload, attachment))[0], kind, who)
 
-    def _ask(
-        self, key: str, who: str, payload: bytes | None = None, attachment: bytes | None = None
-    ) -> list[zenoh.Sample]:
+    def _ask(self, question: Question) -> list[zenoh.Sample]:
         try:
-            return answers(self.session, Question(key, who, self._timeout_s, payload, attachment), self._is_over)
+            return answers(self.session, question, self._is_over)
         except DeadlineExceeded:
-            text = f"no answer from {who} within {self._timeout_s:g} s."
+            text = f"no answer from {question.whom} within {question.deadline_s:g} s."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
         except MeshLost as error:
             self._is_over()
