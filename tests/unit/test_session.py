@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 import zenoh
 
-from fmu_mesh.errors import ConfigurationError, MeshLost
+from fmu_mesh.errors import ConfigurationError, DeadlineExceeded, MeshLost
 from fmu_mesh.wire.client.mesh_client import key_expression
 from fmu_mesh.wire.session import Question, Wiring, ask, close_session, open_session
 from tests.helpers import DEADLINE_S
@@ -54,6 +54,24 @@ def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
     with pytest.raises(MeshLost, match="this process does not wait any more"):
         ask(session, Question("nobody/there", "nobody", 10 * DEADLINE_S), lambda: True)
 
+    close_session(session)
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_question_that_is_sent_once_is_not_repeated(once: bool) -> None:  # noqa: FBT001  a parameter of the test
+    session, asked = open_session(Wiring()), threading.Semaphore(0)
+
+    def answer_nothing(query: zenoh.Query) -> None:
+        asked.release()
+        query.drop()
+
+    queryable = session.declare_queryable("somebody/there", answer_nothing)
+    with pytest.raises(DeadlineExceeded):
+        ask(session, Question("somebody/there", "somebody", 0.5, once=once))
+
+    assert asked.acquire(timeout=DEADLINE_S)
+    assert asked.acquire(blocking=False) is not once
+    queryable.undeclare()
     close_session(session)
 
 
