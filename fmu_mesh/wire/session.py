@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import queue
 import re
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -129,6 +130,32 @@ class Wiring(msgspec.Struct, frozen=True):
 def is_socket(endpoint: str) -> bool:
     """Whether an endpoint is a Unix socket, which is protected by the permissions of its folder."""
     return endpoint.startswith("unixsock-stream/")
+
+
+def host_of(endpoint: str) -> str:
+    """The address or the name of the host in an endpoint of a network."""
+    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+    return address.rpartition(":")[0].strip("[]")
+
+
+def is_of_this_host(endpoint: str) -> bool:
+    """Whether it is a Unix socket, or an address of an interface of this host."""
+    if is_socket(endpoint):
+        return True
+    try:
+        found = socket.getaddrinfo(host_of(endpoint), None, type=socket.SOCK_DGRAM)
+    except OSError:  # nobody knows this name, as yet
+        return False
+    return any(_has(family, address) for family, _, _, _, address in found)
+
+
+def _has(family: int, address: Any) -> bool:  # noqa: ANN401  its form depends on the family
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(address)  # the system refuses the addresses of others
+        except OSError:
+            return False
+        return True
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:

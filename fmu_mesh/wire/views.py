@@ -23,6 +23,7 @@ __all__ = [
     "MeshInfo",
     "MeshState",
     "MeshStatus",
+    "RosTopicView",
     "RosView",
     "SetAnswer",
     "VariableView",
@@ -243,6 +244,17 @@ class MeshStatus(msgspec.Struct, frozen=True):
     cut: dict[str, float] = {}
 
 
+class RosTopicView(msgspec.Struct, frozen=True):
+    """A topic that a gateway publishes (``direction`` out) or subscribes to (in), and whether it is ``matched``.
+
+    That is: whether somebody subscribes to it whom its samples reach, or somebody publishes it.
+    """
+
+    topic: str
+    direction: Literal["in", "out"]
+    matched: bool
+
+
 class RosView(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/ros/<id>`: the link of a gateway to ROS.
 
@@ -258,6 +270,7 @@ class RosView(msgspec.Struct, frozen=True):
     connected: bool
     activity: str
     other_clocks: tuple[str, ...] = ()
+    topics: tuple[RosTopicView, ...] = ()
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

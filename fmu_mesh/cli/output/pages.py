@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import msgspec
 
 from ...pictures.tables import pairs, table
 from ...simtime import ENDLESS
-from ...text import short_number
+from ...text import listed, short_number
 from ...wire.client.readings import Reading
-from ...wire.views import ConnectionView, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
+from ...wire.views import (
+    ConnectionView,
+    InstanceInfo,
+    InstanceStatus,
+    MeshInfo,
+    MeshStatus,
+    RosTopicView,
+    RosView,
+    VariableView,
+)
 
 __all__ = [
     "cells",
@@ -65,9 +74,25 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
+            *(("ROS", text) for view in ros if view.connected for text in _matched(view.topics)),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
+
+
+_MATCHED = {
+    ("out", True): "somebody subscribes to",
+    ("out", False): "nobody subscribes to",
+    ("in", True): "somebody publishes",
+    ("in", False): "nobody publishes",
+}
+
+
+def _matched(topics: Sequence[RosTopicView]) -> Iterator[str]:
+    """Which topics of a gateway have somebody in ROS, and which have not."""
+    for (direction, matched), words in _MATCHED.items():
+        if names := [own.topic for own in topics if (own.direction, own.matched) == (direction, matched)]:
+            yield f"{words} {listed(names)}"
 
 
 def instance_status(status: InstanceStatus) -> list[str]:
