@@ -144,7 +144,7 @@ def is_of_this_host(endpoint: str) -> bool:
         return True
     try:
         found = socket.getaddrinfo(host_of(endpoint), None, type=socket.SOCK_DGRAM)
-    except OSError:  # nobody knows this name, as yet
+    except (OSError, UnicodeError):  # nobody knows this name, as yet, or it is none
         return False
     return any(_has(family, address) for family, _, _, _, address in found)
 

@@ -6,12 +6,13 @@ import socket
 import threading
 from typing import cast
 
+import psutil
 import pytest
 import zenoh
 
 from fmu_mesh.errors import ConfigurationError, DeadlineExceeded, MeshLost
 from fmu_mesh.wire.client.mesh_client import key_expression
-from fmu_mesh.wire.session import Question, Wiring, ask, close_session, open_session
+from fmu_mesh.wire.session import Question, Wiring, ask, close_session, is_of_this_host, open_session
 from tests.helpers import DEADLINE_S
 
 
@@ -55,6 +56,28 @@ def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
         ask(session, Question("nobody/there", "nobody", 10 * DEADLINE_S), lambda: True)
 
     close_session(session)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "here"),
+    [
+        ("unixsock-stream//run/fmu_mesh/a.sock", True),
+        ("tcp/127.0.0.1:7447", True),
+        ("tls/localhost:7447?rel=1#iface=lo", True),
+        ("udp/127.1.2.3:7447", True),
+        ("tcp/192.0.2.1:7447", False),  # an address for documentation
+        ("tcp/[2001:db8::1]:7447", False),
+        (f"tcp/{64 * 'x'}:7447", False),  # too long for a name
+    ],
+)
+def test_an_endpoint_is_of_this_host_or_of_another(endpoint: str, here: bool) -> None:  # noqa: FBT001  a parameter
+    assert is_of_this_host(endpoint) is here
+
+
+def test_all_addresses_of_the_interfaces_are_of_this_host() -> None:
+    own = [one.address for several in psutil.net_if_addrs().values() for one in several if one.family == socket.AF_INET]
+
+    assert [address for address in own if not is_of_this_host(f"tcp/{address}:7447")] == []
 
 
 @pytest.mark.parametrize("once", [True, False])
