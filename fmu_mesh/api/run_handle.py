@@ -354,13 +354,9 @@ class Run:
     def pause(self, *, timeout: float | None = None) -> CommandAnswer:
         """Pause the mesh; returns when all instances have reached the point of the answer.
 
-        Args:
-            timeout: the longest time to wait for it in s; None: the deadline of every question.
-
         Raises:
-            DeadlineExceeded: they have not, in time; the mesh pauses later.
+            DeadlineExceeded: they have not in ``timeout`` s, by default that of every question; the mesh pauses later.
             MeshLost: the mesh has ended, or another program has let it run on or pause elsewhere.
-            FmuMeshError: it has failed.
         """
         return self._steered().rest(Command("pause"), timeout)
 

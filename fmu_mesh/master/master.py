@@ -195,9 +195,8 @@ class Master:
         states, awake = self._states, self._awake
         try:
             while not states.is_over:
-                pause_s = self._decide(now := awake())
+                pause_s = self._decide(awake())
                 if not states.is_over:
-                    pause_s = min(pause_s, max(self._resting.until - now, 0.0))
                     self._turn(min(pause_s, STATUS_S, states.deadlines.heartbeat))
         finally:
             self._clock.stop()
@@ -350,8 +349,6 @@ class Master:
             raise MessageRefused(f"not a command: {error}") from error
         states = self._states
         if states.takes_commands:
-            if command.wait:
-                self._resting.check_room()
             claimed = self._memory.withdraw_grant() if states.granting.sharing else 0
             answer = states.command(command, claimed)
             if command.wait and answer.hold is not None:

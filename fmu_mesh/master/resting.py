@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import zenoh
 from msgspec.structs import replace
 
-from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..errors import DeadlineExceeded, FmuMeshError, MeshLost, from_report
 from ..system.plan import RECORDER
 from ..wire.views import CommandAnswer
 from .master_states import MasterStates
@@ -28,23 +27,9 @@ class Resting:
         self._reply = reply
         self._waiting: list[tuple[zenoh.Query, CommandAnswer, float]] = []
 
-    def check_room(self) -> None:
-        """Call before a command that will wait.
-
-        Raises:
-            MessageRefused: too many wait already.
-        """
-        if len(self._waiting) >= _MOST_WAITING:
-            raise MessageRefused(f"{_MOST_WAITING} others wait for an answer")
-
     def add(self, query: zenoh.Query, answer: CommandAnswer, until: float) -> None:
-        """The answer to a command waits, at most ``until`` this time."""
-        self._waiting.append((query, answer, until))
-
-    @property
-    def until(self) -> float:
-        """When the first deadline is over."""
-        return min((until for *_, until in self._waiting), default=math.inf)
+        """The answer to a command waits, ``until`` this time or shortly after; at once if too many wait already."""
+        self._waiting.append((query, answer, until if len(self._waiting) < _MOST_WAITING else 0.0))
 
     def settle(self, now: float) -> None:
         """Answer the commands that do not wait any more."""
@@ -68,9 +53,8 @@ class Resting:
         if states.state != "paused":
             return MeshLost(f"{mesh} is {states.state} at point {granting.slowest}, and does not come to rest any more")
         if states.hold is not None and states.hold < goal:
-            return MeshLost(
-                f"{mesh} pauses at point {states.hold}, before point {goal}: another program controls it too"
-            )
+            text = f"{mesh} pauses at point {states.hold}, before point {goal}: another program controls it too"
+            return MeshLost(text)
         if not late:  # also after `stop` (hold None), until all have come to the last point
             return None
         nodes = [node for node in granting.progress if node != RECORDER]

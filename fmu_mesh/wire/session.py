@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -142,20 +142,12 @@ def is_of_this_host(endpoint: str) -> bool:
     """Whether it is a Unix socket, or an address of an interface of this host."""
     if is_socket(endpoint):
         return True
-    try:
-        found = socket.getaddrinfo(host_of(endpoint), None, type=socket.SOCK_DGRAM)
-    except (OSError, UnicodeError):  # nobody knows this name, as yet, or it is none
-        return False
-    return any(_has(family, address) for family, _, _, _, address in found)
-
-
-def _has(family: int, address: Any) -> bool:  # noqa: ANN401  its form depends on the family
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(address)  # the system refuses the addresses of others
-        except OSError:
-            return False
-        return True
+    with suppress(OSError, UnicodeError):  # nobody knows this name, as yet, or it is none
+        for family, *_, address in socket.getaddrinfo(host_of(endpoint), None, type=socket.SOCK_DGRAM):
+            with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.bind(address)  # the system refuses the addresses of others
+                return True
+    return False
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:

@@ -245,10 +245,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
 
 
 class RosTopicView(msgspec.Struct, frozen=True):
-    """A topic that a gateway publishes (``direction`` out) or subscribes to (in), and whether it is ``matched``.
-
-    That is: whether somebody subscribes to it whom its samples reach, or somebody publishes it.
-    """
+    """A topic that a gateway publishes (out) or subscribes to (in), and whether a subscriber or publisher is there."""
 
     topic: str
     direction: Literal["in", "out"]
@@ -263,6 +260,7 @@ class RosView(msgspec.Struct, frozen=True):
         connected: whether a bridge or router answers.
         activity: the same as text, such as `nobody answers at tcp/127.0.0.1:7447`.
         other_clocks: other publishers of `/clock`, as text.
+        topics: all of them; what is published reaches a subscriber if it is matched.
     """
 
     profile: str

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import msgspec
 
@@ -16,7 +16,6 @@ from ...wire.views import (
     InstanceStatus,
     MeshInfo,
     MeshStatus,
-    RosTopicView,
     RosView,
     VariableView,
 )
@@ -74,25 +73,24 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
-            *(("ROS", text) for view in ros if view.connected for text in _matched(view.topics)),
+            *(
+                ("ROS", f"{words} {listed(names)}")
+                for view in ros
+                for words, which in _MATCHED.items()
+                if view.connected
+                and (names := [own.topic for own in view.topics if (own.direction, own.matched) == which])
+            ),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
 
 
 _MATCHED = {
-    ("out", True): "somebody subscribes to",
-    ("out", False): "nobody subscribes to",
-    ("in", True): "somebody publishes",
-    ("in", False): "nobody publishes",
+    "somebody subscribes to": ("out", True),
+    "nobody subscribes to": ("out", False),
+    "somebody publishes": ("in", True),
+    "nobody publishes": ("in", False),
 }
-
-
-def _matched(topics: Sequence[RosTopicView]) -> Iterator[str]:
-    """Which topics of a gateway have somebody in ROS, and which have not."""
-    for (direction, matched), words in _MATCHED.items():
-        if names := [own.topic for own in topics if (own.direction, own.matched) == (direction, matched)]:
-            yield f"{words} {listed(names)}"
 
 
 def instance_status(status: InstanceStatus) -> list[str]:

@@ -52,7 +52,7 @@ View = TypeVar("View")
 # How often a wait for the mesh asks whether it has ended meanwhile; there is no event for both.
 _END_CHECK_S = 0.05
 _ANSWER_S = 0.25
-"""So long before the deadline of `rest` the mesh says what it still waits for, and this answer is in time."""
+"""So long before the deadline of `rest`, the mesh says what it still waits for."""
 
 
 class MeshClient:
@@ -219,32 +219,23 @@ class MeshClient:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
         return self._view(target.key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
 
-    def command(self, command: Command) -> CommandAnswer:
+    def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
-        return self._command(command, self._timeout_s)
+        key, payload = self.keys.mesh_key("command"), msgspec.json.encode(command)
+        question = Question(key, self._who, timeout_s or self._timeout_s, payload, once=True)
+        return _understood(self._ask(question)[0], CommandAnswer, self._who)
 
     def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause or step the mesh; the answer comes when it has paused, and has the point at which it has.
 
-        Args:
-            command: what it does.
-            timeout_s: the deadline in s, by default that of a query.
-
         Raises:
-            MeshLost: it ended, was resumed, or was paused by somebody else before, or did not pause in time.
-            FmuMeshError: it has failed before.
+            FmuMeshError: it does not come to this point, or not in ``timeout_s``, by default the deadline of a query.
         """
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
-        wait_s = max(timeout_s - _ANSWER_S, timeout_s / 2)
-        answer = self._command(replace(command, wait=wait_s), timeout_s)
+        answer = self.command(replace(command, wait=max(timeout_s - _ANSWER_S, timeout_s / 2)), timeout_s)
         if answer.error is not None:
             raise from_report(answer.error)
         return answer
-
-    def _command(self, command: Command, deadline_s: float) -> CommandAnswer:
-        key, payload = self.keys.mesh_key("command"), msgspec.json.encode(command)
-        sample, *_ = self._ask(Question(key, self._who, deadline_s, payload, once=True))
-        return _understood(sample, CommandAnswer, self._who)
 
     @contextmanager
     def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
