@@ -10,15 +10,7 @@ from ...pictures.tables import pairs, table
 from ...simtime import ENDLESS
 from ...text import listed, short_number
 from ...wire.client.readings import Reading
-from ...wire.views import (
-    ConnectionView,
-    InstanceInfo,
-    InstanceStatus,
-    MeshInfo,
-    MeshStatus,
-    RosView,
-    VariableView,
-)
+from ...wire.views import ConnectionView, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
 
 __all__ = [
     "cells",
