@@ -23,7 +23,7 @@ from ..run.options import ResetOptions, StartOptions
 from ..text import shown
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
-from ..wire.client.waiting import begun_again, replay, rest, wait_for, wait_for_start
+from ..wire.client.waiting import begun_again, replay, wait_for, wait_for_start
 from ..wire.views import (
     GOING_ON,
     Command,
@@ -231,7 +231,8 @@ class Run:
         Args:
             name: `instance.variable`.
             value: a Python or numpy value of its type; an Enumeration by name or number.
-            at: simulation time in s from which on the value holds; None: from the next point on.
+            at: simulation time in s from which on the value holds, before the end of the simulation and, without a stop
+                time, at most 1e6 s ahead; None: from the next point on.
 
         Returns:
             The point, and its time in s, from which on the value holds; `late` says that the time asked for was past.
@@ -352,14 +353,20 @@ class Run:
 
     # --- steering
 
-    def pause(self) -> CommandAnswer:
-        """Pause the mesh; returns when all instances have reached the point of the answer."""
-        return rest(self._steered(), Command("pause"))
+    @checked
+    def pause(self, *, timeout: float | None = None) -> CommandAnswer:
+        """Pause the mesh; returns when all instances have reached the point of the answer.
+
+        Raises:
+            DeadlineExceeded: they have not in ``timeout`` s, by default that of every question; the mesh pauses later.
+            MeshLost: the mesh has ended, or another program has let it run on or pause elsewhere.
+        """
+        return self._steered().rest(Command("pause"), timeout)
 
     @checked
-    def step(self, points: int = 1) -> CommandAnswer:
-        """Run some points and pause again; returns when the mesh has paused."""
-        return rest(self._steered(), Command("step", points))
+    def step(self, points: int = 1, *, timeout: float | None = None) -> CommandAnswer:
+        """Run some points and pause again; returns when the mesh has paused. For ``timeout`` and errors see `pause`."""
+        return self._steered().rest(Command("step", points), timeout)
 
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""

@@ -75,6 +75,11 @@ class Granting:
         self.last_point = min(point, self.last_point)
 
     @property
+    def reached(self) -> int:
+        """The last point that all instances know; the recorder may be far behind."""
+        return min(point for node, point in self.progress.items() if node != RECORDER)
+
+    @property
     def reaches_all(self) -> int:
         """The point up to which all nodes have a grant, also those that get it by messages."""
         return self.grant if self._all_share else self._sent
@@ -136,15 +141,18 @@ class Granting:
         if self._all_share:
             return 0, False
         credit = min(map(operator.add, self.progress.values(), self._windows)) if self._keep_windows else self.grant
-        ahead = min(point for node, point in self.progress.items() if node != RECORDER)
-        owed = min(self.grant, credit, ahead + self._reach.points(ahead, now, self._round_trip_s))
+        reached = self.reached
+        owed = min(self.grant, credit, reached + self._reach.points(reached, now, self._round_trip_s))
         grown = owed > self._sent
         self._sent = max(self._sent, owed)
         return self._sent, grown
 
-    def wake_at(self) -> tuple[str, int] | None:
-        """The slowest node of this host, and its point from which on there is something to do for the master."""
-        if not self.seen:
+    def wake_at(self, wanted: int) -> tuple[str, int] | None:
+        """The slowest node of this host, and its point from which on there is something to do for the master.
+
+        Nothing if the grant is below the ``wanted`` point and all have it: only the wall clock lets it grow.
+        """
+        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted):
             return None
         nodes = [node for node in self.seen if node != RECORDER]
         if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:

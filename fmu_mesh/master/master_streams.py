@@ -65,7 +65,7 @@ class MasterStreams:
                 if recorder
                 else []
             )
-            told = [CounterEnd(GRANT, 0, memory.sent), CounterEnd(FINISH, 0, memory.finish)]
+            told = [CounterEnd(GRANT, 0, memory.sent, 0), CounterEnd(FINISH, 0, memory.finish)]
             if recorder is not None:
                 number, stride = memory.map.number_of(RECORDER), recorder.progress_stride
                 told.append(CounterEnd(PROGRESS, number, memory.progress[RECORDER], stride))
@@ -76,6 +76,12 @@ class MasterStreams:
             self._streams = RowStreams(memory, ends, plan.grid.last_point)
             self._thread.start()
             self._keeper = StreamKeeper(self._streams, self._meeting, [end.peer for end in ends], self._post)
+
+    def grant(self, point: int) -> None:
+        """On the main thread: grant to the nodes that have a stream; without the other thread, which would be woken."""
+        self._memory.sent.raise_to(point)
+        if self._streams is not None:
+            self._streams.tell()
 
     @property
     def round_trip_s(self) -> float:

@@ -70,6 +70,7 @@ class Engine(ABC):
         windows: the progress of those whose windows are kept here, and how far each may be behind.
 
     Attributes:
+        is_blocked: whether the last `run` has ended because nothing can step without another row, or a grant.
         sending: held by whoever sends rows: the main thread between bursts, or another one during a long step.
     """
 
@@ -79,6 +80,7 @@ class Engine(ABC):
         self.units = units
         self.runners = [runner for unit in units for runner in unit]
         self.waited_s = 0.0
+        self.is_blocked = False
         self.sending = Lock()
         self._plan = plan
         self._memory = memory
@@ -102,10 +104,11 @@ class Engine(ABC):
     def refit(self, runner: Runner) -> None:
         """On the main thread, between steps: the runner steps in another way from the next step on."""
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
+    def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
-        If it is ``eager``, it returns instead of waiting when there was a step: its rows have to be sent.
+        If it is ``eager``, it returns instead of waiting when there was a step: its rows have to be sent. If it is
+        ``quiet``, nobody looks at each step: it goes on for 50 ms, because each return takes longer than a small step.
 
         Raises:
             FmuMeshError: a step failed, or a ring has something that its writer never wrote.
@@ -114,9 +117,9 @@ class Engine(ABC):
         The unit of an instance that raised one of them is not stepped any more.
         """
         self._looked_after = self._looked_after or ProcessState()
-        looks = True
+        looks, self.is_blocked = True, False
         try:
-            stepped = self._burst(wait_s, eager=eager)
+            stepped = self._burst(wait_s, eager=eager, quiet=quiet)
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
@@ -127,12 +130,16 @@ class Engine(ABC):
         return stepped
 
     @abstractmethod
-    def _burst(self, wait_s: float, *, eager: bool) -> bool:
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         """As `run`, which then restores the state of the process."""
 
     @abstractmethod
     def ring_bell(self) -> None:
         """From any thread: let `run` return after the current step."""
+
+    def note_wait(self, seconds: float) -> None:
+        """The node has waited for so long because nothing could step."""
+        self.waited_s += seconds
 
     def send(self) -> None:
         """While a step is under way, by another thread that holds `sending`: send all rows before it."""
@@ -221,10 +228,11 @@ class BurstEngine(Engine):
         for runner in self.runners:
             runner.refit()
 
-    def _burst(self, wait_s: float, *, eager: bool) -> bool:
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library
-        node.wait_ns, node.eager = int(wait_s * 1e9), eager
-        started, before = perf_counter(), self._ticks
+        most_s = _STATE_CHECK_S if quiet else _SLICE_S
+        node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
+        started, before, waited_ns = perf_counter(), self._ticks, node.waited_ns
         while True:
             result = library.run(self._address)
             if result < BurstEnd.PYTHON:
@@ -235,10 +243,11 @@ class BurstEngine(Engine):
             began = perf_counter()
             self._complete(node.unit, runner, result)
             self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
-            if perf_counter() - started > _SLICE_S:
+            if perf_counter() - started > most_s:
                 library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
-        self.waited_s = node.waited_ns / 1e9
+        self.is_blocked = result in {BurstEnd.BLOCKED, BurstEnd.DONE}
+        self.note_wait((node.waited_ns - waited_ns) / 1e9)
         return self._ticks != before
 
     def send(self) -> None:
@@ -366,7 +375,7 @@ class PlainEngine(Engine):
     def refit(self, runner: Runner) -> None:
         """Nothing: each step asks the runner itself."""
 
-    def _burst(self, wait_s: float, *, eager: bool) -> bool:  # noqa: ARG002  it never waits after a step
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:  # noqa: ARG002  it never waits after a step
         started = perf_counter()
         seen = self._memory.seen()
         stepped = False
@@ -374,12 +383,13 @@ class PlainEngine(Engine):
             advanced = [self._advance(*both, started) for both in zip(self.units, self._units, strict=False)]
             self._progress.raise_to(self.covered + 1)
             stepped = stepped or any(advanced)
-            if not any(advanced) or perf_counter() - started > self.slice_s:
+            self.is_blocked = not any(advanced)
+            if self.is_blocked or perf_counter() - started > self.slice_s:
                 break
         if not stepped and not self._attention:
             began = perf_counter()
             self._memory.sleep(seen, wait_s)
-            self.waited_s += perf_counter() - began
+            self.note_wait(perf_counter() - began)
         self._attention = False
         return stepped
 

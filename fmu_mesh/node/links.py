@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import numpy as np
-
 from ..errors import FmuMeshError
 from ..rings.ring import Ring
 from ..rings.transfer import Index, elements_at
@@ -56,16 +54,11 @@ class OutLink:
         if self._picked and end - first > ring.rows:
             text = f"{end - ring.rows - first} rows for {self.link.target_node} were overwritten before they were sent"
             raise FmuMeshError(text, instance=self.link.source, point=first * self.link.step_points)
-        while self._picked and (first := self.sent) < end:
-            numbers = np.arange(first, min(end, first + self._rows))
-            slots = numbers & ring.mask
-            rows = tuple(
-                ring.parts[part][(slots, own) if isinstance(own, slice) else np.ix_(slots, own)]
-                for part, own in self._picked
-            )
-            for message in encode_frames(FRAME, self.link.index, first, rows):
+        for start, slots in ring.pieces(first, end, self._rows) if self._picked else ():
+            rows = tuple(ring.parts[part][slots, own] for part, own in self._picked)
+            for message in encode_frames(FRAME, self.link.index, start, rows):
                 self._put(message)
-            self.sent += len(numbers)
+            self.sent = start + slots.stop - slots.start
 
     def send_again(self, end: int) -> None:
         """Send all rows again that are still there; the target knows which it has."""

@@ -35,7 +35,7 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..instances.contract import Instance
+from ..instances.contract import Instance, LogMessage
 from ..rings.host_memory import ONE_CORE, HostMemory
 from ..rings.row_streams import RowStreams
 from ..system.plan import MASTER, RECORDER, Link, NodePlan
@@ -62,6 +62,7 @@ from ..wire.messages import (
 from ..wire.router_link import RouterLink
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.streamed_rows import why_not
+from ..wire.views import LogLine
 from ..wire.ways import Ways
 from .activity import Activity
 from .engine import Engine, Windows, make_engine
@@ -101,7 +102,7 @@ _LOOK_S = 0.5
 """How often in s it looks whether its router is there."""
 
 _LAZY_S = 0.05
-"""How long in s rows that no step needs may wait for more rows while this node steps: each frame wakes a process."""
+"""How long in s rows that no step needs may wait for more rows: each frame wakes three threads of a process."""
 
 
 class Node:
@@ -143,7 +144,7 @@ class Node:
         self.new_start: NewStart | None = None
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
-        self._progress_sent = -1
+        self._progress_sent = self._lazy_covered = -1
         self._router = router or RouterLink(session)
         self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
@@ -235,7 +236,7 @@ class Node:
         self._activity.enter("loading")
         instances = {}
         for item in plan.instances:
-            instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid)
+            instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid, self._warn)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.memory or self._own_memory
@@ -244,6 +245,10 @@ class Node:
                 ring, counter = self._memory.ring(place), self._memory.counter(place.counter)
                 item = plan.instance(place.instance)
                 self._runners[place.instance] = Runner(item, instances[place.instance], plan.grid, ring, counter)
+
+    def _warn(self, message: LogMessage) -> None:
+        point = message.step * self._plan.instance(message.instance).step_points
+        self.server.log_message(LogLine(message.instance, message.status, message.category, message.message, point))
 
     def _meet(self) -> Welcome:
         """Join the mesh: afterwards all other nodes are ready."""
@@ -264,6 +269,8 @@ class Node:
         plan, membership = self._plan, self._membership
         keys = membership.keys(plan.timeouts.start)
         self._ways = ways = welcome.ways
+        if ways.way(plan.node, MASTER) == "zenoh" and not ways.streams_of(plan.node):
+            self._inbox.receive_directly()
         for link in plan.links_out:
             runner = self._runners[link.source]
             put = membership.sender(keys.frames(link.source, link.target_node))
@@ -355,25 +362,34 @@ class Node:
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
-        all_sent = True
+        quiet = not eager and self._profiler is None and self._ways.way(self._plan.node, MASTER) != "zenoh"
+        left_s = 0.0
         while not self.finished:
-            try:  # it waits only when everything is sent: the grant may depend on it
-                stepped = engine.run(_LONGEST_SLEEP_S if all_sent or not eager else 0.0, eager=eager)
+            try:
+                wait_s = 0.0 if self._inbox.is_direct else left_s if eager else _LONGEST_SLEEP_S
+                stepped = engine.run(wait_s, eager=eager, quiet=quiet and not self.server.is_followed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)
             self._check_streams()
             if self._clock() > self._look_at:
                 self._look_at_router()
-            if self._profiler is not None:
-                self._profiler.look(engine)
             with engine.sending:
-                all_sent = self._send_rows(stepped=stepped)
+                left_s = self._send_rows(engine)
             if stepped:
                 self.server.stepped()
-            while (message := self._inbox.poll()) is not None:
-                self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
             self._tell_progress(engine)
+            if self._inbox.is_direct and engine.is_blocked:
+                began = time.perf_counter()
+                message = self._inbox.wait(left_s)
+                engine.note_wait(time.perf_counter() - began)
+            else:
+                message = self._inbox.poll()
+            if self._profiler is not None:
+                self._profiler.look(engine)
+            while message is not None:
+                self._inbox.hand_on(message, self._take_from_master, self._take_from_node)
+                message = self._inbox.poll()
             if self._token_went and not self._membership.master_runs:
                 self._end_without_master()
             self._membership.check_silence(self._clock() - self._heard)
@@ -390,13 +406,19 @@ class Node:
             member.flush()
         self._memory.progress[self._plan.node].raise_to(engine.covered + 1)
 
-    def _send_rows(self, *, stepped: bool) -> bool:
-        """Send rows that a step may wait for; those for the recorder every 50 ms, and before a wait. Are all sent?"""
-        if lazy := not stepped or time.monotonic() - self._lazy_sent > _LAZY_S:
-            self._lazy_sent = time.monotonic()
+    def _send_rows(self, engine: Engine) -> float:
+        """Send the rows that a step may wait for; return how long in s this node may wait until the next call.
+
+        Those for the recorder are sent every 50 ms, and when the grant may depend on them. A node that waits for
+        another node holds back less than a quarter of the window, so the other node can still step.
+        """
+        now, covered = time.monotonic(), engine.covered
+        is_due = now - self._lazy_sent >= _LAZY_S or covered - self._lazy_covered >= self._plan.progress_stride
+        if lazy := is_due or covered >= self._memory.grant.value:
+            self._lazy_sent, self._lazy_covered = now, covered
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
-        return lazy
+        return _LONGEST_SLEEP_S if lazy else self._lazy_sent + _LAZY_S - now
 
     def _look_at_router(self) -> None:
         """If it was lost and is back, send again what may be lost. What others have got already does not matter."""

@@ -116,6 +116,11 @@ class NodeServer:
                 take = partial(self._answers.put_arrived, runner)
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
+    @property
+    def is_followed(self) -> bool:
+        """Whether some streams have subscribers."""
+        return any(streams.is_active for streams in self._streams)
+
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers."""
         for streams in self._streams:

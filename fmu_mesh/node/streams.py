@@ -210,6 +210,11 @@ class InstanceStreams:
         rings = [ring for ring in (self.runner.outputs, self.runner.watched) if ring is not None]
         self._picked = [picked for ring in rings for picked in _picked(ring, active)]
 
+    @property
+    def is_active(self) -> bool:
+        """On the main thread: whether `collect` has something to do."""
+        return bool(self._active)
+
     def collect(self, waiting_rows: int) -> Batch | None:
         """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
         end, watched = self.runner.step + 1, self.runner.watched

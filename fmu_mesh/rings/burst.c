@@ -463,13 +463,17 @@ static inline int blocked(Node *node, Unit *unit, Counter *counter, int64_t need
 
 enum { READY, NOT_READY, NOT_TRUE };
 
+/* The row that the next step of a member needs. */
+static inline int64_t row_of(const Member *member, const Gate *gate) {
+  const int64_t row = member->step * member->points + gate->lead;
+  return gate->points != 1 ? row / gate->points : row;
+}
+
 /* Whether the rows of all gates are there; then the bases point to them. */
 static inline int open_gates(Node *node, Unit *unit, Member *member) {
-  const int64_t start = member->step * member->points;
   for (int64_t i = 0; i < member->n_gates; i++) {
     Gate *gate = &member->gates[i];
-    int64_t row = start + gate->lead;
-    if (gate->points != 1) row /= gate->points;
+    const int64_t row = row_of(member, gate);
     while (gate->known <= row) {
       if ((gate->known = value_of(gate->counter)) > row) break;
       if (blocked(node, unit, gate->counter, row + 1, gate->points)) return NOT_READY;
@@ -483,12 +487,10 @@ static inline int open_gates(Node *node, Unit *unit, Member *member) {
 
 /* Whether the rows of all gates are still those that were opened. */
 static inline int gates_held(const Member *member) {
-  const int64_t start = member->step * member->points;
   atomic_thread_fence(memory_order_acquire);
   for (int64_t i = 0; i < member->n_gates; i++) {
     const Gate *gate = &member->gates[i];
-    int64_t row = start + gate->lead;
-    if (gate->points != 1) row /= gate->points;
+    const int64_t row = row_of(member, gate);
     if (atomic_load_explicit((_Atomic int64_t *)(void *)member->bases[FIRST_GATE + i], memory_order_relaxed) != row + 1)
       return 0;
   }
@@ -573,6 +575,18 @@ out:
   return result;
 }
 
+/* What a unit sleeps for. Of a grant and a row that it lacks, the row comes later, because its source steps with the grant,
+ * too: who slept for the grant would wake twice for each point of a run that the wall clock paces. */
+static inline Wish wish_of(const Node *node, const Unit *unit) {
+  const Member *member = &unit->members[0];
+  if (unit->blocked_by == node->ceiling && member->every == 1 && member->stage == WAITING)
+    for (int64_t i = 0; i < member->n_gates; i++) {
+      const int64_t row = row_of(member, &member->gates[i]);
+      if (value_of(member->gates[i].counter) <= row) return (Wish){member->gates[i].counter, row + 1};
+    }
+  return (Wish){unit->blocked_by, unit->need};
+}
+
 /* Sleep until a unit may step, Python has something to do, or the time is over. */
 static int64_t await(Node *node, int64_t limit_ns) {
   uint32_t seen = bell_seen(&node->place);
@@ -585,12 +599,12 @@ static int64_t await(Node *node, int64_t limit_ns) {
     if (unit->stopped || unit->tick >= unit->last_tick) continue;
     by_grant |= unit->blocked_by == node->ceiling;
     if (n < 64)
-      wishes[n++] = (Wish){unit->blocked_by, unit->need};
+      wishes[n++] = wish_of(node, unit);
     else if (limit_ns > 1000000)
       limit_ns = 1000000;
   }
   wake_all(node, by_grant); /* the master of another host grants more when it knows that this node is there */
-  if (node->stride > 1 && limit_ns > node->slice_ns) limit_ns = node->slice_ns;
+  if (node->stride > 1 && !by_grant && limit_ns > node->slice_ns) limit_ns = node->slice_ns;
   int64_t start = now();
   wishes[n] = (Wish){node->finish != NULL && value_of(node->finish) == 0 ? node->finish : NULL, 1};
   int64_t is_granted = sleep_on(&node->place, node->streams, seen, wishes, n + 1, limit_ns, &node->late), elapsed = now() - start;
@@ -602,9 +616,10 @@ static int64_t await(Node *node, int64_t limit_ns) {
 /* Step as far as it goes, for about one slice of time. Call it again and again. */
 PUBLIC int64_t node_run(Node *node) {
   int64_t start = now(), begin = start;
+  const int64_t quiet_until = start + node->quiet_ns;
   int any = 0;
   for (;;) {
-    int stepped = 0, left = 0;
+    int stepped = 0, left = 0, by_grant = 1;
     for (int64_t i = 0; i < node->n_units; i++) {
       Unit *unit = &node->units[i];
       if (unit->stopped || unit->tick >= unit->last_tick) continue;
@@ -625,6 +640,7 @@ PUBLIC int64_t node_run(Node *node) {
         return result;
       }
       left += unit->tick < unit->last_tick;
+      by_grant &= unit->blocked_by == node->ceiling;
       /* Without a step it has not begun: else many units would be looked through in vain, each time from the first. */
       if (atomic_load_explicit(&node->attention, memory_order_relaxed) || (any && begin - start > 2 * node->slice_ns)) {
         wake_all(node, 0);
@@ -637,14 +653,16 @@ PUBLIC int64_t node_run(Node *node) {
       return DONE;
     }
     if (!stepped) {
-      /* After a step only a little: its rows may be streamed, or sent. */
-      int64_t limit_ns = !any ? node->wait_ns : node->eager ? 0 : node->slice_ns - (begin - start);
+      /* After a step that somebody looks at only a little, as its rows may be streamed, or sent; and not for a grant, which
+       * may come with the next tick of the wall clock. */
+      const int is_first = !any || (node->quiet_ns > 0 && begin < quiet_until);
+      int64_t limit_ns = is_first ? node->wait_ns : node->eager || by_grant ? 0 : node->slice_ns - (begin - start);
       if (limit_ns <= 0 || !await(node, limit_ns)) {
-        wake_all(node, 0);
+        wake_all(node, by_grant);
         return BLOCKED;
       }
       begin = now();
-      if (!any) start = begin; /* the slice begins with the first step */
+      if (is_first) start = begin; /* the slice begins with the first step */
     }
     if (any && begin - start > node->slice_ns) {
       wake_all(node, 0);

@@ -178,7 +178,8 @@ typedef struct { /* one socket to another process */
   int64_t send_size, send_from, send_to;
   int64_t receive_size, used, filled;
   int64_t frame, row, rows_left; /* of the frame that is being read: its number in `incoming`, and the next row */
-  int64_t flushed_ns, heard_ns;
+  int64_t heard_ns;
+  _Atomic int64_t flushed_ns;
   int64_t about, about_row; /* why `state` is not OPEN: the link or kind, and the row or number */
   int64_t has_ended, is_known; /* what `streams_serve` has told Python */
   _Atomic int64_t state, sending;
@@ -225,6 +226,7 @@ typedef struct { /* all units of a process */
   int64_t last_point, slice_ns;
   int64_t wait_ns;   /* how long to sleep where nothing can step */
   int64_t eager;     /* whether to leave, not to sleep, after a step: its rows have to be sent */
+  int64_t quiet_ns;  /* for how long it goes on, waits included, because nobody looks at each step; 0: for a slice */
   int64_t spins;     /* whether it spins before it sleeps */
   int64_t batch;     /* how many points it may sleep for; 1 if others may wait for its next row */
   int64_t stride;    /* how many it sleeps for now */

@@ -129,6 +129,6 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
 int streams_read(Streams *streams);
 
 /* Send what is new; with `all`, also what may wait for a while. */
-void streams_write(Streams *streams, int all);
+PUBLIC void streams_write(Streams *streams, int64_t all);
 
 #endif

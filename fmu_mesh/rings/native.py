@@ -424,6 +424,7 @@ class _Library:
         self.stream_open = PYFUNCTYPE(None, address, c_int64)(("stream_open", quick))
         self.stream_hold = CFUNCTYPE(None, address)(("stream_hold", slow))
         self.stream_beat = PYFUNCTYPE(None, address)(("stream_beat", quick))
+        self.streams_write = PYFUNCTYPE(None, address, c_int64)(("streams_write", quick))
         self.streams_serve = CFUNCTYPE(None, address, c_int64)(("streams_serve", slow))
         self.streams_listen = PYFUNCTYPE(None, address, c_int64, c_int64)(("streams_listen", quick))
         self.grant_withdraw = PYFUNCTYPE(c_int64, address, address, c_int64)(("grant_withdraw", quick))

@@ -6,7 +6,8 @@ Row ``n`` is in slot ``n & mask``. This module owns the memory; it knows neither
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,14 @@ class Ring:
     def has_row(self, row: int) -> bool:
         """Whether a row is complete, and has not been overwritten."""
         return bool(self.stamps[row & self.mask] == row + 1)
+
+    def pieces(self, first: int, end: int, most: int = sys.maxsize) -> Iterator[tuple[int, slice]]:
+        """The slots of rows ``first .. end - 1``, with the first row of each piece: ``most`` rows, neighbours."""
+        while first < end:
+            slot = first & self.mask
+            size = min(end - first, self.rows - slot, most)
+            yield first, slice(slot, slot + size)
+            first += size
 
     def part(self, type_: VariableType) -> NDArray[Any]:
         """The array of one type, of shape (rows, elements); it has no elements if no column has this type."""

@@ -194,6 +194,10 @@ class RowStreams:
         """Move rows and counters, for ``limit_s`` seconds or until a stream has news (`states`, `ended_links`)."""
         self._library.streams_serve(self.address, int(limit_s * 1e9))
 
+    def tell(self) -> None:
+        """From any thread: send at once all that is new."""
+        self._library.streams_write(self.address, 1)
+
     def wake(self) -> None:
         """From any thread: let `serve` return."""
         self._streams.attend()

@@ -6,8 +6,8 @@
  * on one host, and only who wakes them is different.
  *
  * Threads. Of one process, all streams are read by one thread: the main thread of a node, between and within its waits,
- * or a thread of the master's process, which does nothing else (`streams_serve`). The same thread writes. Where the
- * kernel takes no more bytes, because a large row does not fit or the network is slow, a thread of its own sends the
+ * or a thread of the master's process, which does nothing else (`streams_serve`). The same thread writes, and so does
+ * the main thread of the master, so that a grant wakes no other thread of its process on its way. Where the kernel takes no more bytes, because a large row does not fit or the network is slow, a thread of its own sends the
  * rest, so that a long step holds nothing back, and ends when nothing is left. Who writes has `sending`: a flag that is
  * taken with one instruction, and nobody waits for it: who finds it taken knows that the other one sends everything.
  * Python changes a stream only while it has the flag, on the thread that reads.
@@ -188,19 +188,24 @@ static void send_on(Stream *stream) {
   pthread_attr_destroy(&attributes);
 }
 
+/* Send what is new, give the flag back, and once more if somebody has asked meanwhile. */
+static void send_and_release(Stream *stream, int all) {
+  for (int64_t own = 1;; own = all = 1) {
+    atomic_exchange(&stream->sending, 1);
+    if (send_new(stream, all)) return send_on(stream);
+    if (atomic_compare_exchange_strong(&stream->sending, &own, 0)) return;
+  }
+}
+
 static void write_stream(const Streams *streams, Stream *stream, int all) {
   if (atomic_load(&stream->state) != OPEN) return;
   if (!all && now() - stream->flushed_ns > streams->lazy_ns) all = 1;
   if (all) stream->flushed_ns = now(); /* also if the other thread sends it */
-  if (!take_flag_or_ask(stream)) return;
-  if (send_new(stream, all))
-    send_on(stream);
-  else
-    atomic_store(&stream->sending, 0);
+  if (take_flag_or_ask(stream)) send_and_release(stream, all);
 }
 
-void streams_write(Streams *streams, int all) {
-  for (int64_t i = 0; i < streams->n_streams; i++) write_stream(streams, &streams->streams[i], all);
+void streams_write(Streams *streams, int64_t all) {
+  for (int64_t i = 0; i < streams->n_streams; i++) write_stream(streams, &streams->streams[i], all != 0);
 }
 
 /* ---- receiving */
@@ -386,7 +391,10 @@ static void poll_streams(Streams *streams, Bell *bell, uint32_t seen, const Wish
                          int64_t limit_ns) {
   const int64_t end = now() + limit_ns;
   struct pollfd *polled = streams->polled;
-  while (atomic_load(&bell->rung) == seen && !granted(wishes, n_wishes)) {
+  for (;;) {
+    atomic_store(&bell->polls, 1);
+    atomic_thread_fence(memory_order_seq_cst);
+    if (atomic_load(&bell->rung) != seen || granted(wishes, n_wishes)) return;
     int64_t n = 0, until = end;
     polled[n++] = (struct pollfd){(int)streams->bell_pipe, POLLIN, 0};
     for (int64_t i = 0; i < streams->n_streams; i++)
@@ -398,6 +406,7 @@ static void poll_streams(Streams *streams, Bell *bell, uint32_t seen, const Wish
     if (left < 0) left = 0;
     const struct timespec limit = {left / 1000000000, left % 1000000000};
     const int ready = ppoll(polled, (nfds_t)n, &limit, NULL);
+    atomic_store(&bell->polls, 0); /* what it reads rings its own bell: this needs no pipe */
     if (ready > 0 && polled[0].revents != 0) {
       char bytes[64];
       while (read((int)streams->bell_pipe, bytes, sizeof bytes) == (ssize_t)sizeof bytes) continue;
@@ -422,11 +431,11 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
     if (other == 0 || other > wishes[i].need) atomic_store(&counter->needs[place->own], wishes[i].need);
     lower(&counter->wake_at, wishes[i].need);
   }
-  if (streams != NULL) atomic_store(&bell->polls, 1);
   atomic_thread_fence(memory_order_seq_cst);
   int is_granted = granted(wishes, n), is_late = 0;
   if (!is_granted && streams != NULL) {
     poll_streams(streams, bell, seen, wishes, n, limit_ns);
+    atomic_store(&bell->polls, 0);
     is_granted = granted(wishes, n);
   } else if (!is_granted) {
     futex_wait(bell, seen, limit_ns, &is_late);
@@ -437,7 +446,6 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
       *late += is_late;
     }
   }
-  if (streams != NULL) atomic_store(&bell->polls, 0);
   for (int64_t i = 0; i < n; i++)
     if (wishes[i].counter != NULL) atomic_store(&wishes[i].counter->needs[place->own], 0);
   return is_granted;
@@ -464,7 +472,7 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
     for (int64_t i = 0; i < streams->n_streams; i++) {
       const Stream *stream = &streams->streams[i];
       for (int64_t j = 0; j < stream->n_told; j++)
-        wishes[n++] = (Wish){stream->told[j].counter, stream->told[j].sent + stream->told[j].stride};
+        if (stream->told[j].stride > 0) wishes[n++] = (Wish){stream->told[j].counter, stream->told[j].sent + stream->told[j].stride};
     }
     const int64_t left = end - now();
     if (left <= 0 || atomic_exchange(&streams->attention, 0)) return;
@@ -476,10 +484,7 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
 PUBLIC void stream_beat(Stream *stream) {
   if (atomic_load(&stream->state) != OPEN || !take_flag_or_ask(stream)) return;
   if (room(stream) >= 0) put_header(stream, ALIVE, 0, 0, 0);
-  if (send_new(stream, 1))
-    send_on(stream);
-  else
-    atomic_store(&stream->sending, 0);
+  send_and_release(stream, 1);
 }
 
 /* Shut the socket down, wait for the thread that may send, and keep the flag: from now on nobody uses the stream. */

@@ -345,7 +345,7 @@ class _MasterRuns:
             plan.nodes[RECORDER],
             self.session,
             files,
-            lambda: master.has_begun,
+            lambda: master.wanted,
             growth=GrowthWatch(plan),
             notes=process.folder if process.is_child else None,
             launch=process.launch,

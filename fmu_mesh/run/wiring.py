@@ -17,7 +17,7 @@ from ..config.mesh import TimeoutsConfig, ZenohConfig
 from ..files import beside
 from ..system.plan import MASTER
 from ..wire.runtime import socket_endpoint
-from ..wire.session import Wiring, is_socket
+from ..wire.session import Wiring, host_of, is_socket
 
 __all__ = ["is_socket", "leaves_host", "patient", "wiring"]
 
@@ -59,17 +59,18 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
     """The wiring of a process that waits for the others as long as the configuration says.
 
     On one host the end of a process closes its sockets, so no link is given up before a step is: its deadlines come
-    first. Of two hosts the one that connects decides.
+    first. Of two hosts the one that connects decides. Between hosts a queue is full during a cut, and links wait for
+    its end. A master that is on one host with all others does not wait so long for a tool that is stopped.
     """
     is_local = all(map(is_socket, made.connect))
     lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
-    return replace(made, lease_s=lease_s, stuck_s=lease_s if is_node else made.stuck_s)
+    waits = is_node or not all(map(is_socket, (*made.listen, *made.connect)))
+    return replace(made, lease_s=lease_s, stuck_s=lease_s if waits else made.stuck_s)
 
 
 def leaves_host(endpoint: str) -> bool:
     """Whether other hosts can connect to a process that listens at this endpoint."""
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    host = address.rpartition(":")[0].strip("[]")
+    host = host_of(endpoint)
     try:
         return not ipaddress.ip_address(host).is_loopback
     except ValueError:

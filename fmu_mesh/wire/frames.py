@@ -129,11 +129,12 @@ class FrameReceiver:
                     point=row * link.step_points,
                     hint="Two processes publish as this instance: end one of them.",
                 )
-        if end > received:
-            numbers = np.arange(received, end)
+        for start, slots in ring.pieces(received, end):
+            stop = start + slots.stop - slots.start
             for part, new in parts:
-                part[numbers & ring.mask] = new[received - first :]
-            ring.stamps[numbers & ring.mask] = numbers + 1
+                part[slots] = new[start - first : stop - first]
+            ring.stamps[slots] = np.arange(start + 1, stop + 1)
+        if end > received:
             self._counter.raise_to(end)
 
 

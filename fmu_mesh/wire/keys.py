@@ -127,6 +127,10 @@ class RunKeys(msgspec.Struct, frozen=True):
         """Key expression that a node subscribes to for everything sent to it."""
         return f"{self.base}/**/to={node}/**"
 
+    def wake(self, node: str) -> str:
+        """What a node sends to its own inbox, to wake its main thread."""
+        return f"{self.base}/wake/to={node}"
+
     def frames(self, source: str, target_node: str) -> str:
         """Frames of one instance for one node."""
         return f"{self.base}/frame/{source}/to={target_node}"

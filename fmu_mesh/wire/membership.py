@@ -65,6 +65,9 @@ T = TypeVar("T")
 _SILENCE_S = 2.0
 """Longer than a live master is silent: it says something twice a second."""
 
+_SAID_PER_S = 4
+"""At most so many messages of the master come in a second while a node takes no step."""
+
 _GRACE_S = 1.0
 _AGAIN_S = 0.25
 """How often in s the question whether the master is there is asked again."""
@@ -326,7 +329,9 @@ class Membership:
         senders = {keys.frames(link.source, plan.node): link.source_node for link in plan.links_in}
         if plan.node == RECORDER:
             senders |= {keys.settings(node): node for node, _ in plan.windows if node != RECORDER}
-        inbox.open(self._session, keys, plan.node, {**senders, self._admitted.result(0).grants: MASTER})
+        # What may come while a step lasts: the rows that were granted, again after a cut, and what the master says.
+        on_way = 2 * sum(place.rows for place in plan.rings) + _SAID_PER_S * plan.timeouts.step
+        inbox.open(self._session, keys, plan.node, {**senders, self._admitted.result(0).grants: MASTER}, on_way)
         for node in dict.fromkeys(link.source_node for link in plan.links_in):
             question = Question(keys.hello(node), f"node '{node}'", deadline_s, self._hello_to(node))
             self._heard_hello(decode_json(ask(self._session, question, self._has_nothing_to_join), Hello))

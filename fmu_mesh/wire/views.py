@@ -23,6 +23,7 @@ __all__ = [
     "MeshInfo",
     "MeshState",
     "MeshStatus",
+    "RosTopicView",
     "RosView",
     "SetAnswer",
     "VariableView",
@@ -46,6 +47,7 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
         minimum: the smallest value that its model description allows; None without one. So is ``maximum``.
         items: item names and values of an Enumeration.
         settable: whether it can be set while the mesh runs (`fmu_mesh.system.start_values`).
+        timeout: what it does without a value, in words; None without a timeout.
     """
 
     name: str
@@ -61,6 +63,7 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
     maximum: float | None = None
     items: tuple[tuple[str, int], ...] = ()
     settable: bool = False
+    timeout: str | None = None
 
 
 class ConnectionView(msgspec.Struct, frozen=True):
@@ -125,6 +128,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         wait_time: wall-clock time spent waiting since the first point in s.
         running_time: wall-clock time since the first point in s.
         refused: messages that its process refused: malformed ones, and those of unknown senders.
+        timed_out: the inputs without a value for longer than their timeout, and the points of their last values.
     """
 
     instance: str
@@ -138,6 +142,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     restarts: int = 0
     running_time: float = 0.0
     refused: int = 0
+    timed_out: dict[str, int] = {}
 
     def rates_since(self, before: InstanceStatus | None) -> tuple[float, float, float]:
         """Points per second, and the shares of the time in steps and waiting, since an earlier status.
@@ -245,6 +250,14 @@ class MeshStatus(msgspec.Struct, frozen=True):
     resets: int = 0
 
 
+class RosTopicView(msgspec.Struct, frozen=True):
+    """A topic that a gateway publishes (out) or subscribes to (in), and whether a subscriber or publisher is there."""
+
+    topic: str
+    direction: Literal["in", "out"]
+    matched: bool
+
+
 class RosView(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/ros/<id>`: the link of a gateway to ROS.
 
@@ -253,6 +266,8 @@ class RosView(msgspec.Struct, frozen=True):
         connected: whether a bridge or router answers.
         activity: the same as text, such as `nobody answers at tcp/127.0.0.1:7447`.
         other_clocks: other publishers of `/clock`, as text.
+        topics: all of them; what is published reaches a subscriber if it is matched.
+        ignored: by topic, how many elements of messages had keys that no variable has.
     """
 
     profile: str
@@ -260,6 +275,8 @@ class RosView(msgspec.Struct, frozen=True):
     connected: bool
     activity: str
     other_clocks: tuple[str, ...] = ()
+    topics: tuple[RosTopicView, ...] = ()
+    ignored: dict[str, int] = {}
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -267,11 +284,13 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     Attributes:
         points: for `step` only.
+        wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests.
         start_values: for `reset` only; by `instance.variable`, as in a configuration file.
     """
 
     command: Literal["pause", "resume", "step", "stop", "reset"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
+    wait: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
     start_values: dict[str, PlainValue] = {}
 
 
@@ -282,6 +301,7 @@ class CommandAnswer(msgspec.Struct, frozen=True):
         point: the last point that every instance has reached.
         hold: the point at which all of them will pause; None if the mesh continues to run.
         resets: how often the mesh was reset, once it has done what it was told.
+        error: why an answer that has waited comes before they have.
     """
 
     command: str
@@ -289,3 +309,4 @@ class CommandAnswer(msgspec.Struct, frozen=True):
     point: int
     hold: int | None = None
     resets: int = 0
+    error: ErrorReport | None = None

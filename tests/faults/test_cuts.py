@@ -145,6 +145,7 @@ def test_short_cuts_at_any_moment_cost_only_time(tmp_path: Path, name: str, zeno
         *(pytest.param(name, {}, 3.0, id=f"{name}-streams-3") for name in (THREE if IS_LONG else [MAIN])),
         *(pytest.param(name, BY_ZENOH, 3.0, id=f"{name}-zenoh-3") for name in (THREE if IS_LONG else [CYCLE])),
         *(pytest.param(name, {}, 20.0, id=f"{name}-streams-20") for name in (THREE if IS_LONG else [])),
+        *(pytest.param(name, BY_ZENOH, 20.0, id=f"{name}-zenoh-20") for name in (THREE if IS_LONG else [])),
     ],
 )
 def test_after_a_long_cut_a_run_goes_on_at_once(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from collections.abc import Callable, Sequence
 
@@ -15,8 +16,9 @@ from fmu_mesh.errors import ProtocolBroken, TerminationRequested
 from fmu_mesh.node.engine import Engine, PlainEngine
 from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings import native
-from fmu_mesh.rings.host_memory import HostMemory
+from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.system.plan import NodePlan, Plan
+from tests.helpers import wait_until
 from tests.property.test_random_systems import (
     Drawn,
     Mixer,
@@ -193,6 +195,50 @@ def test_an_engine_that_cannot_step_sleeps_until_attention(make: MakeEngine, eag
     thread.join(10.0)
     assert not thread.is_alive()
     assert not any(results)
+
+
+@needs_library
+@pytest.mark.parametrize(("quiet", "least", "most"), [(False, 1, 1), (True, 2, 10)])
+def test_only_a_quiet_engine_goes_on_after_a_wait(quiet: bool, least: int, most: int) -> None:  # noqa: FBT001 a parameter of a test
+    mesh, _ = meshed(chain(1, 10, 4), burst_engine)
+    [engine] = mesh.engines.values()
+    [progress] = mesh.memory.progress.values()
+
+    def grant() -> None:
+        for point in range(1, 11):
+            wait_until(lambda point=point: progress.value >= point, "the point before the next grant")  # type: ignore[misc]  # a default
+            mesh.memory.grant.raise_to(point)
+
+    thread = threading.Thread(target=grant)
+    thread.start()
+    assert engine.run(30.0, eager=False, quiet=quiet)
+
+    assert least <= engine.covered <= most
+    while engine.covered < 10:
+        engine.run(30.0, eager=False)
+    thread.join(10.0)
+
+
+@needs_library
+def test_who_lacks_a_grant_and_a_row_sleeps_for_the_row() -> None:
+    """The row comes later, because its source steps with the grant, too: it wakes up once for both."""
+    mesh, _ = meshed(chain(2, 10, 4), burst_engine)
+    first, second = mesh.engines.values()
+    [source] = second.runners[0].sources
+    place = second._memory.place.own
+
+    def need(counter: Counter) -> int:
+        return ctypes.c_int64.from_address(counter.address + 64 + 8 * place).value
+
+    thread = threading.Thread(target=lambda: second.run(30.0, eager=False))
+    thread.start()
+    wait_until(lambda: need(source.counter) == 2, "the sleep for the row of point 1")
+
+    assert need(mesh.memory.grant) == 0
+    mesh.memory.grant.raise_to(1)
+    first.run(0.0, eager=False)
+    thread.join(10.0)
+    assert second.covered == 1
 
 
 @needs_library

@@ -10,6 +10,7 @@ import random
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +111,9 @@ class EngineMesh:
             FmuMeshError: of an engine.
         """
         chance = random.Random(seed)  # noqa: S311 no secret
+        any_ = partial(chance.choice, (False, True))
         acts: list[Callable[[], object]] = [
-            *(lambda engine=engine: engine.run(0.0, eager=chance.random() < 0.5) for engine in self.engines.values()),
+            *(lambda engine=engine: engine.run(0.0, eager=any_(), quiet=any_()) for engine in self.engines.values()),
             lambda: self.grant(chance.randint(1, 20)),
             *([self.record] if self._records else []),
         ]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Self, cast
 
@@ -55,7 +55,7 @@ class SimulatedMesh:
     Attributes:
         recorded: the rows (Real part) that reached the recorder, by instance.
         messages: how many frames were sent.
-        waits_before_sending: how often a node waited while it had rows that were not sent.
+        waits_before_sending: how often a node waited while it had rows for another node that were not sent.
     """
 
     def __init__(self, plan: Plan, open_instance: Callable[[str], Instance], seed: int = 0) -> None:
@@ -158,7 +158,8 @@ class SimulatedMesh:
         elif target == RECORDER:
             self._record(data)
         else:
-            self._processes[target].take(cast("zenoh.Sample", _Sample(_internal(key), data)))
+            self._processes[target].channel.put(_Sample(_internal(key), data))
+            self._processes[target].rung = True
 
     def _resume(self, process: _Process) -> None:
         process.turn.release()
@@ -227,14 +228,13 @@ class _Process:
         self.name = plan.node
         self.mesh = mesh
         self.number = number
-        self.take: Callable[[zenoh.Sample], None]
+        self.channel = _Channel(self)
+        self.engine: _SimulatedEngine | None = None
         self.rung = False
         self.turn = threading.Semaphore(0)
         self.thread = threading.Thread(target=self._live, name=f"node {plan.node}", daemon=True)
         self.over = False
         self.error: BaseException | None = None
-        self._arrived: list[zenoh.Sample] = []
-        self.take = self._arrived.append  # what comes before its inbox is open
         self._waiting = False
         self._plan = plan
         self._open_instance = open_instance
@@ -248,12 +248,6 @@ class _Process:
     def may_be_told(self) -> bool:
         """Whether this is a thread of the simulation; what other threads want has time until the next message."""
         return threading.current_thread() in (self.thread, self.mesh.thread)
-
-    def receive_with(self, take: Callable[[zenoh.Sample], None]) -> None:
-        """From now on ``take`` gets the messages."""
-        for sample in self._arrived:
-            take(sample)
-        self.take = take
 
     def sleep(self) -> None:
         """Let the others go on until the bell has rung, or time has passed."""
@@ -340,13 +334,17 @@ class _SimulatedEngine(PlainEngine):
     ) -> None:
         super().__init__(plan, units, memory, windows)
         self._process = process
+        process.engine = self
 
-    def run(self, wait_s: float, *, eager: bool) -> bool:
-        self._process.give_up()
+    @property
+    def has_unsent(self) -> bool:
+        """Whether another node may wait for rows of this one."""
         links = [(runner, link) for runner in self.runners for link in runner.out_links if link.has_frames]
-        is_unsent = any(link.sent <= runner.step for runner, link in links)
-        stepped = super().run(wait_s, eager=eager)
-        self._process.mesh.waits_before_sending += is_unsent and wait_s > 0 and not stepped
+        return any(link.sent <= runner.step for runner, link in links if not link.to_recorder)
+
+    def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
+        self._process.give_up()
+        stepped = super().run(wait_s, eager=eager, quiet=quiet)
         for _ in range(1, self._process.mesh.burst() if stepped else 1):
             if not super().run(0.0, eager=eager):
                 break
@@ -406,16 +404,49 @@ class _Entity:
         return False
 
 
+class _Channel:
+    """Where the samples for a node are until it takes them; its subscriber, too."""
+
+    def __init__(self, process: _Process) -> None:
+        self._process = process
+        self._samples: deque[_Sample] = deque()
+        self.put = self._samples.append
+        self.wake: _Sample
+
+    @property
+    def handler(self) -> Self:
+        return self
+
+    def undeclare(self) -> None:
+        return
+
+    def __iter__(self) -> Iterator[_Sample]:
+        return iter(())  # the node reads it itself
+
+    def try_recv(self) -> _Sample | None:
+        return self._samples.popleft() if self._samples else None
+
+    def recv(self) -> _Sample:
+        """The next sample; if the bell has rung without one, or time has passed, that which wakes the node."""
+        engine = self._process.engine
+        self._process.mesh.waits_before_sending += engine is not None and engine.has_unsent
+        if not self._samples and not self._process.rung:
+            self._process.sleep()
+        return self.try_recv() or self.wake
+
+
 class _Session:
     """As much of a session as a node uses."""
 
     def __init__(self, process: _Process) -> None:
         self._process = process
 
-    def declare_subscriber(self, key: str, handler: Callable[[zenoh.Sample], None], **_settings: object) -> _Entity:
-        if key.endswith(f"/to={self._process.name}/**"):
-            self._process.receive_with(handler)
-        return _Entity()
+    def declare_subscriber(self, key: str, _handler: object, **_settings: object) -> _Entity | _Channel:
+        return self._process.channel if key.endswith(f"/to={self._process.name}/**") else _Entity()
+
+    def put(self, key: str, data: bytes, **_settings: object) -> None:
+        """What a node sends to itself: its bell wakes it here."""
+        self._process.channel.wake = _Sample(key, data)
 
     def declare_publisher(self, key: object, **_settings: object) -> _Entity:
         return _Publisher(self._process, str(key)) if "/@sync/" in str(key) else _Entity()

@@ -202,6 +202,27 @@ def test_the_wall_clock_limits_the_grant(plan: Plan) -> None:
     assert run.decide(paced=4) == [RaiseGrant(4)]
 
 
+def test_a_recorder_that_is_behind_is_no_delay_of_the_wall_clock(plan: Plan) -> None:
+    """It writes many rows at once: with `catch_up: 0`, each time points of the wall clock were given up."""
+    run = running(plan)
+    run.at(20, *(node for node in ALL if node != RECORDER))
+
+    assert run.states.granting.slowest == 0
+    assert run.states.granting.reached == 20
+
+
+def test_who_waits_for_the_wall_clock_does_not_wait_for_progress(plan: Plan) -> None:
+    run = initializing(plan)
+    run.at(0)
+    run.decide(paced=3)
+    granting, wanted = run.states.granting, run.states.wanted
+
+    assert granting.wake_at(wanted) is None  # what is granted next depends on the clock alone
+    assert granting.wake_at(granting.grant) is not None
+    run.decide(paced=wanted)
+    assert granting.wake_at(wanted) is not None
+
+
 def test_nodes_elsewhere_get_the_grant_by_messages_that_hold_the_window(plan: Plan) -> None:
     run = running(plan, sharing=False)
     window = plan.nodes["delay"].window

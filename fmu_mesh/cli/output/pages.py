@@ -8,7 +8,7 @@ import msgspec
 
 from ...pictures.tables import pairs, table
 from ...simtime import ENDLESS
-from ...text import short_number
+from ...text import listed, short_number
 from ...wire.client.readings import Reading
 from ...wire.views import ConnectionView, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
 
@@ -66,9 +66,29 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
+            *(
+                ("ROS", f"{count} elements on {topic} were ignored: no variable has their keys")
+                for view in ros
+                for topic, count in view.ignored.items()
+            ),
+            *(
+                ("ROS", f"{words} {listed(names)}")
+                for view in ros
+                for words, which in _MATCHED.items()
+                if view.connected
+                and (names := [own.topic for own in view.topics if (own.direction, own.matched) == which])
+            ),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
+
+
+_MATCHED = {
+    "somebody subscribes to": ("out", True),
+    "nobody subscribes to": ("out", False),
+    "somebody publishes": ("in", True),
+    "nobody publishes": ("in", False),
+}
 
 
 def instance_status(status: InstanceStatus) -> list[str]:
@@ -132,6 +152,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("can", ", ".join(can)),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(map(_connection, info.connections))),
+            ("timeouts", ", ".join(f"{v.name}: {v.timeout}" for v in info.variables if v.timeout)),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
         ]
