@@ -415,8 +415,10 @@ class Master:
         """
         plan, resets = self._replan(command.start_values, self._resets + 1), self._resets + 1
         before = {item.name: item.start_values for node in self._first_plan.nodes.values() for item in node.instances}
-        after = {item.name: item.start_values for node in plan.nodes.values() for item in node.instances}
-        return NewStart(resets, plan.digest, {name: own for name, own in after.items() if own != before[name]})
+        items = [item for node in plan.nodes.values() for item in node.instances]
+        changed = {item.name: item for item in items if item.start_values != before[item.name]}
+        timeouts = {name: item.timeouts for name, item in changed.items()}
+        return NewStart(resets, plan.digest, {name: item.start_values for name, item in changed.items()}, timeouts)
 
     # --- views
 

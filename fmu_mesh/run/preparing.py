@@ -209,7 +209,10 @@ def _without_start_values(run: RunPlan) -> object:
     """What must stay as it is in a reset, because processes and their links have it."""
     return run.contents, {
         name: replace(
-            node, digest="", records=(), instances=tuple(replace(own, start_values={}) for own in node.instances)
+            node,
+            digest="",
+            records=(),
+            instances=tuple(replace(own, start_values={}, timeouts=()) for own in node.instances),
         )
         for name, node in run.plan.nodes.items()
     }

@@ -174,7 +174,11 @@ class _NodeProcess:
         if self._meeting is not None:
             self._meeting.close()
         instances = tuple(
-            replace(item, start_values=start.start_values.get(item.name, item.start_values))
+            replace(
+                item,
+                start_values=start.start_values.get(item.name, item.start_values),
+                timeouts=start.timeouts.get(item.name, item.timeouts),
+            )
             for item in self._first.plan.instances
         )
         plan, showing = self._first.plan, self._first.showing

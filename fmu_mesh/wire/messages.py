@@ -17,6 +17,7 @@ import msgspec
 
 from ..errors import ErrorReport, MessageRefused
 from ..files import decoded_json
+from ..system.input_timeouts import InputTimeout
 from ..variables.value_types import PlainValue
 from .time_profile import NodeProfile
 
@@ -102,11 +103,13 @@ class NewStart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         resets: how often the mesh was reset.
         digest: that of the plan with these start values.
         start_values: all of them, of each instance that has others than in the first run.
+        timeouts: of these instances; an input may fall back to its start value.
     """
 
     resets: int
     digest: str
     start_values: dict[str, dict[str, PlainValue]]
+    timeouts: dict[str, tuple[InputTimeout, ...]] = {}
 
 
 def sealed(secret: str) -> str:

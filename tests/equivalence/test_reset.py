@@ -115,6 +115,19 @@ def test_values_that_were_set_are_gone_after_a_reset(tmp_path: Path) -> None:
         assert run.wait(DEADLINE_S)["gain.y"].tolist() == [0.0] * 101
 
 
+def test_an_input_falls_back_to_the_start_value_of_the_reset(tmp_path: Path) -> None:
+    gain = {"fmu": "Gain", "inputs": {"u": {"timeout": {"after": 0.02, "then": "start"}}}}
+    mesh = fmu_mesh.load(write_config(tmp_path, instances={"gain": gain}, connections=(), stop_time=0.1))
+    with mesh.start(paused=True) as run:
+        run.step(10)
+        run.reset(start_values={"gain.u": 4.0})
+        run.set("gain.u", 7.0)
+        run.resume()
+        column = run.wait(DEADLINE_S)["gain.y"].tolist()
+
+    assert column == [4.0, *[7.0] * 20, *[4.0] * 80]
+
+
 def test_a_reset_that_cannot_be_done_changes_nothing(tmp_path: Path) -> None:
     config = write_config(tmp_path, stop_time=0.1)
     with fmu_mesh.load(config).start(paused=True) as run:
