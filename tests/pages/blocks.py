@@ -24,7 +24,7 @@ PAGES = [
     *(page for folder in ("bridges", "docs", "examples") for page in sorted((ROOT / folder).rglob("*.md"))),
 ]
 
-LANGUAGES = {"sh", "console", "yaml", "python", "json", "text"}
+LANGUAGES = {"sh", "console", "yaml", "python", "json", "xml", "text"}
 """What a block may be. An indented block whose first line begins with `$` is `console`, any other one is `text`."""
 
 _NOTE = re.compile(r"<!-- (not run|needs|meanwhile|file)(?:: (.+?))? -->\s*", re.DOTALL)

@@ -20,6 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Self
 from unittest import mock
+from xml.etree import ElementTree as ET
 
 import pytest
 import yaml
@@ -110,6 +111,8 @@ class PageRun:
                 self._run_python(block, shown)
             case "json":
                 json.loads(block.text)
+            case "xml":
+                ET.fromstring(block.text)  # noqa: S314 our own page
 
     def _run_yaml(self, block: Block) -> None:
         content = yaml.safe_load(block.text)
@@ -325,6 +328,23 @@ NOT_RUN = [
         "ros2 lifecycle set /fmi_adapter_node cleanup",
         "`ros2` is not on PyPI; tests/ros/test_gateway_lifecycle.py calls these services",
     ),
+    (
+        "docs/ros-package.md",
+        "sudo apt install python3-venv python3-colcon-common-extensions",
+        "it needs a ROS in /opt/ros; .ci/long ros builds the package with colcon from PyPI",
+    ),
+    ("docs/ros-package.md", "source /opt/ros/jazzy/setup.bash", "as above"),
+    ("docs/ros-package.md", "source ~/ws/install/setup.bash", "as above"),
+    (
+        "docs/ros-package.md",
+        "ros2 launch fmu_mesh_ros fmu.launch.py fmu_path:=fmus/DampedPendulum.fmu",
+        "`ros2` is not on PyPI; tests/ros/test_package.py runs these files",
+    ),
+    (
+        "docs/ros-package.md",
+        "from fmu_mesh_ros.actions import Mesh, OnMeshReady",
+        "`launch` is not on PyPI; tests/ros/test_package.py has these events",
+    ),
     ("docs/ros.md", "$ ros2 topic list", "`ros2` is not on PyPI; tests/ros/test_bridge.py looks with rclpy"),
     (
         "docs/ros.md",
@@ -335,6 +355,20 @@ NOT_RUN = [
         "docs/ros.md",
         "$ ros2 param get /pendulum_ros gain.k",
         "`ros2` is not on PyPI; tests/ros/test_rmw_zenoh.py calls these services",
+    ),
+    ("docs/ros2-control.md", "ros:", "it is a part; tests/ros/test_ros2_control.py runs the complete file"),
+    (
+        "docs/ros2-control.md",
+        "ros2 launch fmu_mesh_ros mesh_and_gateway.launch.py config:=examples/ros/ros2_control_arm.yaml",
+        "it needs a ROS with its commands; tests/ros/test_ros2_control.py starts both programs",
+    ),
+    (
+        "docs/ros2-control.md",
+        (
+            "ros2 run controller_manager ros2_control_node --ros-args --params-file controllers.yaml "
+            "-r ~/robot_description:=/robot_description"
+        ),
+        "ros2_control is not on PyPI",
     ),
     (
         "docs/sweeps.md",

@@ -5,9 +5,12 @@ Nodes of one test share an executor that the test itself turns, until what it wa
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import importlib.util
 import os
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -20,7 +23,7 @@ import pytest
 from tests.helpers import DEADLINE_S
 from tests.ros.peers import ros_settings
 
-__all__ = ["Ros", "environment", "ros_or_skip"]
+__all__ = ["Ros", "built_types_or_skip", "environment", "ros_or_skip"]
 
 _SPIN_S = 0.02
 _REPEAT_S = 5.0
@@ -45,6 +48,36 @@ def ros_or_skip() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # a parser that ROS imports is older than this Python
         importlib.import_module("rosidl_generator_py")
+
+
+def built_types_or_skip() -> dict[str, str]:
+    """Make the packages of `interfaces.txt` importable; skip a test, or a module, where `build_interfaces` has not run.
+
+    Call it after `ros_or_skip` and before an import of such a package.
+
+    Returns:
+        The environment in which another process can import them, too.
+    """
+    script = Path(__file__).with_name("build_interfaces")
+    asked = {**os.environ, "PYTHON": sys.executable}
+    if subprocess.run([str(script), "--check"], check=False, env=asked, timeout=DEADLINE_S).returncode:
+        pytest.skip(
+            "ROS's generator has not built simulation_interfaces; tests/ros/build_interfaces", allow_module_level=True
+        )
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    libraries = cache / "fmu_mesh/ros_interfaces/install/lib"
+    packages = str(libraries / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages")
+    if packages not in sys.path:
+        sys.path.append(packages)
+        # ROS opens these by their bare names, and LD_LIBRARY_PATH counts at the start of a process only. A library that
+        # is there already is found by its name.
+        for pattern in ("*typesupport_fastrtps_c.so", "*typesupport_introspection_c.so"):
+            for library in libraries.glob(pattern):
+                ctypes.CDLL(str(library))
+    return {
+        "LD_LIBRARY_PATH": os.pathsep.join(filter(None, [str(libraries), os.environ.get("LD_LIBRARY_PATH")])),
+        "PYTHONPATH": os.pathsep.join(filter(None, [packages, os.environ.get("PYTHONPATH")])),
+    }
 
 
 class Ros:
