@@ -234,7 +234,7 @@ class Master:
         self._look_at_streams(now)
         while True:
             paced = states.wanted
-            if states.takes_commands:
+            if states.takes_commands and states.paced:
                 paced, pause_s = self._pacer.limit(paced, states.granting.reached)
             stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
             before, actions = states.state, states.decide(now, paced, stopped)

@@ -106,6 +106,7 @@ class MasterStates:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
         hold: the point at which all nodes pause.
+        paced: whether the wall clock limits the grant: not in a step that asks for it.
         reports: how nodes have ended, by name.
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
@@ -124,6 +125,7 @@ class MasterStates:
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
         self.hold = 0 if paused else None
+        self.paced = True
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -225,6 +227,7 @@ class MasterStates:
         """
         granting, before = self.granting, self.hold
         self.hold = point = granting.halt(claimed)
+        self.paced = command.paced
         self._actions.append(RaiseGrant(point))
         match command.command:
             case "pause":

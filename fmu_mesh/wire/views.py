@@ -260,11 +260,17 @@ class RosView(msgspec.Struct, frozen=True):
     other_clocks: tuple[str, ...] = ()
 
 
-class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A query to `…/mesh/command`; ``points`` is for `step` only."""
+class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A query to `…/mesh/command`.
+
+    Attributes:
+        points: for `step` only.
+        paced: for `step` only: whether the real-time factor limits it.
+    """
 
     command: Literal["pause", "resume", "step", "stop"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
+    paced: bool = True
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
