@@ -19,6 +19,9 @@ __all__ = ["ENDLESS", "TimeGrid", "resolvable", "step_within", "steps_between"]
 ENDLESS = 2**53
 """Last point of a run without a stop time. Beyond it a point has no exact double any more."""
 
+_FAR_S = 1e6
+"""A time that is this far ahead of the present in s is no simulation time: who sends it most likely has a Unix time."""
+
 
 class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The communication points `0 .. last_point` of a run: `t = start_time + point * step_size`.
@@ -79,6 +82,11 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def stop_time(self) -> float | None:
         """The time of the last point in s; None for a run without a stop time."""
         return self.time(self.last_point) if self.last_point < ENDLESS else None
+
+    def latest(self, point: int, *, streamed: bool) -> float:
+        """The latest time in s of a value sent at ``point``: the end; without one, or ``streamed``, 1e6 s ahead."""
+        ahead, stop = self.time(point) + _FAR_S, self.stop_time
+        return ahead if stop is None else min(stop, ahead) if streamed else stop
 
     def told_stop_time(self, points: int) -> float | None:
         """The stop time in s for the setup of an FMU whose steps take ``points`` points; None without a stop time.

@@ -406,6 +406,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "fmu_mesh.run.preparing: fmu_mesh.instances.python": "a scenario has units by the names that components use",
         "fmu_mesh.adapter.adapter: fmu_mesh.instances.fmi": "FMIAdapter is one FMU, by what it promises",
         "fmu_mesh.api.inspection: fmu_mesh.instances.fmi": "`inspect` shows what is in an .fmu file",
+        "fmu_mesh.ssp.fmi_world_reading: fmu_mesh.instances.gazebo": "the joints of a world say what its plugins mean",
         "fmu_mesh.ssp.package: fmu_mesh.instances.fmi": "a package is opened as an FMU is, and may lie in one",
         "fmu_mesh.ssp.package_writing: fmu_mesh.instances.fmi": "a package has each FMU once, by its content",
         "fmu_mesh.ssp.system_reading: fmu_mesh.instances.fmi": "the variables of its FMUs say what a package means",

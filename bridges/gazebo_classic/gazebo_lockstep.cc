@@ -147,8 +147,16 @@ class World {
   // By component: as a whole, a vector is written rounded.
   static void write(std::ostream &text, const Vector3d &v) { text << v.X() << ' ' << v.Y() << ' ' << v.Z() << ' '; }
 
-  static void push(const LinkPtr &link, const double *wrench) {
+  void push(const LinkPtr &link, const double *wrench) const {
     const Vector3d force(wrench[0], wrench[1], wrench[2]), moment(wrench[3], wrench[4], wrench[5]);
+    if (world_->Physics()->GetType() == "simbody") {
+      // Of Gazebo's functions, Simbody has only these two; the others do nothing. A force acts at the origin of the link,
+      // and the moment comes first: it replaces the force.
+      const auto rotation = link->WorldPose().Rot();
+      if (acts(moment)) link->SetTorque(rotation.RotateVector(moment));
+      if (acts(force)) link->AddForce(rotation.RotateVector(force));
+      return;
+    }
     if (acts(force)) link->AddLinkForce(force);
     if (acts(moment)) link->AddRelativeTorque(moment);
   }

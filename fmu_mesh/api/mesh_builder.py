@@ -634,7 +634,7 @@ def _in_words(data: object) -> str:
 
 @checked
 def load(path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] = ()) -> Mesh:
-    """Read a configuration: a YAML file, or a package of SSP.
+    """Read a configuration: a YAML file, a package of SSP, or a world of Gazebo.
 
     Example:
         >>> import fmu_mesh
@@ -642,7 +642,7 @@ def load(path: str | Path, *, ssd: str | None = None, ssv: Sequence[str | Path] 
         ['pendulum', 'delay']
 
     Args:
-        path: the YAML file; or an .ssp file, the folder of an unpacked one, or an .ssd file.
+        path: the YAML file; an .ssp file, the folder of an unpacked one, or an .ssd file; or an SDF world.
         ssd: which system structure description of a package: the name of its file, such as "VarB.ssd", or the name that
             it has; None: SystemStructure.ssd.
         ssv: files with parameter values (SSP 2.0, 6) that replace those of a package; of several, the last one counts.

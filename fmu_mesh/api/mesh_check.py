@@ -14,6 +14,8 @@ from ..pictures.plan_view import PlanView, plan_view
 from ..pictures.tables import html_table
 from ..printing import page
 from ..run.run_plan import RunPlan
+from ..ssp.configuration_files import names_world
+from ..ssp.naming import WORLD
 from ..system.round_trip import round_trip_cost
 from ..text import counted
 
@@ -121,7 +123,10 @@ def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
     if run is not None:
         system, findings = run.plan.system, run.loaded.findings()
         models = {name: (Path(one.fmu), one.description) for name, one in system.instances.items()}
-        check_engines(system.config.instances, models, system.config.limits, findings)
+        # Of a world, only the SDF is checked: that the engine is missing is a warning there.
+        of_file = names_world(run.loaded.file)
+        instances = {name: one for name, one in system.config.instances.items() if not of_file or name != WORLD}
+        check_engines(instances, models, system.config.limits, findings)
         for look in (findings.raise_any, run.check_memory):
             try:
                 look()

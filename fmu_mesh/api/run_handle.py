@@ -229,7 +229,8 @@ class Run:
         Args:
             name: `instance.variable`.
             value: a Python or numpy value of its type; an Enumeration by name or number.
-            at: simulation time in s from which on the value holds; None: from the next point on.
+            at: simulation time in s from which on the value holds, before the end of the simulation and, without a stop
+                time, at most 1e6 s ahead; None: from the next point on.
 
         Returns:
             The point, and its time in s, from which on the value holds; `late` says that the time asked for was past.

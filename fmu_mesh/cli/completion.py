@@ -40,12 +40,12 @@ _LONGEST_S: Final = 5
 """After this time a shell gets no answer."""
 _RESULTS: Final = ("csv", "mcap")
 _FILES: Final[Mapping[str, tuple[str, ...]]] = {
-    "CONFIG": ("yaml", "yml", "ssp", "ssd"),
-    "CONFIG|MESH": ("yaml", "yml", "ssp", "ssd"),
+    "CONFIG": ("yaml", "yml", "ssp", "ssd", "world", "sdf"),
+    "CONFIG|MESH": ("yaml", "yml", "ssp", "ssd", "world", "sdf"),
     "MODEL.fmu": ("fmu",),
     "MODEL.fmu|PACKAGE": ("fmu", "ssp", "ssd"),
     "FILE.ssv": ("ssv",),
-    "SOURCE": ("ssp", "ssd", "yaml", "yml"),
+    "SOURCE": ("ssp", "ssd", "yaml", "yml", "world", "sdf"),
     "TARGET": ("ssp", "yaml", "yml"),
     "FMU": ("fmu",),
     "RESULTS.csv": _RESULTS,

@@ -44,7 +44,7 @@ PARSERS: Parsers = {
         *reaching(),
     ),
     "convert": (
-        argument("source", "SOURCE", "a package of SSP, or a configuration file", type=Path),
+        argument("source", "SOURCE", "a package of SSP, a world of Gazebo, or a configuration file", type=Path),
         argument("target", "TARGET", "the new file: .yaml, or .ssp", type=Path),
         *PACKAGE,
         argument(

@@ -118,7 +118,7 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace | None:
     if name is not None and given[0] == name and name not in COMMANDS:
         suffix = PurePath(name).suffix  # somebody may have left the command out
         hint = did_you_mean(name, COMMANDS, "`fmu-mesh --help` lists them.")
-        if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd"):
+        if suffix in (".yaml", ".yml", ".fmu", ".ssp", ".ssd", ".world", ".sdf"):
             hint = f"Did you mean `fmu-mesh {'simulate' if suffix == '.fmu' else 'launch'} {name}`?"
         raise ConfigurationError(f"there is no command '{name}'.", hint=hint)
     parser, commands = command_parser([] if name is None else [name])

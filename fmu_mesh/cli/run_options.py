@@ -71,7 +71,7 @@ def options(*names: str, of: type[CallOptions] = RunOptions, **words: Mapping[st
 
 
 CONFIGURED = (
-    argument("config", "CONFIG", "the configuration file, or a package of SSP", type=Path),
+    argument("config", "CONFIG", "a configuration file, a package of SSP, or a world of Gazebo", type=Path),
     *PACKAGE,
     group(
         "instead of what CONFIG says",

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from fmu_mesh.config.base import POSITIVE, Base, Name
+from fmu_mesh.config.base import POSITIVE, Base, InputConfig, Name
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import PlainValue
@@ -77,11 +77,12 @@ class InstanceSection:
     """Base class of the sections of instances.
 
     A kind derives its section from `Base` and from this class. The field that has the same name as the kind is the path
-    of the model, unless the section overrides `path` and `agreed`. The section has those of the five common keys that
+    of the model, unless the section overrides `path` and `agreed`. The section has those of the six common keys that
     make sense for its kind::
 
         class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="table"):
             table: Annotated[str, Meta(description="Path of a CSV file, relative to this file.")]
+            inputs: Inputs = {}
             step_size: StepSize = None
             group: Group = None
             host: Host = None
@@ -89,6 +90,7 @@ class InstanceSection:
 
     Attributes:
         start_values: by variable name, as written in the file.
+        inputs: what inputs that are not connected do, by variable name.
         step_size: of the instance in s; None: the base step size.
         group: the group that shares one node; None: none.
         host: the host that the node is meant to run on; None: the one of `launch`.
@@ -104,6 +106,7 @@ class InstanceSection:
     __slots__ = ()
 
     start_values: Mapping[str, PlainValue] = MappingProxyType({})
+    inputs: Mapping[str, InputConfig] = MappingProxyType({})
     step_size: float | None = None
     group: str | None = None
     host: str | None = None
@@ -168,6 +171,7 @@ def placed(section: InstanceSection, not_finite: Literal["stop", "record"] | Non
     """A section without the common keys, which a plan has in fields of its own, but with what ``not_finite`` means."""
     common: dict[str, Any] = {
         "start_values": {},
+        "inputs": {},
         "step_size": None,
         "group": None,
         "host": None,

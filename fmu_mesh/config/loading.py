@@ -419,6 +419,6 @@ def _with_model(instance: Plain, sections: Mapping[str, type[InstanceSection]]) 
     try:
         msgspec.convert(with_path, sections[key])
     except msgspec.ValidationError:  # a kind without a file, or one that misses something else
-        shared = {key: given[key] for key in ("step_size", "group", "host", "not_finite") if key in given}
+        shared = {key: given[key] for key in ("inputs", "step_size", "group", "host", "not_finite") if key in given}
         return {KIND: usual, usual: "", **shared}
     return with_path

@@ -36,7 +36,7 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
     fields: Annotated[
         dict[str, str],
         Meta(
-            description="Several variables in one message: `instance.variable` by its field in the message.",
+            description="Several variables in one message: `instance.variable` by field, such as `position[name=hip]`.",
             examples=[{"twist.linear.x": "path_filter.v"}],
         ),
     ] = {}

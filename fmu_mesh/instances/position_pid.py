@@ -15,7 +15,7 @@ from typing import Annotated, Literal, cast
 import msgspec
 from msgspec import Meta
 
-from ..config.base import Base
+from ..config.base import Base, Inputs
 from ..config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ..config.mesh import LimitsConfig
 from ..errors import StepFailed
@@ -48,6 +48,7 @@ class PidConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
         Meta(description="position_pid: gains p, i, d; inputs target, position, velocity; output effort."),
     ]
     start_values: StartValues = {}
+    inputs: Inputs = {}
     step_size: StepSize = None
     group: Group = None
     host: Host = None

@@ -16,6 +16,7 @@ from ..wire.stream_keeper import StreamKeeper
 from ..wire.views import InstanceStatus
 from ..wire.ways import Ways
 from .engine import Engine
+from .inputs import TimedInputs
 from .stepping import Runner
 
 __all__ = ["Activity"]
@@ -62,20 +63,23 @@ class Activity:
         runner = self.runners.get(name)
         # The main thread continues meanwhile: all values of an answer must belong to one point.
         step, points = (runner.step, runner.plan.step_points) if runner is not None else (0, 1)
-        engine, step_time = self._engine, 0.0
+        instance, engine, step_time = runner.instance if runner is not None else None, self._engine, 0.0
+        own = instance.late if isinstance(instance, TimedInputs) else {}
+        late = {variable: at * points for variable, at in own.items()}
         if engine is not None and step:
             spent = zip(engine.units, engine.spent_s, strict=True)
             step_time = next(spent_s for unit, spent_s in spent if runner in unit) / step
         return InstanceStatus(
             instance=name,
             state=self.state,
-            activity=self._in_words(runner) if runner is not None and self.state == "running" else self.state,
+            activity=self._in_words(runner, late) if runner is not None and self.state == "running" else self.state,
             point=step * points,
             time=self._plan.grid.time(step * points),
             step_time=step_time,
             wait_time=engine.waited_s if engine is not None else 0.0,
             restarts=self._plan.restarts,
             refused=self._refusals.count,
+            timed_out=late,
             running_time=time.monotonic() - self._started if engine is not None else 0.0,
         )
 
@@ -109,7 +113,10 @@ class Activity:
             hint="If it needs that long, raise `timeouts.step` in the configuration.",
         )
 
-    def _in_words(self, runner: Runner) -> str:
+    def _in_words(self, runner: Runner, late: Mapping[str, int]) -> str:
+        if late:
+            without = (f"no value for '{name}' since point {point}" for name, point in late.items())
+            return "; ".join((self._in_words(runner, {}), *without))
         current = self._engine.current if self._engine is not None else None
         if current is None:
             cut = self._keeper.cut_in_words(self._plan.node) if self._keeper is not None else ()

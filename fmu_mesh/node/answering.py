@@ -47,6 +47,8 @@ _BEFORE_VALUES = ("waiting for the mesh", "initializing")
 """States of a node that has its FMUs and no values yet. A mesh can be running for others already."""
 
 _LOOKS = 3
+_MOST_WARNED = 100
+"""Largest number of senders that are warned of."""
 
 _CAPABILITIES = (
     "can_handle_variable_step_size",
@@ -89,6 +91,7 @@ class Answers:
         self._before: list[Job] | None = []
         self._pending: list[_Pending] = []
         self._early: list[_Pending] = []
+        self._without_time: set[str] = set()
 
     def begin(self) -> None:
         """On the main thread, at point 0: set the values that came before; the initialization is as without them."""
@@ -200,9 +203,9 @@ class Answers:
         The ``pending`` query, if it was sent with one, is answered with the point from which on the value holds.
         """
 
-        def confirm(point: int) -> None:
+        def confirm(point: int, when: float | None) -> None:
             grid, points = self._plan.grid, runner.plan.step_points
-            late = origin.time is not None and point > grid.step_at(origin.time, points) * points
+            late = when is not None and point > grid.step_at(when, points) * points
             answer = msgspec.json.encode(SetAnswer(key, point, grid.time(point), late))
             if pending is not None:
                 pending.finish(partial(pending.query.reply, key, answer, encoding=json_encoding))
@@ -211,14 +214,17 @@ class Answers:
             if self._before is not None:
                 self._before.append(take)
                 return
-            at = runner.point
+            at, when = runner.point, origin.time
+            if pending is None and when is not None and when > runner.grid.latest(at, streamed=True):
+                self._post(partial(self._warn_of_time, runner, origin.who, when, at))
+                when = None  # nobody hears a refusal, and a command must not be lost
             try:
-                step = set_input(runner, name, value, origin.time)
+                step = set_input(runner, name, value, when)
             except ValueRefused as refused:
                 self._post(partial(refuse, str(refused)))
             else:
-                self._tell(SetValue(runner.name, name, to_plain(value), at, origin.time, key, origin.who))
-                self._post(partial(confirm, step * runner.plan.step_points))
+                self._tell(SetValue(runner.name, name, to_plain(value), at, when, key, origin.who))
+                self._post(partial(confirm, step * runner.plan.step_points, when))
 
         key = str(sent.key_expr)
         try:
@@ -229,6 +235,13 @@ class Answers:
         if pending is not None:
             self._pending.append(pending)
         self._inbox.post(take)
+
+    def _warn_of_time(self, runner: Runner, who: str, time: float, at: int) -> None:
+        if who not in self._without_time and len(self._without_time) < _MOST_WARNED:
+            self._without_time.add(who)
+            text = f"the time {time:.12g} s that '{who}' sends is no simulation time of this run, which is at"
+            text += f" {runner.grid.time(at):.12g} s: its values take effect at once. Does it run with use_sim_time?"
+            self._log(LogLine(runner.name, "warning", "set", text, at))
 
     def _checked_setting(
         self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
@@ -280,7 +293,7 @@ class _Pending:
 def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
-    sources = runner.plan.sources
+    sources, timeouts = runner.plan.sources, {own.variable: str(own) for own in runner.plan.timeouts}
     nodes = {link.source: link.source_node for link in plan.links_in}
 
     def way_of(source: str, target: str, *, initial_only: bool) -> Way | None:
@@ -316,6 +329,7 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
                 v.maximum,
                 v.items,
                 why_not_settable(v, sources.get(v.name)) is None,
+                timeouts.get(v.name),
             )
             for v in description.variables
             if (kind := kind_of(v)) is not None

@@ -1,7 +1,7 @@
 """Unconnected inputs and tunable parameters over time: what a scenario prescribes, and what programs send with a time.
 
 Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. Which variables may be set is
-`fmu_mesh.system.start_values`.
+`fmu_mesh.system.start_values`; when an input without values falls back is `fmu_mesh.system.input_timeouts`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from ..errors import FmuError
 from ..instances.call_guard import Guarded
-from ..instances.contract import Instance, KeepsState
+from ..instances.contract import Instance, KeepsState, LogMessage
 from ..instances.input_trajectory import Trajectory
 from ..instances.instance_wrapper import AroundNativeSteps
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
+from ..system.input_timeouts import InputTimeout, LastValues
 from ..system.plan import InstancePlan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
@@ -47,8 +48,10 @@ class TimedInputs(AroundNativeSteps):
 
     Args:
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
+        warn: called with the first fallback of each input.
 
     Attributes:
+        late: the inputs without a value for too long, and the own steps of their last values; for any thread.
         python_at: the next own step that `do_step` has to take, because a value may change in it.
         tracks: inputs that change in each step before it: where each lies in the row of inputs, and its values.
         tracks_from: the own step of the first of these values.
@@ -59,8 +62,13 @@ class TimedInputs(AroundNativeSteps):
         instance: Instance,
         interpolation: Literal["hold", "linear"],
         courses: Mapping[str, Course] = MappingProxyType({}),
+        timeouts: Sequence[InputTimeout] = (),
+        warn: Callable[[LogMessage], None] = lambda _message: None,
     ) -> None:
         super().__init__(instance)
+        self._last = LastValues(timeouts, courses, instance.description)
+        self._warn, self._unwarned = warn, {own.variable: own for own in timeouts}
+        self.late: dict[str, int] = {}
         self.python_at = 0
         self.tracks: list[tuple[int, NDArray[np.float64]]] = []
         self.tracks_from = 0
@@ -110,13 +118,11 @@ class TimedInputs(AroundNativeSteps):
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
-            ValueRefused: too many values wait for their time, or this one is too late.
+            ValueRefused: too many values wait for their time.
         """
         now = self._time(self._step)
         when = now if time is None else time
         step = self._grid.step_at(when, self._points)
-        if step >= ENDLESS:
-            raise ValueRefused(f"the time {when:g} s is later than any run ends")
         if name not in self._trajectories:
             variable = self.description.variable(name)
             is_input = variable is not None and variable.causality == "input"
@@ -127,9 +133,12 @@ class TimedInputs(AroundNativeSteps):
             self._trajectories[name] = trajectory
         if len(self._trajectories[name]) >= _WAITING:
             raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
-        self._trajectories[name].add(when, value)
+        step = max(step, self._step)
+        # The value that it has fallen back to is as if it had been sent, and would be newer than one with a past time.
+        self._trajectories[name].add(max(when, now) if name in self.late else when, value)
+        self._last.came(name, step)
         self.python_at = self._step
-        return max(step, self._step)
+        return step
 
     def follows(self, name: str) -> bool:
         """Whether a variable gets its values over time: every input does, and a parameter that got one with a time."""
@@ -140,6 +149,8 @@ class TimedInputs(AroundNativeSteps):
         """Set what changes in own step ``step``."""
         time = self._time(step)
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
+        if self._last.sent:
+            changes |= self._fall_back(step, time)
         for name, value in changes.items():
             if name in self._trajectories:
                 self._trajectories[name].add(time, value)
@@ -156,6 +167,18 @@ class TimedInputs(AroundNativeSteps):
             self._set_in_step(others)
         self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
 
+    def _fall_back(self, step: int, time: float) -> dict[str, Value]:
+        """What inputs fall back to in own step ``step``, which begins at ``time`` (s)."""
+        for name, own in self._trajectories.items():
+            if own.linear and own.after(time + self._grid.rounding(time)) is not None:
+                self._last.came(name, step)  # a line to a later value
+        values, self.late = self._last.fall_back(step), self._last.late(step)
+        for name in [name for name in self._unwarned if name in self.late]:
+            timeout, point = self._unwarned.pop(name), self.late[name] * self._points
+            text = f"input '{name}' has had no value since point {point}: it {timeout}"
+            self._warn(LogMessage(timeout.instance, "warning", "timeout", text, step))
+        return values
+
     def _look_ahead(self, step: int) -> None:
         """Find the step that Python takes next, and the values of inputs that change in each step before it."""
         changes = {name: own.next_change(step) for name, own in self._courses.items()}
@@ -165,13 +188,15 @@ class TimedInputs(AroundNativeSteps):
             if change < step + _SOON
             and name in self._in_row
             and name not in self._trajectories
+            and name not in self.late
             and self._courses[name].first_step <= step
         ]
         others = [change for name, change in changes.items() if name not in soon]
-        end = min([*others, self._next_sent(step), step + _AHEAD])
+        sent = min(self._next_sent(step), self._last.next(step))
+        end = min([*others, sent, step + _AHEAD])
         self.tracks, self._tracked, self.tracks_from = [], [], step
         if not soon or end - step < _SOON:
-            self.python_at = min([*changes.values(), self._next_sent(step)])
+            self.python_at = min([*changes.values(), sent])
             return
         self._tracked = soon
         self.tracks = [(self._in_row[name][1], self._courses[name].values(step, end - step)) for name in soon]
@@ -195,17 +220,17 @@ class TimedInputs(AroundNativeSteps):
         return self._grid.time(step * self._points)
 
 
-def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid) -> Instance:
+def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid, warn: Callable[[LogMessage], None]) -> Instance:
     """The instance as its plan wants it: with what a scenario prescribes, and with inputs that follow times.
 
     Raises:
         ConfigurationError: a table of the scenario cannot be read, or has changed since the run was planned.
     """
     interpolation = plan.section.interpolation
-    if interpolation is None and not plan.scenario:
+    if interpolation is None and not plan.scenario and not plan.timeouts:
         return instance
     courses = courses_of(plan.scenario, instance.description, grid, plan.step_points)
-    return TimedInputs(instance, interpolation or "hold", courses)
+    return TimedInputs(instance, interpolation or "hold", courses, plan.timeouts, warn)
 
 
 def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:
@@ -215,8 +240,11 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
 
     Raises:
         FmuError: the FMU refused it.
-        ValueRefused: too many values wait for their time, or this one is too late.
+        ValueRefused: too many values wait for their time, or no step of this run begins at this one or later.
     """
+    if time is not None and time > (latest := runner.grid.latest(runner.point, streamed=False)):
+        what = "the end of the simulation" if runner.grid.stop_time is not None else "1e6 s ahead: is it a Unix time?"
+        raise ValueRefused(f"the time {time:.12g} s is later than {latest:.12g} s, {what}")
     if time is not None and not isinstance(runner.instance, TimedInputs):
         timed = TimedInputs(runner.instance, "hold")
         timed.start(runner.grid, runner.plan.step_points, runner.step)

@@ -34,7 +34,7 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
-from ..instances.contract import Instance
+from ..instances.contract import Instance, LogMessage
 from ..rings.host_memory import ONE_CORE, HostMemory
 from ..rings.row_streams import RowStreams
 from ..system.plan import MASTER, RECORDER, Link, NodePlan
@@ -59,6 +59,7 @@ from ..wire.messages import (
 from ..wire.router_link import RouterLink
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.streamed_rows import why_not
+from ..wire.views import LogLine
 from ..wire.ways import Ways
 from .activity import Activity
 from .engine import Engine, Windows, make_engine
@@ -229,7 +230,7 @@ class Node:
         self._activity.enter("loading")
         instances = {}
         for item in plan.instances:
-            instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid)
+            instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid, self._warn)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.memory or self._own_memory
@@ -238,6 +239,10 @@ class Node:
                 ring, counter = self._memory.ring(place), self._memory.counter(place.counter)
                 item = plan.instance(place.instance)
                 self._runners[place.instance] = Runner(item, instances[place.instance], plan.grid, ring, counter)
+
+    def _warn(self, message: LogMessage) -> None:
+        point = message.step * self._plan.instance(message.instance).step_points
+        self.server.log_message(LogLine(message.instance, message.status, message.category, message.message, point))
 
     def _meet(self) -> Welcome:
         """Join the mesh: afterwards all other nodes are ready."""

@@ -37,6 +37,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Groups", _groups(plan)),
         ("Scenario", _scenario(plan)),
         ("Inputs that are not connected", _free_inputs(plan)),
+        ("Timeouts", _timeouts(plan)),
         ("Initialization", _initialization(plan)),
         ("Recorded", _recorded(plan)),
         ("Warnings", _warnings(plan)),
@@ -126,6 +127,11 @@ def _free_inputs(plan: Plan) -> list[str]:
         if shown_:
             lines.append([name, listed(shown_)])
     return table(lines, indent=2)
+
+
+def _timeouts(plan: Plan) -> list[str]:
+    instances = plan.system.instances.items()
+    return table([[f"{name}.{own.variable}", str(own)] for name, item in instances for own in item.timeouts], indent=2)
 
 
 def _scenario(plan: Plan) -> list[str]:

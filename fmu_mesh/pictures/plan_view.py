@@ -8,6 +8,7 @@ from ..config.loading import LoadedConfig
 from ..config.mesh import SimulationConfig
 from ..errors import Finding
 from ..rings.library import why_no_library
+from ..system.input_timeouts import InputTimeout
 from ..system.plan import Plan
 from ..system.value_map import map_words
 from ..text import counted
@@ -27,7 +28,7 @@ class PlannedOrigin(msgspec.Struct, frozen=True):
 
 
 class PlannedInstance(msgspec.Struct, frozen=True):
-    """One instance: its model, step size in s, node (process), and start values with their origins."""
+    """One instance: its model, step size in s, node (process), start values with their origins, timeouts of inputs."""
 
     name: str
     model: str
@@ -35,6 +36,7 @@ class PlannedInstance(msgspec.Struct, frozen=True):
     node: str
     start_values: dict[str, PlainValue]
     origins: dict[str, PlannedOrigin]
+    timeouts: tuple[InputTimeout, ...] = ()
 
 
 class PlannedConnection(msgspec.Struct, frozen=True):
@@ -134,6 +136,7 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
                 for name in own.start_values
                 for origin in [start_value_origin(loaded, own, name)]
             },
+            own.timeouts,
         )
         for own in system.instances.values()
     ]

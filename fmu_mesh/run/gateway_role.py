@@ -54,8 +54,8 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
         profiles = stack.enter_context(open_profiles(section, ros, ros_plan, mesh, keys))
         link = RosLink(section, ros, mesh, keys, clock=ros_plan.clock_points is not None)
         stack.callback(link.close)
-        link.open()
         gateway = Gateway(ros_plan, mesh, keys, run.plan.grid, profiles)
+        link.open(gateway.ignored)
         stack.callback(gateway.close)
         process.interruption.goes_to(lambda _reason: gateway.end())
         gateway.open(patience_s)
@@ -70,7 +70,7 @@ def _ros_plan(run: RunPlan) -> RosPlan:
     """The topics of a configuration that was checked before."""
     findings = run.loaded.findings()
     descriptions = {name: own.description for name, own in run.plan.system.instances.items()}
-    ros_plan = resolve(run.loaded, descriptions, findings)
+    ros_plan = resolve(run.loaded, descriptions, findings, run.loaded.findings())
     findings.raise_any()
     assert ros_plan is not None
     return ros_plan

@@ -7,7 +7,7 @@ order of calls at a point and the state of the whole system. Knows no files, no 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
 from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop
+from ..system.input_timeouts import LastValues
 from ..system.layout import Layout
 from ..system.plan import Plan
 from ..system.schedule import Course
@@ -233,13 +234,14 @@ class LocalSystem:
 
 
 class _SavedMember(NamedTuple):
-    """The state of one instance, its own steps done, those done when something was last set, and its rows."""
+    """The state of one instance, its own steps done, those when something was last set, its rows, `LastValues.sent`."""
 
     state: object
     step: int
     set_at: int
     outputs: Rows
     inputs: Rows
+    sent: Mapping[str, Sequence[int]]
 
 
 class SavedSystem(NamedTuple):
@@ -272,6 +274,7 @@ class _Member:
         self._feeds: list[_Feed] = []
         self._set_at = -1
         self._courses: dict[str, Course] = {}
+        self._last = LastValues((), {}, instance.description)
         self._parameters: dict[str, str] = {}
         self.step = 0
         self.settled: set[str] = set()
@@ -315,6 +318,7 @@ class _Member:
     def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
         """Prepare `step_from`: what it needs at every point is looked up here, once."""
         self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
+        self._last = LastValues(self.plan.timeouts, self._courses, self.instance.description)
         names = [column.name for column in self._inputs.layout.columns if column.shape or column.name in self._courses]
         for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
@@ -345,9 +349,10 @@ class _Member:
             return
         step = self.step
         start = step * self._points
-        if self._courses:
+        if self._courses or self.plan.timeouts:
             changes = {name: course.change(step) for name, course in self._courses.items()}
-            if prescribed := {name: value for name, value in changes.items() if value is not None}:
+            prescribed = {name: value for name, value in changes.items() if value is not None}
+            if prescribed := prescribed | self._last.fall_back(step):
                 self._give(prescribed)
         for read, points, lead, change, write in self._feeds:
             value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
@@ -376,6 +381,7 @@ class _Member:
     def set(self, name: str, value: Value) -> None:
         """See `LocalSystem.set`."""
         self._set_at = self.step
+        self._last.came(name, self.step)
         self.instance.set_values({name: value})
         if name in self._courses:
             self._give({name: value})
@@ -393,12 +399,14 @@ class _Member:
         """See `LocalSystem.save`."""
         rows = tuple(part.copy() for part in self._outputs.parts)
         inputs = tuple(part.copy() for part in self._inputs.parts)
-        return _SavedMember(self.instance.get_state(), self.step, self._set_at, rows, inputs)
+        sent = {name: tuple(steps) for name, steps in self._last.sent.items()}
+        return _SavedMember(self.instance.get_state(), self.step, self._set_at, rows, inputs, sent)
 
     def restore(self, saved: _SavedMember) -> None:
         """See `LocalSystem.restore`."""
         self.instance.set_state(saved.state)
         self.step, self._set_at = saved.step, saved.set_at
+        self._last.sent.update((name, [*steps]) for name, steps in saved.sent.items())
         for part, kept in zip(self._outputs.parts, saved.outputs, strict=True):
             part[...] = kept
         for part, kept in zip(self._inputs.parts, saved.inputs, strict=True):

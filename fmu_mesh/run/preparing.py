@@ -136,10 +136,11 @@ def planned(
     known = known or KnownModels()
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
+    warnings = loaded.findings()
     if loaded.config.ros is not None:
         from ..ros.gateway.mapping import resolve  # noqa: PLC0415 most configurations have no such section
 
-        resolve(loaded, descriptions, findings)
+        resolve(loaded, descriptions, findings, warnings)
     scenario = _scenario(loaded, descriptions, findings)
     sections = located
 
@@ -151,7 +152,6 @@ def planned(
     system = build(loaded, descriptions, findings, scenario, claimed, obstacles, partial(check_record, loaded))
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
-    warnings = loaded.findings()
     warn_of_endings(loaded, system.records, warnings)
     warn_of_point_loops(plan, warnings)
     plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))

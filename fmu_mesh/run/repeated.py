@@ -292,7 +292,7 @@ class _Run:
             stack.callback(instance.close)
             place = places[item.name]
             ring, counter = memory.ring(place), memory.counter(place.counter)
-            timed = with_times(instance, item, node.grid)
+            timed = with_times(instance, item, node.grid, self._around.log)
             self._runners[item.name] = Runner(item, timed, node.grid, ring, counter)
         connect(node, self._runners, memory, memory)
 

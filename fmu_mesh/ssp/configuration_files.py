@@ -1,4 +1,4 @@
-"""A configuration file of any format: YAML, or a package of SSP. Both become the same plain values."""
+"""A configuration file of any format: YAML, a package of SSP, or an SDF world. All become the same plain values."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from ..config.loading import PlainConfig, read_file
 from ..errors import ConfigurationError
 from .package import ARCHIVE, DEFAULT, beginning
 
-__all__ = ["named_package", "names_package", "read_configuration"]
+__all__ = ["named_package", "names_package", "names_world", "read_configuration"]
 
 _YAML: Final = (".yaml", ".yml", ".json")
 _PACKAGES: Final = (".ssp", ".ssd")
+_WORLDS: Final = (".world", ".sdf")
 _PARTS: Final = (".ssv", ".ssm", ".ssb")
 
 
@@ -27,7 +28,8 @@ def read_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str | P
         'pendulum_delay'
 
     Args:
-        path: a YAML file; or an .ssp file, a folder that was one, an .ssd file, or an .ssd inside an .ssp.
+        path: a YAML file; an .ssp file, a folder that was one, an .ssd file, or an .ssd inside an .ssp; or a .world or
+            .sdf file with a world of Gazebo classic.
         ssd: which description of a package: the name of its file, or the name that it has; None: the default one.
         ssv: files with values that replace those of a package: in it, or else on the disk.
 
@@ -45,6 +47,10 @@ def read_configuration(path: Path, ssd: str | None = None, ssv: Sequence[str | P
     if path.suffix.lower() in _PARTS or (archive is not None and names_package(archive)):
         hint = "Name the package: the .ssp, its folder, or an .ssd in it."
         raise ConfigurationError(f"'{path}' is a part of a package of SSP", hint=hint)
+    if names_world(path):
+        from .fmi_world_reading import read_fmi_world  # noqa: PLC0415  only where there is a world
+
+        return read_fmi_world(path)
     return read_file(path)
 
 
@@ -82,3 +88,8 @@ def names_package(path: Path) -> bool:
             return any(name.lower().endswith(".ssd") and "/" not in name for name in archive.namelist())
     except (OSError, ValueError, zipfile.BadZipFile):
         return False  # whoever reads it says why
+
+
+def names_world(path: Path) -> bool:
+    """Whether a path is that of a world of Gazebo, by its suffix."""
+    return path.suffix.lower() in _WORLDS

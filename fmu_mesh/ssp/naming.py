@@ -11,7 +11,10 @@ import re
 from collections.abc import Sequence
 from typing import Final
 
-__all__ = ["element_path", "instance_name", "mesh_name"]
+__all__ = ["WORLD", "element_path", "instance_name", "mesh_name"]
+
+WORLD: Final = "world"
+"""The name of the instance that is the world, where a configuration is made from an SDF world."""
 
 _PART: Final = re.compile(r"-([0-9]+)-|(-)|([^-]+)")
 _RESERVED: Final = "mesh"

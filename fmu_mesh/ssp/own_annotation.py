@@ -44,6 +44,7 @@ _INSTANCE_KEYS: Final = (
     "deep_binding",
     "group",
     "host",
+    "inputs",
     "interpolation",
     "not_finite",
     "retry_discarded_steps",

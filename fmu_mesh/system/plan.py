@@ -23,6 +23,7 @@ from .digest import digest_of
 from .execution_order import execution_order
 from .feeds import Feed, feeds_of
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
+from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
@@ -52,6 +53,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initial_outputs: what is read in Initialization Mode only.
         finite: those of ``outputs`` that end the run where they are not finite.
         not_finite: what it means; `record` also allows to set such values.
+        timeouts: what its inputs do without a value.
     """
 
     name: str
@@ -71,6 +73,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initial_outputs: Layout = Layout()
     finite: tuple[str, ...] = ()
     not_finite: Literal["stop", "record"] = "stop"
+    timeouts: tuple[InputTimeout, ...] = ()
 
     @property
     def input_row(self) -> Layout:
@@ -240,8 +243,7 @@ def make_plan(
     descriptions = {name: own.description for name, own in system.instances.items()}
     check_loops(initialization, connections, descriptions, findings)
     outputs = _output_layouts(system, connections)
-    configured = window if window is not None else system.config.simulation.window
-    points = window_of(configured, outputs.values())
+    points = window_of(system.config.simulation.window if window is None else window, outputs.values())
     plan = Plan(
         system=system,
         connections=connections,
@@ -283,10 +285,9 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
 
 def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     system, config = plan.system, plan.system.config
-    node_names = list(dict.fromkeys(instance.node for instance in system.instances.values()))
     links = _links(plan)
     recorded = {link.source for link in links if link.target_node == RECORDER}
-    windows = dict.fromkeys(node_names, plan.window)
+    windows = dict.fromkeys((instance.node for instance in system.instances.values()), plan.window)
     if system.records:
         windows[RECORDER] = recorder_window(plan.window, [row_bytes(outputs[name]) for name in recorded])
     longest_step = max(instance.step_points for instance in system.instances.values())
@@ -371,6 +372,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
     given = {variable.name for variable in instance.description.with_causality("output")}
+    checked = tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
     return InstancePlan(
         name=instance.name,
         fmu=instance.fmu,
@@ -391,10 +393,9 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         parameters=feeds_of(initial),
         initial_inputs=Layout.of(v for v in instance.description.variables if v.name in initialized),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),
-        finite=tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
-        if instance.not_finite == "stop"
-        else (),
+        finite=checked if instance.not_finite == "stop" else (),
         not_finite=instance.not_finite,
+        timeouts=instance.timeouts,
     )
 
 

@@ -54,6 +54,7 @@ class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initial: whether a value for the start or earlier is a start value, and not set in the first step.
         tolerance: times that differ by this much (s) are equal; rounding is allowed for in any case.
         file: a table with more times and values, which come before ``times`` where both are equal.
+        every: whether a value that equals the one before counts, too: its input has a timeout.
     """
 
     variable: str
@@ -63,6 +64,7 @@ class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     initial: bool = True
     tolerance: float = 0.0
     file: SeriesFile | None = None
+    every: bool = False
 
     def agreed(self) -> Schedule:
         """The schedule without what may differ between hosts: where the file is."""
@@ -91,6 +93,7 @@ class Course:
         linear: whether numbers change linearly between two times.
         initial: whether the value for step 0 is set before the run, as a start value.
         tolerance: see `Schedule`.
+        every: see `Schedule`.
     """
 
     def __init__(  # noqa: PLR0913  what a schedule has, and the steps
@@ -103,7 +106,9 @@ class Course:
         linear: bool = False,
         initial: bool = True,
         tolerance: float = 0.0,
+        every: bool = False,
     ) -> None:
+        self._every = every
         self._grid = grid
         self._points = points
         self._linear = linear
@@ -117,7 +122,7 @@ class Course:
             step = grid.step_at(time, points, tolerance)
             if not linear and self._steps and step == self._steps[-1]:
                 self._times.pop(), self._values.pop(), self._steps.pop()
-            if linear or not self._values or not _same(self._values[-1], value):
+            if linear or every or not self._values or not _same(self._values[-1], value):
                 self._times.append(time)
                 self._values.append(value)
                 self._steps.append(step)
@@ -170,8 +175,16 @@ class Course:
         value = self.value(step)
         if value is None or (step == 0 and self._initial):
             return None
+        if self._every and not self._linear and self.last(step) == step:
+            return value
         before = self.value(step - 1) if step else None
         return None if before is not None and _same(before, value) else value
+
+    def last(self, step: int) -> int:
+        """The last own step up to ``step`` with a value of its own, or in a line; 0 where there is none."""
+        place = bisect_right(self._steps, step) - 1
+        is_line = self._linear and 0 <= place < len(self._steps) - 1
+        return step if is_line else self._steps[place] if place >= 0 else 0
 
     def next_change(self, step: int) -> int:
         """The first own step from ``step`` on that may have a `change`; `ENDLESS` if there is none."""

@@ -93,6 +93,7 @@ def course_of(schedule: Schedule, variable: Variable, grid: TimeGrid, points: in
         linear=schedule.linear,
         initial=schedule.initial,
         tolerance=schedule.tolerance,
+        every=schedule.every,
     )
 
 

@@ -7,7 +7,7 @@ model descriptions are arguments: this module knows neither FMPy nor Zenoh.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Literal
 
@@ -24,14 +24,16 @@ from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import Connection, Variables, resolve_connections, unit_warnings
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
+from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.linear_inputs import check_extrapolation
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
-from fmu_mesh.text import listed, nearest_file, shown
+from fmu_mesh.text import listed, nearest, nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
+from fmu_mesh.variables.value_conversion import ValueRefused, to_plain, to_value
 
 __all__ = ["Connection", "ResolvedSystem", "SystemInstance", "build"]
 
@@ -47,6 +49,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
         step_points: its step size as a multiple of the base step size; 1 or more.
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
         not_finite: what an output that is NaN or infinite means.
+        timeouts: what its inputs do without a value.
     """
 
     name: str
@@ -57,6 +60,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
     node: str
     scenario: tuple[Schedule, ...] = ()
     not_finite: Literal["stop", "record"] = "stop"
+    timeouts: tuple[InputTimeout, ...] = ()
 
 
 class ResolvedSystem(msgspec.Struct, frozen=True):
@@ -144,6 +148,9 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     records = resolve_records(loaded, variables, grid, collected, of_files, check_record)
     sources = {c.target: c.source.partition(".")[0] for c in config.connections}  # also those of wrong connections
     sources |= {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
+    base = grid.step_size if grid is not None else 1.0
+    timeouts = {name: tuple(_timeouts(own, config, sources, base, collected)) for name, own in instances.items()}
+    timed = {(name, timeout.variable) for name, own in timeouts.items() for timeout in own}
     prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)
     _check_zenoh(loaded, collected)
     if len(collected):
@@ -162,7 +169,10 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
         name: replace(
             own,
             start_values=own.start_values | prescribed.start_values.get(name, {}),
-            scenario=prescribed.schedules.get(name, ()),
+            scenario=tuple(
+                replace(one, every=(name, one.variable) in timed) for one in prescribed.schedules.get(name, ())
+            ),
+            timeouts=timeouts[name],
         )
         for name, own in instances.items()
     }
@@ -255,6 +265,39 @@ def _instances(
             not_finite=not_finite,
         )
     return instances
+
+
+def _timeouts(
+    instance: SystemInstance, config: Config, sources: Mapping[str, str], base: float, findings: Findings
+) -> Iterator[InputTimeout]:
+    """What the inputs of an instance do without a value; ``sources`` has those that are connected."""
+    inputs = {v.name: v for v in instance.description.with_causality("input")}
+    free = [name for name in inputs if f"{instance.name}.{name}" not in sources]
+    for name, given in config.instances[instance.name].inputs.items():
+        path, variable, own = f"instances.{instance.name}.inputs.{name}", inputs.get(name), given.timeout
+        if variable is None or name not in free:
+            what = f"the unknown input '{name}'" if variable is None else f"'{name}', which is connected"
+            expected = f"an input of '{instance.name}' that is not connected: {listed(free)}"
+            findings.add(path, what, expected, nearest(name, free))
+        elif own is not None and not (math.isfinite(own.after) and own.after > 0.0):
+            findings.add(f"{path}.timeout.after", f"{own.after:g}", "a time > 0 in s")
+        elif own is not None:
+            value: Value | None = instance.start_values.get(name, variable.start) if own.then == "start" else None
+            try:
+                if own.then not in ("hold", "start", "stop"):
+                    value = to_value(own.then, variable, finite=True)
+            except ValueRefused as refused:
+                found = f"{shown(own.then)} for the {variable.type_name} '{name}'"
+                expected = f"hold, start, stop, or {refused.expected}"
+                findings.add(f"{path}.timeout.then", found, expected, refused.suggestion)
+                continue
+            if own.then == "start" and value is None:
+                findings.add(f"{path}.timeout.then", f"start for '{name}', which has no start value", "one, or a value")
+                continue
+            # From 0 on: the time between two values has the rounding of that time, and not of a large start time.
+            steps = TimeGrid(0.0, base, ENDLESS).step_at(own.after, instance.step_points)
+            plain, stops = to_plain(value) if value is not None else None, own.then == "stop"
+            yield InputTimeout(instance.name, name, own.after, steps, instance.step_points, plain, stops)
 
 
 def _step_points(name: str, config: InstanceSection, base: float, findings: Findings) -> int:

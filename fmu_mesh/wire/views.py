@@ -46,6 +46,7 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
         minimum: the smallest value that its model description allows; None without one. So is ``maximum``.
         items: item names and values of an Enumeration.
         settable: whether it can be set while the mesh runs (`fmu_mesh.system.start_values`).
+        timeout: what it does without a value, in words; None without a timeout.
     """
 
     name: str
@@ -61,6 +62,7 @@ class VariableView(msgspec.Struct, frozen=True, omit_defaults=True):
     maximum: float | None = None
     items: tuple[tuple[str, int], ...] = ()
     settable: bool = False
+    timeout: str | None = None
 
 
 class ConnectionView(msgspec.Struct, frozen=True):
@@ -125,6 +127,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         wait_time: wall-clock time spent waiting since the first point in s.
         running_time: wall-clock time since the first point in s.
         refused: messages that its process refused: malformed ones, and those of unknown senders.
+        timed_out: the inputs without a value for longer than their timeout, and the points of their last values.
     """
 
     instance: str
@@ -138,6 +141,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     restarts: int = 0
     running_time: float = 0.0
     refused: int = 0
+    timed_out: dict[str, int] = {}
 
     def rates_since(self, before: InstanceStatus | None) -> tuple[float, float, float]:
         """Points per second, and the shares of the time in steps and waiting, since an earlier status.
@@ -251,6 +255,7 @@ class RosView(msgspec.Struct, frozen=True):
         connected: whether a bridge or router answers.
         activity: the same as text, such as `nobody answers at tcp/127.0.0.1:7447`.
         other_clocks: other publishers of `/clock`, as text.
+        ignored: by topic, how many elements of messages had keys that no variable has.
     """
 
     profile: str
@@ -258,6 +263,7 @@ class RosView(msgspec.Struct, frozen=True):
     connected: bool
     activity: str
     other_clocks: tuple[str, ...] = ()
+    ignored: dict[str, int] = {}
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -267,6 +267,11 @@ NOT_RUN = [
     ),
     (
         "docs/gazebo.md",
+        "fmu-mesh launch examples/gazebo_fmi/simple_electrical_actuator.world",
+        "it needs Gazebo classic 11; tests/physics/test_gazebo_classic.py runs these worlds",
+    ),
+    (
+        "docs/gazebo.md",
         "make -C bridges/gazebo_classic",
         "it needs the headers of Gazebo classic 11; .ci/long builds it",
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ from numpy.typing import NDArray
 
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
 from fmu_mesh.run.options import PlanOptions
-from tests.helpers import Place, rows_of
+from tests.helpers import FMUS, Place, rows_of
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+EXAMPLES = CONFIGS.parent / "examples" / "gazebo_fmi"
 
 Array = NDArray[np.float64]
 
@@ -38,6 +40,11 @@ pytestmark = pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
 def columns(config: Path, output: Path, *start_values: str) -> dict[str, Array]:
     """The result of a run in this process."""
     PlainRun(prepare(config, PlanOptions(start_values=start_values, output=output))).run()
+    return table_of(output)
+
+
+def table_of(output: Path) -> dict[str, Array]:
+    """The columns of a result file by their names."""
     with output.open(newline="") as file:
         header, *rows = csv.reader(file)
     table = np.array(rows, dtype=np.float64)
@@ -123,15 +130,17 @@ def joint(name: str, kind: str, parent: str, child: str, more: str = "") -> str:
     return f"<joint name='{name}' type='{kind}'><parent>{parent}</parent><child>{child}</child>{axis}</joint>"
 
 
-def ran(folder: Path, content: str, *efforts: str, stop_time: float = 1.0) -> dict[str, Array]:
-    """A run of a world without gravity but along z, with constant efforts."""
+def ran(
+    folder: Path, content: str, *efforts: str, stop_time: float = 1.0, starts: Mapping[str, float] = {}
+) -> dict[str, Array]:
+    """A run of a world without gravity but along z, with constant efforts and other inputs."""
     path = folder / "world.sdf"
     path.write_text(f"<sdf version='1.6'><world name='w'>{content}</world></sdf>", encoding="utf-8")
-    starts = ", ".join(f"'{effort}.effort': 0.1" for effort in efforts)
+    values = {f"{effort}.effort": 0.1 for effort in efforts} | dict(starts)
     config = folder / "mesh.yaml"
     config.write_text(
         f"mesh: m\nsimulation: {{stop_time: {stop_time}, step_size: 0.001}}\n"
-        f"instances: {{world: {{gazebo_classic: world.sdf, start_values: {{{starts}}}}}}}\n",
+        f"instances: {{world: {{gazebo_classic: world.sdf, start_values: {values}}}}}\n",
         encoding="utf-8",
     )
     return columns(config, folder / "result.csv")
@@ -178,6 +187,24 @@ def test_a_joint_that_has_no_variables_is_simulated(tmp_path: Path) -> None:
     assert not any(name.startswith("world.ball.") for name in result)
 
 
+@pytest.mark.parametrize("engine", ["ode", "simbody", "dart"])
+def test_a_force_and_a_moment_act_at_the_origin_of_a_link(engine: str, tmp_path: Path) -> None:
+    inertial = "<inertial><pose>0.5 0 0 0 0 0</pose><mass>1</mass></inertial>"  # a moment of inertia of 1 kg m2
+    turned = "1.5707963267948966 0 0"  # about x: y of the link is z of the world, and z is -y
+    body = f"<link name='l'><pose>0 0 0 {turned}</pose>{inertial}</link>"
+    content = f"<gravity>0 0 0</gravity><physics type='{engine}'/><model name='m'>{body}</model>"
+    starts = {"l.force_y": 0.1, "l.force_x": 0.05, "l.moment_z": 0.2}
+
+    result = ran(tmp_path, content, stop_time=0.1, starts=starts)
+
+    # The force at the origin turns the link about its centre by -0.05 N m; what remains of the moment is 0.15 N m.
+    assert result["world.l.angular_velocity_y"][-1] == pytest.approx(-0.015, rel=1e-2)
+    assert result["world.l.angular_velocity_x"][-1] == pytest.approx(0.0, abs=1e-6)
+    # The centre moves with the force, and the origin about it as well: 0.1 m/s2 - 0.5 m * 0.15 rad/s2.
+    assert result["world.l.linear_velocity_z"][-1] == pytest.approx(0.0025, rel=2e-2)
+    assert result["world.l.linear_velocity_x"][-1] == pytest.approx(0.005, rel=2e-2)
+
+
 def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: Place, tmp_path: Path) -> None:
     config = with_gazebo("electrical_actuator", tmp_path, stop_time=1.0)
     outputs = "variables: [world.bare.position,"
@@ -194,3 +221,108 @@ def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: P
     assert len(results[0]) == 1001
     assert len(results[0][0]) > 4  # the inputs as well
     assert results[0] == results[1]
+
+
+# ---- worlds of gazebo-fmi, by one command ----
+
+
+def launched(place: Place, world: Path, stop_time: float, *start_values: str) -> dict[str, Array]:
+    """The result of `fmu-mesh launch WORLD`, with FMUs where Gazebo finds them."""
+    place.environment = {**place.environment, "GAZEBO_RESOURCE_PATH": str(FMUS)}
+    output = place.folder / "result.csv"
+    options = ["--stop-time", str(stop_time), "--real-time-factor", "0", "--no-progress", "--output", str(output)]
+    values = [word for value in start_values for word in ("--set", value)]
+    run = place.start("launch", world, *options, *values)
+    assert run.wait(120.0) == 0, run.errors
+    return table_of(output)
+
+
+def settled(times: Array, angle: Array) -> float:
+    """When an angle is within 5 % of 1 rad, and stays there."""
+    return float(times[np.flatnonzero(np.abs(angle - 1.0) > 0.05)[-1]])
+
+
+@pytest.mark.parametrize(("engine", "apart"), [("ode", 0.0), ("simbody", pytest.approx(3.46e-4, abs=0.005e-4))])
+def test_a_launched_world_has_the_pendulums_of_figure_10(
+    engine: str, apart: float, place: Place, tmp_path: Path
+) -> None:
+    text = (EXAMPLES / "damped_pendulum.world").read_text(encoding="utf-8")
+    path = tmp_path / "damped_pendulum.world"
+    path.write_text(text.replace('"default">', f'"default"><physics type="{engine}"/>'), encoding="utf-8")
+
+    result = launched(place, path, 10.0)
+
+    engine_s, fmu_s = (result[f"world.pendulum_damped_via_{by}::joint.position"] for by in ("sdf", "fmi"))
+    assert np.abs(engine_s - fmu_s).max() == apart
+    reference = [-2.894207, -0.682642, -1.152221, -2.478352]
+    assert [fmu_s[point] for point in (1000, 2000, 5000, 10_000)] == pytest.approx(reference, abs=3e-3)
+
+
+def test_a_launched_world_has_the_arms_of_figure_20(place: Place) -> None:
+    world, motor = EXAMPLES / "simple_electrical_actuator.world", "joint_actuator.motorConstant=0.1"
+    bare, weak = (f"{name}-joint-pid" for name in ("no_actuator_model", "simple_electrical_actuator_model"))
+
+    same = [f"{pid}.{value}" for pid in (bare, weak) for value in ("p=10", "d=3", "target=1")]
+    result = launched(place, world, 20.0, motor, *same)
+    tuned = launched(place, world, 20.0, motor, *(f"{weak}.{value}" for value in ("p=109", "d=60", "target=1")))
+
+    angles = [
+        result["world.no_actuator_model::joint.position"],
+        result["world.simple_electrical_actuator_model::joint.position"],
+        tuned["world.simple_electrical_actuator_model::joint.position"],
+    ]
+    assert [angle.max() for angle in angles] == pytest.approx([1.171, 1.229, 1.113], abs=1e-3)
+    assert [settled(result["time"], angle) for angle in angles] == pytest.approx([1.67, 14.56, 3.4], abs=0.02)
+    assert not tuned["world.no_actuator_model::joint.effort_applied"].any()  # a controller without gains
+
+
+@pytest.mark.parametrize("engine", ["ode", "simbody", "dart"])
+def test_a_launched_world_brakes_the_cube_whose_model_is_named(engine: str, place: Place, tmp_path: Path) -> None:
+    text = (EXAMPLES / "linear_friction.world").read_text(encoding="utf-8")
+    path = tmp_path / "linear_friction.world"
+    path.write_text(text.replace('"default">', f'"default"><physics type="{engine}"/>'), encoding="utf-8")
+
+    braked = launched(place, path, 2.0, "floating_cube_fluid_dynamics.gain=10")
+    free = launched(place, path, 2.0, "floating_cube_fluid_dynamics.gain=0")
+
+    assert 0.096 < braked["world.link.position_x"][-1] < 0.1
+    assert free["world.link.position_x"][-1] == pytest.approx(2.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("disabled", ["true", "false"])
+def test_a_launched_world_lifts_an_arm_only_without_its_limits(disabled: str, place: Place, tmp_path: Path) -> None:
+    text = (EXAMPLES / "position_regulation.world").read_text(encoding="utf-8")
+    path = tmp_path / "position_regulation.world"
+    path.write_text(text.replace("limits>true", f"limits>{disabled}"), encoding="utf-8")
+
+    gains = [f"upper_joint-pid.{value}" for value in ("p=100", "i=20", "d=10", "target=1")]
+    result = launched(place, path, 6.0, "upper_joint_actuator.motorConstant=0.1", *gains)
+
+    # The tolerance is that of the test of gazebo-fmi.
+    assert (abs(result["world.upper_joint.position"][-1] - 1.0) < 0.1) == (disabled == "true")
+
+
+def test_a_joint_to_a_model_that_is_included_in_another_moves(place: Place, tmp_path: Path) -> None:
+    hand = tmp_path / "models" / "hand"
+    hand.mkdir(parents=True)
+    (hand / "model.sdf").write_text(f"<sdf version='1.6'><model name='hand'>{link('palm')}</model></sdf>", "utf-8")
+    plugin = (
+        "<plugin name='p' filename='libFMIActuatorPlugin.so'><actuator><joint>wrist</joint><fmu>Damper.fmu</fmu>"
+        "</actuator></plugin>"
+    )
+    include = "<include><uri>model://hand</uri><name>{}</name></include>"
+    arms = "".join(
+        f"<model name='{name}'>{link('arm')}{joint('held', 'fixed', 'world', 'arm')}{include.format('left')}"
+        f"{joint('wrist', 'revolute', 'arm', 'left::palm')}{damper}</model>"
+        for name, damper in (("damped", plugin), ("free", ""))
+    )
+    path = tmp_path / "world.world"
+    path.write_text(f"<sdf version='1.6'><world name='w'><gravity>0 0 0</gravity>{arms}</world></sdf>", "utf-8")
+    place.environment = {**place.environment, "GAZEBO_MODEL_PATH": str(tmp_path / "models")}
+
+    efforts = [f"{pid}-wrist-pid.{value}" for pid in ("damped", "free") for value in ("p=0.1", "target=1")]
+    result = launched(place, path, 1.0, *efforts)
+
+    # The free one gets 0.1 N m/rad on 0.1 kg m2, and is a pendulum: 1 - cos(t). Damper.fmu ignores its controller.
+    assert result["world.free::wrist.position"][-1] == pytest.approx(1.0 - np.cos(1.0), abs=1e-3)
+    assert np.abs(result["world.damped::wrist.position"]).max() == 0.0

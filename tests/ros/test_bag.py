@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.ros.bags.bag import Bag, BagSample
 from fmu_mesh.ros.bags.playing import Played, schedule
 from fmu_mesh.ros.messages.cdr import Codec
 from fmu_mesh.ros.messages.definitions import MessageTypes
 from fmu_mesh.ros.messages.topics import Port, Topic
-from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.variables.model_description import Variable
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, Launched, Place, rows_of, wait_until, write_config
@@ -247,6 +249,17 @@ def test_a_sample_holds_from_first_point_that_is_not_before_its_stamp(
 
     assert {moment.point: moment.values["gain", "u"] for moment in moments} == points
     assert len(moments) + merged + beyond == len(samples)
+
+
+@pytest.mark.parametrize(("point", "played"), [(0, 1), (2 * 10**8, 5)])
+def test_a_mesh_without_stop_time_has_no_unix_times(point: int, played: int) -> None:
+    """At point 2e8 of 10 ms, two million seconds are nearly over."""
+    grid = TimeGrid(0.0, 0.01, ENDLESS)
+    samples = [BagSample(round(time * 1e9), "gain", "u", 1.0) for time in (5.0, 1.1e6, 1.5e6, 2e6, 2.9e6, 1.7e9)]
+
+    moments, _, beyond = schedule(samples, grid, {"gain": 1}, start=None, point=point)
+
+    assert (len(moments), beyond) == (played, 6 - played)
 
 
 def test_stamps_of_another_clock_are_moved_to_begin_at_the_start() -> None:
@@ -488,3 +501,55 @@ def test_each_wrong_entry_of_one_bag_is_told_at_its_place(tmp_path: Path) -> Non
         ("scenario.values.first.u.topic", "field 'first'"),
         ("scenario.values.second.u.topic", "field 'second'"),
     ]
+
+
+def test_joints_of_a_bag_are_recorded_and_played_by_their_names(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    file = tmp_path / "arm.mcap"
+    coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
+    fields = {"position[name=rod]": "pendulum.a", "position[name='late [1]']": "delay.y"}
+    states = {"topic": "/joint_states", "type": "sensor_msgs/msg/JointState", "fields": fields}
+    coupled.configure(ros={"topics": [states]}, simulation={"stop_time": 0.02})
+    expected = coupled.run(processes=False, record="memory")
+    coupled.run(processes=False, output=file)
+    mesh = fmu_mesh.Mesh("played", step_size=0.002, stop_time=0.02)
+    mesh.add("rod", fmu=FMUS / "Gain.fmu")
+    mesh.add("other", fmu=FMUS / "Gain.fmu", start_values={"u": 0.25})
+
+    with mesh.start(paused=True, record="memory") as run:
+        run.play(file, topics=["/joint_states:position[name=rod]=rod.u"])
+        played = run.wait()
+    mesh.scenario({"rod.u": {"file": file, "topic": "/joint_states:position[name=rod]"}})
+    prescribed = mesh.run(processes=False, record="memory")
+    read = fmu_mesh.Result.read(file)
+
+    assert [own.name for _, own in messages_of(file)["/joint_states"]] == [["rod", "late [1]"]] * 11
+    for name in ("pendulum.a", "delay.y"):
+        np.testing.assert_array_equal(read[name], expected[name])
+    for result in (played, prescribed):
+        np.testing.assert_array_equal(result["rod.y"][1:], expected["pendulum.a"][:-1])
+        assert set(result["other.y"].tolist()[1:]) == {0.25}
+
+
+@pytest.mark.parametrize(
+    ("choice", "says"),
+    [
+        ("/joint_states:position[name=none]=rod.u", "no message of /joint_states in"),
+        ("/joint_states:position[nam=rod]=rod.u", "'nam' is no text that tells its elements apart"),
+    ],
+)
+def test_joint_that_a_bag_lacks_is_told(choice: str, says: str, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install 'fmu-mesh[test]'")
+    coupled = fmu_mesh.load(FMUS.parent / "configs/pendulum_delay.yaml")
+    states = {
+        "topic": "/joint_states",
+        "type": "sensor_msgs/msg/JointState",
+        "fields": {"position[name=rod]": "pendulum.a"},
+    }
+    coupled.configure(ros={"topics": [states]}, simulation={"stop_time": 0.02})
+    coupled.run(processes=False, output=tmp_path / "arm.mcap")
+    mesh = fmu_mesh.Mesh("played", step_size=0.002, stop_time=0.02)
+    mesh.add("rod", fmu=FMUS / "Gain.fmu")
+
+    with mesh.start(paused=True, record="memory") as run, pytest.raises(ConfigurationError, match=re.escape(says)):
+        run.play(tmp_path / "arm.mcap", topics=[choice])

@@ -18,9 +18,12 @@ import zenoh
 
 from fmu_mesh.ros.messages.cdr import Codec
 from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
+from fmu_mesh.ros.messages.ros_names import dds_type
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 
+COMMANDS = 5000
+JOINTS = "sensor_msgs/msg/JointState"
 FLOAT = struct.Struct("<4xd")
 TIME = struct.Struct("<4xiI")
 
@@ -67,12 +70,16 @@ def configured(
     factor: float,
     stop_time: float = 3.0,
     timeouts: dict[str, float] | None = None,
+    inputs: dict[str, Any] | None = None,
     **more: Any,  # noqa: ANN401 keys of the section
 ) -> Path:
     return write_config(
         place.folder,
         name="lab",
-        instances={"pendulum": {"fmu": "DampedPendulum", "start_values": {"a": 1.3}}, "gain": {"fmu": "Gain"}},
+        instances={
+            "pendulum": {"fmu": "DampedPendulum", "start_values": {"a": 1.3}},
+            "gain": {"fmu": "Gain", "inputs": inputs or {}},
+        },
         connections=[],
         stop_time=stop_time,
         simulation={"step_size": 0.01, "real_time_factor": factor},
@@ -272,6 +279,121 @@ def test_transforms_go_out_an_element_comes_in_and_none_changes_nothing(place: P
     assert [own.transform.rotation.w for own in transforms] == [0.0, 2.5]
     stamps = [own.header.stamp.sec + own.header.stamp.nanosec / 1e9 for own in transforms]
     assert stamps[0] == stamps[1] > 0.1
+    assert place.run("stop", "lab").wait() == 0
+    assert mesh.wait() == 130, mesh.errors
+
+
+@pytest.mark.parametrize("stop_time", [1000.0, None])
+def test_commands_with_unix_times_take_effect_at_once(stop_time: float, place: Place, ros: Ros) -> None:
+    """As a node without `use_sim_time` stamps them; a mesh without a stop time ignored all of them."""
+    twists = Codec(MessageTypes("jazzy"), "geometry_msgs/msg/TwistStamped")
+    command = {"topic": "/cmd", "type": "geometry_msgs/msg/TwistStamped", "fields": {"twist.linear.x": "gain.u"}}
+    topics = [command, {"topic": "/angle", "variable": "gain.y"}]
+    config = configured(place, ros, factor=1, stop_time=stop_time, topics=topics)
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: ros.floats("angle"), "the first output")
+    sent: list[int] = []
+    for number in (1, 2):
+        sent.append(number)
+        message = twists.empty()
+        message["header"]["stamp"] = {"sec": 1_700_000_000 + number, "nanosec": 0}
+        message["twist"]["linear"]["x"] = float(number)
+        ros.session.put("cmd", twists.encode(message))
+        wait_until(lambda: float(sent[-1]) in ros.floats("angle"), "the command at the output")
+
+    assert place.run("stop", "lab").wait() == 0
+    mesh.wait()
+    assert mesh.errors.count("that 'ros /cmd' sends is no simulation time of this run") == 1, mesh.errors
+    assert "Does it run with use_sim_time?" in mesh.errors
+
+
+def test_a_joystick_that_dies_does_not_steer_for_ever(place: Place, ros: Ros) -> None:
+    inputs = {"u": {"timeout": {"after": 0.5, "then": "start"}}}
+    topics = [{"topic": "/command", "variable": "gain.u"}, {"topic": "/angle", "variable": "gain.y"}]
+    config = configured(place, ros, factor=1, stop_time=1000.0, inputs=inputs, topics=topics)
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: ros.floats("angle"), "the first output")
+    for _ in range(3):
+        seen = len(ros.floats("angle"))
+        ros.session.put("command", struct.pack("<4xd", 2.0).replace(bytes(4), b"\0\1\0\0", 1))
+        wait_until(lambda: len(ros.floats("angle")) > seen + 30, "less than the timeout")  # noqa: B023  it waits here
+    wait_until(lambda: ros.floats("angle")[-1] == 0.0, "the start value")
+
+    values = [value for value, _ in groupby(ros.floats("angle"))]
+    assert values == [0.0, 2.0, 0.0]
+    assert place.run("stop", "lab").wait() == 0
+    mesh.wait()
+
+
+@pytest.mark.parametrize("profile", ["ros2dds", "rmw_zenoh"])
+def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place, ros: Ros, profile: str) -> None:
+    types = MessageTypes("jazzy")
+    codec = Codec(types, JOINTS)
+    key = "{}" if profile == "ros2dds" else f"0/{{}}/{dds_type(JOINTS)}/{types.type_hash(JOINTS)}"
+    joints = {f"position[name={name}]": f"{name}.y" for name in ("weak", "bare")}
+    config = write_config(
+        place.folder,
+        name="lab",
+        instances={"weak": {"fmu": "Gain"}, "bare": {"fmu": "Gain"}},
+        connections=[],
+        stop_time=1000.0,
+        simulation={"step_size": 0.01, "real_time_factor": 1},
+        ros={
+            "connect": [f"tcp/127.0.0.1:{ros.port}"],
+            "profile": profile,
+            "topics": [
+                {"topic": "/command", "type": JOINTS, "fields": {own: f"{joints[own][:-2]}.u" for own in joints}},
+                {"topic": "/states", "type": JOINTS, "fields": joints},
+            ],
+        },
+    )
+
+    def send(names: list[str], position: list[float]) -> None:
+        data = codec.encode(codec.empty() | {"name": names, "position": position})
+        ros.session.put(key.format("command"), data, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def newest() -> tuple[list[str], list[float]]:
+        message = codec.decode(states[-1].payload.to_bytes())
+        return message["name"], message["position"].tolist()
+
+    states: list[zenoh.Sample] = []
+    puts: dict[str, list[float]] = {}
+
+    def keep(sample: zenoh.Sample) -> None:
+        if sample.attachment is not None and b"point" not in sample.attachment.to_bytes():
+            puts.setdefault(str(sample.key_expr).split("/")[2], []).append(float(sample.payload.to_string()))
+
+    def subscribed() -> bool:
+        send(["bare", "weak"], [0.0, 0.0])
+        return len(puts) == 2
+
+    ros.session.declare_subscriber(key.format("states"), states.append)
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: bool(states), "the first state")
+    send(["weak", "bare"], [0.5, -0.5])
+    wait_until(lambda: newest() == (["weak", "bare"], [0.5, -0.5]), "both commands at their joints")
+    send(["bare", "weak"], [-0.25, 0.25])
+    wait_until(lambda: newest() == (["weak", "bare"], [0.25, -0.25]), "both in the other order")
+    with place.session() as session, session.declare_subscriber("fmu_mesh/lab/*/in/u", keep):
+        wait_until(subscribed, "a subscriber that the gateway knows")
+        for number in range(1, COMMANDS + 1):
+            own = {"weak": float(number), "bare": -float(number), "stranger": 0.0}
+            send([*own][:: 1 if number % 2 else -1], [*own.values()][:: 1 if number % 2 else -1])
+        numbers = [float(number) for number in range(1, COMMANDS + 1)]
+        wait_until(lambda: {abs(own[-1]) for own in puts.values()} == {COMMANDS}, "the last command")
+    send(["weak", "bare", "weak"], [7.0, 8.0])
+    send(["bare"], [3.0])
+    wait_until(lambda: newest() == (["weak", "bare"], [numbers[-1], 3.0]), "the command of one joint")
+
+    assert [value for value in puts["weak"] if value] == numbers
+    assert [-value for value in puts["bare"] if value] == numbers
+    assert mesh.errors.count("elements that no variable has are ignored: stranger; variables have bare, weak") == 1
+    assert "'position[name=weak]' is one of 2 elements for 3 texts in 'name'" in mesh.errors
+    status = place.run("status", "lab")
+    assert status.wait() == 0
+    assert f"{COMMANDS} elements on /command were ignored: no variable has their keys" in status.output
     assert place.run("stop", "lab").wait() == 0
     assert mesh.wait() == 130, mesh.errors
 

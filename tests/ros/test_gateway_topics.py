@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+import fmu_mesh
 from fmu_mesh.config.loading import read_file
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data
@@ -30,7 +31,8 @@ def plan_of(path: Path) -> RosPlan:
     """The plan of a file, with what its instances say of themselves."""
     plan = prepare(path)
     loaded = examine_data(read_file(path))[0]
-    found = resolve(loaded, {name: own.description for name, own in plan.system.instances.items()}, loaded.findings())
+    descriptions = {name: own.description for name, own in plan.system.instances.items()}
+    found = resolve(loaded, descriptions, loaded.findings(), loaded.findings())
     assert found is not None
     return found
 
@@ -265,6 +267,30 @@ def mapped(message: str, fields: dict[str, str], **more: Any) -> dict[str, Any]:
         (mapped(JOINTS, {"position[0]": "delay.y"}, constants={"effort[0]": True}), "a value of the type float64"),
         (mapped(PRIMITIVE, {"dimensions[0]": "delay.y"}, constants={"type": 300}), "'type' cannot be 300"),
         (mapped(JOINTS, {"position[0]": "gain.u"}, constants={"name[0]": "a"}), "a topic that is subscribed"),
+        (
+            mapped(JOINTS, {"position[nam=elbow]": "gain.u"}),
+            "apart; expected one of position[name=elbow]. Did you mean 'position[name=elbow]'?",
+        ),
+        (
+            mapped(JOINTS, {"position[name=elbow]": "delay.y", "position[0]": "gain.y"}),
+            "'position[0]', which 'position[name=elbow]' gives already",
+        ),
+        (
+            mapped(TF, {"transforms[child_frame_id=a].transform": "delay.y"}),
+            "'transforms[child_frame_id=a].transform' of 'tf2_msgs/msg/TFMessage' for 'delay.y': it is a message",
+        ),
+        (
+            mapped(
+                TF,
+                {"transforms[child_frame_id=a].transform.rotation.w": "delay.y"},
+                constants={"transforms[child_frame_id=a].child_frame_id": "b"},
+            ),
+            "'transforms[child_frame_id=a].child_frame_id', which '[…=a]' gives already",
+        ),
+        (
+            mapped(JOINTS, {"position[name=elbow]": "delay.y"}, constants={"name[0]": "elbow", "name[1]": "elbow"}),
+            "constants: 'elbow' at 'name[1]', and at 'name[0]'; expected each key once",
+        ),
     ],
 )
 def test_what_could_not_be_sent_or_received_is_told_by_check(tmp_path: Path, ros: dict[str, Any], message: str) -> None:
@@ -303,6 +329,42 @@ def test_elements_of_arrays_of_messages_are_topics_in_both_directions(tmp_path: 
     assert plan.topics[0].constants == tuple(names.items())
 
 
+def test_published_keys_become_indexes_and_constants_of_plan(tmp_path: Path) -> None:
+    fields = {"position[name=weak]": "pendulum.a", "position[name=bare]": "delay.y", "velocity[name=bare]": "gain.y"}
+
+    [made] = planned(tmp_path, **mapped(JOINTS, fields, constants={"name[0]": "bare"})).topics
+
+    assert [port.path for port in made.ports] == ["position[1]", "position[0]", "velocity[0]"]
+    assert str(made.constants) == "(('name[0]', 'bare'), ('name[1]', 'weak'), ('velocity[1]', nan))"
+
+
+@pytest.mark.parametrize(
+    ("message", "field", "by_key"),
+    [
+        (JOINTS, "position[0]", "position[name=…]"),
+        (TF, "transforms[1].transform.rotation.w", "transforms[child_frame_id=…].transform.rotation.w"),
+        (JOINTS, "position[name=elbow]", None),
+        ("geometry_msgs/msg/PoseArray", "poses[0].position.x", None),
+    ],
+)
+def test_index_into_subscribed_table_is_a_warning_with_spelling_by_key(
+    tmp_path: Path, message: str, field: str, by_key: str | None
+) -> None:
+    checked = fmu_mesh.load(configured(tmp_path, **mapped(message, {field: "gain.u"}))).check()
+
+    warnings = [text for text in checked.warnings if "ros.topics" in text]
+    where = (
+        f"ros.topics[0].fields.{field}: '{field}' of '{message}', whose elements may come in any order; expected a key"
+    )
+    assert [text.partition(": ")[2] for text in warnings] == ([] if by_key is None else [f"{where}: {by_key}"])
+
+
+def test_index_into_published_table_is_no_warning(tmp_path: Path) -> None:
+    ros = mapped(JOINTS, {"position[0]": "delay.y"}, constants={"name[0]": "elbow"})
+
+    assert not [text for text in fmu_mesh.load(configured(tmp_path, **ros)).check().warnings if "ros" in text]
+
+
 def test_names_that_collide_or_start_with_a_digit_are_found_together(tmp_path: Path) -> None:
     loaded = examine_data(read_file(configured(tmp_path, topics=["pendulum", "delay.nothing"])))[0]
     variables = tuple(
@@ -314,7 +376,7 @@ def test_names_that_collide_or_start_with_a_digit_are_found_together(tmp_path: P
     )
     findings = loaded.findings()
 
-    plan = resolve(loaded, {"pendulum": model, "delay": model}, findings)
+    plan = resolve(loaded, {"pendulum": model, "delay": model}, findings, loaded.findings())
 
     texts = [str(finding) for finding in findings]
     assert len(texts) == 3

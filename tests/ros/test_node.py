@@ -514,21 +514,21 @@ def test_an_element_of_an_array_of_messages_is_variable_in_both_directions(ros: 
                 "fmu_path": PENDULUM,
                 "messages": ["/t: {type: std_msgs/msg/Float64MultiArray, fields: {'data[-1]': a}}"],
             },
-            "'data[-1]' is no field such as",
+            "has no field 'data[-1]': an index is a whole number from 0 to 65535",
         ),
         (
             {
                 "fmu_path": PENDULUM,
                 "messages": ["/t: {type: std_msgs/msg/Float64MultiArray, fields: {'data[65536]': a}}"],
             },
-            "is beyond its 65536 elements",
+            "has no field 'data[65536]': an index is a whole number from 0 to 65535",
         ),
         (
             {
                 "fmu_path": PENDULUM,
                 "messages": ["/t: {type: geometry_msgs/msg/PoseWithCovariance, fields: {'covariance[36]': a}}"],
             },
-            "is beyond its 36 elements",
+            "has no field 'covariance[36]': an index is a whole number from 0 to 35",
         ),
         ({"fmu_path": PENDULUM, "publish_clock": True, "use_sim_time": True}, "publish /clock and run by it"),
     ],

@@ -359,7 +359,7 @@ def test_a_topic_of_a_clock_is_refused_as_that(tmp_path: Path) -> None:
     loaded = parse(f"{head}ros: {{topics: [a.called]}}\n", Path("mesh.yaml"))
     findings = loaded.findings()
 
-    resolve_ros(loaded, {"a": described(tmp_path, 3)}, findings)
+    resolve_ros(loaded, {"a": described(tmp_path, 3)}, findings, loaded.findings())
 
     assert [finding.found for finding in findings] == [
         "'called' is a clock, and clocks cannot be connected yet, nor set or recorded"

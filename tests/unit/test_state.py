@@ -15,6 +15,7 @@ from fmu_mesh.errors import FmuError, FmuMeshError, TerminationRequested
 from fmu_mesh.instances.call_guard import CallWatch, Guarded
 from fmu_mesh.instances.contract import Instance
 from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
 from fmu_mesh.instances.fmi.fmu_instance import Bookkeeping, FmuInstance
 from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
@@ -27,7 +28,7 @@ from fmu_mesh.system.linear_inputs import LinearInput
 from fmu_mesh.variables.model_description import Kind
 from fmu_mesh.variables.value_types import Value
 from tests.fmus.event_fmus import Version
-from tests.helpers import DEADLINE_S
+from tests.helpers import DEADLINE_S, FMUS
 
 EventFmu = Callable[..., Path]
 Rows = list[tuple[Value, ...]]
@@ -160,11 +161,13 @@ def test_what_is_no_state_is_refused(event_fmu: EventFmu, tmp_path: Path) -> Non
             one.instance.deserialize_state(b"no state")
 
 
-def test_inputs_over_time_are_no_part_of_state_so_there_is_none() -> None:
-    timed = TimedInputs(cast("Instance", FmuInstance), "hold")
+def test_inputs_over_time_are_no_part_of_state_so_there_is_none(tmp_path: Path) -> None:
+    path = FMUS / "Gain.fmu"
+    timed = TimedInputs(Fmi2Instance(path, "gain", read_description(path), tmp_path), "hold")
 
     with pytest.raises(FmuError, match="the state of an instance with inputs over time cannot be kept"):
         timed.get_state()
+    timed.close()
 
 
 def test_a_kind_of_instance_without_states_says_so() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from fmu_mesh.instances.contract import Instance
+from fmu_mesh.errors import TerminationRequested
+from fmu_mesh.instances.contract import Instance, LogMessage
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
 from fmu_mesh.instances.fmi.fmu_kind import FmuConfig
@@ -17,7 +19,8 @@ from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.native import MemberTable
 from fmu_mesh.rings.ring import Ring
-from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.simtime import ENDLESS, TimeGrid
+from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, map_memory
 from fmu_mesh.system.plan import InstancePlan
@@ -30,9 +33,11 @@ STEP_SIZE = 0.1
 class Steps:
     """A gain of 1 whose input is not connected, from second 1 on in steps of a tenth."""
 
-    def __init__(self, folder: Path, interpolation: Literal["hold", "linear"]) -> None:
+    def __init__(self, folder: Path, interpolation: Literal["hold", "linear"], *timeouts: InputTimeout) -> None:
         path = FMUS / "Gain.fmu"
-        self.inputs = TimedInputs(Fmi2Instance(path, "gain", read_description(path), folder), interpolation)
+        self.warnings: list[LogMessage] = []
+        instance = Fmi2Instance(path, "gain", read_description(path), folder)
+        self.inputs = TimedInputs(instance, interpolation, {}, timeouts, self.warnings.append)
         self.rings = Ring(Layout.of([]), 64), Ring(Layout.of([("y", "Float64")]), 64)
         self.inputs.enter_initialization(1.0, None, {"u": 5.0})
         self.inputs.exit_initialization()
@@ -106,14 +111,80 @@ def test_value_whose_time_is_past_holds_unless_later_one_is_in_use(hold: Steps) 
     assert hold.go(1) == [8.0]
 
 
-def runner_of(instance: Instance) -> tuple[Runner, MemberTable]:
+@pytest.fixture
+def quiet(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Steps]:
+    """With a timeout of three steps, after which the input is 9."""
+    steps = Steps(tmp_path, getattr(request, "param", "hold"), InputTimeout("gain", "u", 0.3, 3, 1, 9.0))
+    steps.bind()
+    yield steps
+    steps.inputs.close()
+
+
+def test_an_input_falls_back_once_and_takes_next_value(quiet: Steps) -> None:
+    assert quiet.go(5) == [5.0, 5.0, 5.0, 9.0, 9.0]
+    assert quiet.inputs.late == {"u": 0}
+    assert [(own.instance, own.step) for own in quiet.warnings] == [("gain", 3)]
+    assert (
+        quiet.warnings[0].message == "input 'u' has had no value since point 0: it gets 9.0 after 0.3 s without a value"
+    )
+
+    assert quiet.inputs.add("u", 5.0, None) == 5
+    assert quiet.go(4) == [5.0, 5.0, 5.0, 9.0]
+    assert quiet.inputs.late == {"u": 5}
+    assert len(quiet.warnings) == 1
+
+
+def test_same_value_again_and_again_keeps_an_input(quiet: Steps) -> None:
+    for _ in range(5):
+        quiet.inputs.add("u", 4.0, None)
+        assert quiet.go(2) == [4.0, 4.0]
+    assert quiet.go(2) == [4.0, 9.0]
+
+
+def test_a_value_whose_time_is_past_replaces_what_it_fell_back_to(quiet: Steps) -> None:
+    quiet.go(3)
+    quiet.inputs.add("u", 1.0, 1.9)
+    assert quiet.go(2) == [9.0, 9.0]
+
+    assert quiet.inputs.add("u", 7.0, 1.2) == 5
+    assert quiet.go(5) == [7.0, 7.0, 7.0, 9.0, 1.0]
+
+
+def test_value_ahead_of_time_is_no_value_until_then(quiet: Steps) -> None:
+    assert quiet.inputs.add("u", 1.0, 1.55) == 6
+
+    assert quiet.go(10) == [5.0, 5.0, 5.0, 9.0, 9.0, 9.0, 1.0, 1.0, 1.0, 9.0]
+
+
+@pytest.mark.parametrize("quiet", ["linear"], indirect=True)
+def test_a_line_to_a_later_value_is_a_value_in_each_step(quiet: Steps) -> None:
+    quiet.go(1)
+    quiet.inputs.add("u", 11.0, 1.7)
+
+    assert quiet.go(10) == pytest.approx([5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 11.0, 11.0, 9.0])
+
+
+def test_an_input_that_says_stop_ends_the_run(tmp_path: Path) -> None:
+    steps = Steps(tmp_path, "hold", InputTimeout("gain", "u", 0.3, 3, 1, stops=True))
+    steps.bind()
+    steps.go(2)
+    steps.inputs.add("u", 1.0, None)
+    steps.go(3)
+
+    with pytest.raises(TerminationRequested, match="since point 2, and it ends the run") as ended:
+        steps.go(1)
+    assert (ended.value.instance, ended.value.variable) == ("gain", "u")
+    steps.inputs.close()
+
+
+def runner_of(instance: Instance, last_point: int = 60) -> tuple[Runner, MemberTable]:
     """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])
     plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
     map_, places = map_memory(["gain", MASTER], {"gain": ("gain", 1, outputs, 64)})
     memory = HostMemory.private(map_, "gain")
     ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
-    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, 60), ring, counter)
+    runner = Runner(plan, instance, TimeGrid(1.0, STEP_SIZE, last_point), ring, counter)
     position = MemberTable()
     runner.follow(position)
     runner.bind()
@@ -164,11 +235,29 @@ def test_so_many_values_may_wait_for_their_time_and_no_more(linear: Steps) -> No
         linear.inputs.add("u", 0.0, 1e9)
 
 
-@pytest.mark.parametrize("time", [1e308, 1e20])
-def test_a_time_after_the_end_of_every_run_is_refused(linear: Steps, time: float) -> None:
-    with pytest.raises(ValueRefused, match="is later than any run ends"):
-        linear.inputs.add("u", 1.0, time)
-    assert linear.go(2) == [5.0, 5.0]
+@pytest.mark.parametrize(
+    ("last_point", "time", "why"),
+    [
+        (60, 7.1, "the time 7.1 s is later than 7 s, the end of the simulation"),
+        (ENDLESS, 1.7e9, "the time 1700000000 s is later than 1000001 s, 1e6 s ahead: is it a Unix time?"),
+        (ENDLESS, 1e308, "1e6 s ahead: is it a Unix time?"),
+    ],
+)
+def test_a_time_that_no_step_of_the_run_has_is_refused(linear: Steps, last_point: int, time: float, why: str) -> None:
+    runner, _ = runner_of(linear.inputs, last_point)
+
+    with pytest.raises(ValueRefused, match=re.escape(why)):
+        set_input(runner, "u", 1.0, time)
+    assert set_input(runner, "u", 1.0, 6.9) == 59
+
+
+def test_a_stream_of_values_has_no_time_a_million_seconds_ahead() -> None:
+    a_year, endless = TimeGrid(0.0, 900.0, 35040), TimeGrid(0.0, 0.01, ENDLESS)
+
+    assert a_year.latest(4, streamed=False) == a_year.stop_time == 31_536_000.0
+    assert a_year.latest(4, streamed=True) == 1_003_600.0
+    assert a_year.latest(35000, streamed=True) == a_year.stop_time
+    assert endless.latest(100, streamed=False) == endless.latest(100, streamed=True) == 1_000_001.0
 
 
 def test_a_time_long_before_the_run_is_the_past(hold: Steps) -> None:

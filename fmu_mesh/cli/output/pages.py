@@ -65,6 +65,11 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),
+            *(
+                ("ROS", f"{count} elements on {topic} were ignored: no variable has their keys")
+                for view in ros
+                for topic, count in view.ignored.items()
+            ),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
@@ -131,6 +136,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("can", ", ".join(can)),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(map(_connection, info.connections))),
+            ("timeouts", ", ".join(f"{v.name}: {v.timeout}" for v in info.variables if v.timeout)),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
         ]

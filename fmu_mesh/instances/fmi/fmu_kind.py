@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from msgspec import Meta
 from msgspec.structs import replace
 
-from ...config.base import POSITIVE, Base, Sha256
+from ...config.base import POSITIVE, Base, Inputs, Sha256
 from ...config.findings import Findings
 from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ...config.mesh import LimitsConfig
@@ -86,6 +86,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
         ),
     ] = False
     start_values: StartValues = {}
+    inputs: Inputs = {}
     step_size: StepSize = None
     group: Group = None
     host: Host = None

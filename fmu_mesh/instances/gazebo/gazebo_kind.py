@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from ... import files
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription
@@ -30,8 +29,10 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
         return load_gazebo_world(path, section).description
 
     def content(self, path: Path) -> str:
-        """The SHA-256 of the file: nothing else is read, see `fmu_mesh.instances.gazebo.gazebo_world`."""
-        return files.sha256_of(path)
+        """The SHA-256 of the file and of the models that it includes."""
+        from .world_includes import WorldFile  # noqa: PLC0415  as above
+
+        return WorldFile(path).sha256
 
     def check_engine(self) -> None:
         """Check that Gazebo classic runs on this host."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from ...config.base import Base
+from ...config.base import Base, Inputs
 from ...config.instance_sections import (
     KIND,
     Actuators,
@@ -38,6 +38,7 @@ class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_f
     actuators: Actuators = []
     fluid_dynamics: FluidDynamics = []
     start_values: StartValues = {}
+    inputs: Inputs = {}
     step_size: StepSize = None
     group: Group = None
     host: Host = None

@@ -11,25 +11,21 @@ A joint or link is named as in the file where that name is unique, and `model::n
 
 from __future__ import annotations
 
-import hashlib
 import math
-import re
-import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from urllib.parse import unquote
+from pathlib import Path, PurePosixPath
 
 import msgspec
+from lxml import etree
 
-from ...archives.safe_xml import safe_xml
 from ...errors import LoadFailed
-from ...files import opened
 from ...variables.model_description import DefaultExperiment, ModelDescription
 from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input
 from .gazebo_section import GazeboClassicConfig
+from .world_includes import Element, WorldFile
 
-__all__ = ["GazeboJoint", "GazeboLink", "GazeboWorld", "load_gazebo_world"]
+__all__ = ["GazeboJoint", "GazeboLink", "GazeboPlugin", "GazeboWorld", "load_gazebo_world"]
 
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
@@ -37,31 +33,25 @@ JOINT_STATE, LINK_STATE = 3, 13
 _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""
 
+_DEFAULT_RATE = 1000.0
+"""Steps per s; of SDF (physics, real_time_update_rate)."""
+
 _WITH_VARIABLES = ("revolute", "prismatic")
 _WITHOUT_VARIABLES = ("ball", "universal", "screw", "revolute2", "gearbox")
 _JOINTS = ("revolute", "continuous", "prismatic", "fixed", *_WITHOUT_VARIABLES)
 
-_VERSION = re.compile(r"/(\d+|tip)$")
+_PLUGINS = {"libFMIActuatorPlugin.so": "actuators", "libFMISingleBodyFluidDynamicsPlugin.so": "fluid_dynamics"}
+"""The plugins of gazebo-fmi by file, and the section of an instance that each of them corresponds to."""
 
-_GROUND = """
-<model name="ground_plane">
-  <static>true</static>
-  <link name="link">
-    <collision name="collision">
-      <geometry><plane><normal>0 0 1</normal><size>100 100</size></plane></geometry>
-      <surface><friction><ode><mu>100</mu><mu2>50</mu2></ode></friction></surface>
-    </collision>
-  </link>
-</model>
-"""
-"""Has the same effect on the motion as Gazebo's own model of this name."""
+_NO_COUPLINGS = GazeboClassicConfig(gazebo_classic="")
 
 
 class GazeboModel(msgspec.Struct, frozen=True):
     """A model, also one in another model."""
 
     scoped: str  # the name in Gazebo, such as `outer::inner`
-    element: ET.Element
+    element: Element
+    file: Path
     moving: bool  # whether it is not static; Gazebo lets a model in a static one move.
 
 
@@ -82,21 +72,52 @@ class GazeboLink(msgspec.Struct, frozen=True):
     name: str
 
 
+class GazeboPlugin(msgspec.Struct, frozen=True):
+    """A plugin of gazebo-fmi in a model."""
+
+    section: str  # that of the instance with the same meaning
+    model: GazeboModel
+    element: Element
+    file: Path
+
+
 class GazeboWorld(msgspec.Struct, frozen=True):
     """A world."""
 
-    text: bytes  # the SDF that Gazebo gets
+    text: bytes  # the SDF that Gazebo gets, without the plugins of gazebo-fmi
+    element: Element  # of the world, as Gazebo gets it
+    plugins: tuple[GazeboPlugin, ...]
     step_size: float  # of the engine in s
+    real_time_factor: float  # that Gazebo itself keeps; 0: as fast as possible
     joints: tuple[GazeboJoint, ...]
     links: tuple[GazeboLink, ...]
     description: ModelDescription
     places: dict[str, WorldVariable]  # the variables by name
 
 
-def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
-    """Read the world at ``path``; `LoadFailed` if Gazebo could not load it without looking elsewhere."""
-    text, source, world, models, notes = _read(path)
+def load_gazebo_world(path: Path, config: GazeboClassicConfig = _NO_COUPLINGS) -> GazeboWorld:
+    """Read the world at ``path``; `LoadFailed` if Gazebo could not load it."""
+    file = WorldFile(path)
+    world, notes = file.world, file.notes
+    models = [*_models(world, "", path, file)]
+    _refuse_what_gazebo_leaves_out(world, models, path)
+    continuous = [joint for joint in world.iter("joint") if joint.get("type") == "continuous"]
+    for joint in continuous:
+        _make_revolute(joint)
+    physics = world.find("physics")
+    if physics is not None and physics.get("type") == "bullet":
+        notes.append("forces and moments of links have no effect: Gazebo does not apply any with Bullet")
+        if config.fluid_dynamics:
+            raise LoadFailed(f"'{path}' has the engine Bullet, with which Gazebo applies no forces to links")
+    plugins = tuple(_taken_plugins(models, file))
+    if plugins and not (config.actuators or config.fluid_dynamics):
+        notes.append(
+            f"the plugins of gazebo-fmi are not loaded: `fmu-mesh launch {path.name}` has their FMUs as instances"
+        )
+    text = etree.tostring(file.root) if notes or continuous or plugins else file.source
+    notes += _notes(world, models)
     step_size = _number(world.findtext("physics/max_step_size"), _DEFAULT_STEP_SIZE, path)
+    rate = _number(world.findtext("physics/real_time_update_rate"), _DEFAULT_RATE, path)
     free = {actuator.joint for actuator in config.actuators if actuator.disable_velocity_effort_limits}
     moving = [model for model in models if model.moving]
     joints, links = _joints(moving, free, path), _links(moving)
@@ -106,14 +127,15 @@ def load_gazebo_world(path: Path, config: GazeboClassicConfig) -> GazeboWorld:
         model_identifier="gazebo_classic",
         fmi_version="",
         kind="physics_engine",
-        guid=hashlib.sha256(source).hexdigest()[:32],
+        guid=file.sha256[:32],
         variables=tuple(own.variable for own in variables),
         generation_tool="Gazebo classic",
         default_experiment=DefaultExperiment(step_size=step_size),
         problems=tuple(notes),
     )
     places = {own.variable.name: own for own in variables}
-    return GazeboWorld(text, step_size, joints, links, description, places)
+    speed = max(0.0, rate * step_size)
+    return GazeboWorld(text, world, plugins, step_size, speed, joints, links, description, places)
 
 
 def _joints(models: Sequence[GazeboModel], free: set[str], path: Path) -> tuple[GazeboJoint, ...]:
@@ -179,81 +201,31 @@ def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariabl
 # --- reading the file
 
 
-def _read(path: Path) -> tuple[bytes, bytes, ET.Element, Sequence[GazeboModel], list[str]]:
-    """The world at ``path``: the text that Gazebo gets, and that of the file.
-
-    Then the element of the world as Gazebo gets it; all models, outer ones first; and the parts that differ from the
-    file or have no variables.
-    """
-    try:
-        with opened(path) as file:
-            source = file.read()
-        safe_xml(source, f"'{path}'")
-        root = ET.fromstring(source)  # noqa: S314  it was parsed safely
-    except (OSError, ET.ParseError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise LoadFailed(f"'{path}' cannot be read as an SDF world: {reason}") from error
-    worlds = root.findall("world")
-    if root.tag != "sdf" or len(worlds) != 1:
-        raise LoadFailed(f"'{path}' is no SDF file with one world", hint="Gazebo classic 11 reads SDF up to 1.7.")
-    (world,) = worlds
-    notes = list(_without_known_includes(world))
-    _refuse_includes(world, path)
-    models = [*_models(world, "")]
-    _refuse_what_gazebo_leaves_out(world, models, path)
-    changed = bool(notes)
-    for joint in world.iter("joint"):
-        if joint.get("type") == "continuous":
-            _make_revolute(joint)
-            changed = True
-    notes += _notes(world, models)
-    return ET.tostring(root) if changed else source, source, world, models, notes
-
-
-def _models(parent: ET.Element, scope: str) -> Iterator[GazeboModel]:
+def _models(parent: Element, scope: str, path: Path, file: WorldFile) -> Iterator[GazeboModel]:
     for element in parent.findall("model"):
-        scoped = f"{scope}{element.get('name')}"
-        yield GazeboModel(scoped, element, element.findtext("static", "false").strip() not in {"true", "1"})
-        yield from _models(element, f"{scoped}::")
+        scoped, own = f"{scope}{element.get('name')}", file.files.get(element, path)
+        yield GazeboModel(scoped, element, own, element.findtext("static", "false").strip() not in {"true", "1"})
+        yield from _models(element, f"{scoped}::", own, file)
 
 
-def _without_known_includes(world: ET.Element) -> Iterator[str]:
-    """Replace each include that needs no file by its model; yields a note for each."""
-    for number, include in enumerate([*world]):
-        uri = include.findtext("uri", "").strip() if include.tag == "include" else ""
-        name = _VERSION.sub("", unquote(uri).rstrip("/")).rpartition("/")[2].casefold().replace(" ", "_")
-        if name not in {"sun", "ground_plane"} or include.find("plugin") is not None:
-            continue
-        if name == "sun":
-            world[number] = ET.Comment("a light")
-            yield f"left out, as a light moves nothing: the included '{uri}'"
-            continue
-        ground = ET.fromstring(_GROUND)  # noqa: S314  our own text
-        ground.set("name", include.findtext("name", "ground_plane").strip())
-        if (pose := include.find("pose")) is not None:
-            ground.append(pose)
-        world[number] = ground
-        yield f"a static plane stands for the included '{uri}'"
+def _taken_plugins(models: Sequence[GazeboModel], file: WorldFile) -> Iterator[GazeboPlugin]:
+    """The plugins of gazebo-fmi, taken out of their models: Gazebo would run the FMUs as well."""
+    for model in models:
+        for plugin in model.element.findall("plugin"):
+            if (section := _PLUGINS.get(PurePosixPath(plugin.get("filename", "")).name)) is not None:
+                model.element.remove(plugin)
+                yield GazeboPlugin(section, model, plugin, file.files.get(plugin, model.file))
 
 
-def _refuse_includes(world: ET.Element, path: Path) -> None:
-    uris = [include.findtext("uri", "without a uri").strip() for include in world.iter("include")]
-    if uris:
-        models = f"a model ({uris[0]})" if len(uris) == 1 else f"models ({', '.join(uris)})"
-        raise LoadFailed(
-            f"'{path}' includes {models}",
-            hint="Nothing is fetched for a run: write the text of each model in the place of its <include>, as "
-            "`gz sdf -p WORLD` of a Gazebo that has the models prints it.",
-        )
-
-
-def _refuse_what_gazebo_leaves_out(world: ET.Element, models: Sequence[GazeboModel], path: Path) -> None:
+def _refuse_what_gazebo_leaves_out(world: Element, models: Sequence[GazeboModel], path: Path) -> None:
     """Parts that Gazebo ignores although they change the motion; and names with spaces.
 
     A space ends a name in the protocol of Gazebo's process.
     """
     problems = [f"the world '{inner.get('name')}' in a world" for inner in world.findall("world")]
     problems += [f"the joint '{joint.get('name')}' outside of a model" for joint in world.findall("joint")]
+    names_of_models = Counter(model.scoped for model in models)
+    problems += [f"{count} models '{name}'" for name, count in names_of_models.items() if count > 1]
     for model in models:
         for joint in model.element.findall("joint"):
             if joint.get("type") not in _JOINTS:
@@ -265,7 +237,7 @@ def _refuse_what_gazebo_leaves_out(world: ET.Element, models: Sequence[GazeboMod
         raise LoadFailed(f"'{path}' has what cannot be simulated with Gazebo classic: {'; '.join(problems)}", hint=hint)
 
 
-def _make_revolute(joint: ET.Element) -> None:
+def _make_revolute(joint: Element) -> None:
     """Replace a continuous joint, which Gazebo classic does not have, by a revolute joint without position limits."""
     joint.set("type", "revolute")
     for limit in joint.iterfind("axis/limit"):
@@ -273,7 +245,7 @@ def _make_revolute(joint: ET.Element) -> None:
             limit.remove(end)
 
 
-def _notes(world: ET.Element, models: Sequence[GazeboModel]) -> Iterator[str]:
+def _notes(world: Element, models: Sequence[GazeboModel]) -> Iterator[str]:
     for model in models:
         for joint in model.element.findall("joint"):
             name, kind = f"{model.scoped}::{joint.get('name')}", joint.get("type")

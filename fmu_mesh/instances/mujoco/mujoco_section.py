@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from ...config.base import Base
+from ...config.base import Base, Inputs
 from ...config.instance_sections import (
     KIND,
     Actuators,
@@ -39,6 +39,7 @@ class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KI
     actuators: Actuators = []
     fluid_dynamics: FluidDynamics = []
     start_values: StartValues = {}
+    inputs: Inputs = {}
     step_size: StepSize = None
     group: Group = None
     host: Host = None

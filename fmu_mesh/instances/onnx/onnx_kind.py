@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from ... import files
-from ...config.base import Base
+from ...config.base import Base, Inputs
 from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
@@ -30,6 +30,7 @@ class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIN
 
     onnx: Annotated[str, Meta(description="Path of the ONNX model, relative to this file.")]
     start_values: StartValues = {}
+    inputs: Inputs = {}
     step_size: StepSize = None
     group: Group = None
     host: Host = None

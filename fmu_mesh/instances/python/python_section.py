@@ -10,7 +10,7 @@ from typing import Annotated, Literal, NamedTuple, Self
 from msgspec import Meta
 from msgspec.structs import replace
 
-from ...config.base import Base
+from ...config.base import Base, Inputs
 from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
 from ...variables.model_description import ModelDescription
 from ...variables.value_types import PlainValue
@@ -64,6 +64,7 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
         dict[str, PlainValue | None], Meta(description="The arguments that the class is called with, by name.")
     ] = {}
     start_values: StartValues = {}
+    inputs: Inputs = {}
     interpolation: Annotated[
         Literal["hold", "linear"] | None,
         Meta(description="How a value with a time is used for an unconnected input; default: from the next step."),

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Bag", "BagSample", "bag_values", "timed", "topics_for"]
 
-_CHOICE = re.compile(r"(?P<topic>/?[^=:]+)(:(?P<field>[^=]+))?=(?P<variable>.+)")
+_CHOICE = re.compile(r"""(?P<topic>/?[^=:]+)(:(?P<field>([^=\[]|\[([^\]"']|"[^"]*"|'[^']*')*\])+))?=(?P<variable>.+)""")
 
 StampSource = Literal["header", "log"]
 
@@ -122,7 +122,8 @@ class Bag:
                         raise ConfigurationError(f"a message of '{connection.topic}': {error}.") from error
                     at = logged if stamp is None or stamps == "log" else stamp
                     for port, value in zip(own.topic.ports, values, strict=True):
-                        yield BagSample(at, port.instance, port.variable.name, value)
+                        if value is not None:
+                            yield BagSample(at, port.instance, port.variable.name, value)
 
 
 def _definitions(reader: Reader) -> Typesdict:

@@ -44,7 +44,7 @@ from ...results.recording import Columns, metadata_in, with_notes
 from ...simtime import ENDLESS, TimeGrid
 from ...variables.value_types import DTYPES, VariableType, is_text
 from ..messages.cdr import HEADER_SIZE, Codec
-from ..messages.definitions import NUMBERS, Basic, MessageTypes, path_parts
+from ..messages.definitions import NUMBERS, Basic, MessageTypes, Part, path_parts
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap, TopicColumns
 
 __all__ = ["finish_mcap", "read_mcap"]
@@ -288,7 +288,7 @@ def _field_columns(
     return dict(zip(names, np.ascontiguousarray(table[held].T), strict=True))
 
 
-def _value(message: Any, path: Sequence[str | int]) -> Any:  # noqa: ANN401  any field
+def _value(message: Any, path: Sequence[Part]) -> Any:  # noqa: ANN401  any field
     for part in path:
         message = message[part]
     return message

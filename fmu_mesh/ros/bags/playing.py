@@ -67,15 +67,17 @@ def play_bag(client: MeshClient, bag: Bag, loaded: LoadedConfig | None, options:
         loaded = running_configuration(Path(options.config or mesh.config))
     topics = topics_for(loaded, descriptions_of(infos), bag, options.topics)
     samples = bag.samples(topics, options.stamps)
-    moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=options.start)
+    point = client.status().point
+    moments, merged, beyond = schedule(samples, grid_of(mesh), step_points, start=options.start, point=point)
     names = [topic.name for topic in topics]
     if not moments and beyond:
+        why = "at or after the end of the simulation" if mesh.stop_time is not None else "at no simulation time"
         raise ConfigurationError(
-            f"all {beyond} values of {', '.join(names)} in '{bag.path}' are at or after the end of the simulation.",
+            f"all {beyond} values of {', '.join(names)} in '{bag.path}' are {why}.",
             hint="Say when the first one is, as with `start=0.0`.",
         )
     if not moments:
-        raise ConfigurationError(f"there is no message of {', '.join(names)} in '{bag.path}'.")
+        raise ConfigurationError(f"no message of {', '.join(names)} in '{bag.path}' has a value for the mesh.")
     count, first = play(client, moments, step_points, options.timeout)
     past = sum(len(moment.values) for moment in moments) - count
     return Played(count, names, first, moments[-1].point, merged, past, beyond)
@@ -108,23 +110,24 @@ def grid_of(info: MeshInfo) -> TimeGrid:
 
 
 def schedule(
-    samples: Iterable[BagSample], grid: TimeGrid, step_points: Mapping[str, int], *, start: float | None
+    samples: Iterable[BagSample], grid: TimeGrid, step_points: Mapping[str, int], *, start: float | None, point: int = 0
 ) -> tuple[list[Moment], int, int]:
     """Find the point of every sample.
 
     A value is set at the first point of its instance that is not before its stamp. If an input has several values for
-    one point, the last one is set. An instance has ``step_points`` points per step; ``start`` is that of `timed`.
+    one point, the last one is set. An instance has ``step_points`` points per step; ``start`` is that of `timed`; the
+    mesh is at ``point``.
 
     Returns:
         The moments in order of their points, the number of samples that a later one replaced, and the number of samples
-        at or after the last point.
+        at or after the last point, or at no time of the simulation (`TimeGrid.latest`).
     """
     moments: dict[int, dict[tuple[str, str], Value]] = {}
-    merged = beyond = 0
+    merged, beyond, latest = 0, 0, grid.latest(point, streamed=False)
     for time_s, sample in timed(samples, start):
         points = step_points[sample.instance]
         point = grid.step_at(time_s, points, BAG_STAMP_S) * points
-        if point >= grid.last_point:
+        if time_s > latest or point >= grid.last_point:
             beyond += 1
             continue
         values = moments.setdefault(point, {})

@@ -90,11 +90,15 @@ class Gateway:
     The caller closes the session and the profiles; the first of these has `/clock`.
 
     Call `open`, then `run`, then `close`.
+
+    Attributes:
+        ignored: by topic, how many elements of messages had keys that no variable has.
     """
 
     def __init__(
         self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: dict[str, Profile]
     ) -> None:
+        self.ignored: dict[str, int] = {}
         self._plan = plan
         self._mesh = mesh
         self._keys = keys
@@ -239,7 +243,7 @@ class Gateway:
                 self._publishers[key] = self._mesh.declare_publisher(
                     key, encoding=json_encoding, congestion_control=zenoh.CongestionControl.BLOCK
                 )
-        subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types), keys, self._grid.stop_time)
+        subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types), keys)
 
         def take(data: bytes) -> None:
             self._post(partial(self._take_message, subscribed, data))
@@ -253,9 +257,15 @@ class Gateway:
             message = subscribed.disassembler.topic.message
             subscribed.warn(f"a message of {len(data)} bytes is no '{message}' that can be used: {error}")
             return
-        attachment = subscribed.attachment(stamp / 1_000_000_000 if stamp is not None else None)
+        attachment = encode_origin(stamp / 1_000_000_000 if stamp is not None else None, subscribed.who)
         for key, value in zip(subscribed.keys, values, strict=True):
-            self._publishers[key].put(encode_value(value), attachment=attachment)
+            if value is not None:
+                self._publishers[key].put(encode_value(value), attachment=attachment)
+        fields = subscribed.disassembler.fields
+        if fields.ignored:
+            self.ignored[subscribed.disassembler.topic.name] = fields.ignored
+            if fields.warning:
+                subscribed.warn(fields.warning)
 
     # --- the queue
 
@@ -304,22 +314,11 @@ class _WarnOnce:
 class _SubscribedTopic(_WarnOnce):
     """A topic that the gateway subscribes to, and the keys of its variables."""
 
-    def __init__(self, disassembler: Disassembler, keys: list[str], stop_time: float | None) -> None:
+    def __init__(self, disassembler: Disassembler, keys: list[str]) -> None:
         super().__init__(disassembler.topic.name)
         self.disassembler = disassembler
         self.keys = keys
-        self._stop_time = stop_time
-        self._who = f"ros {disassembler.topic.name}"
-
-    def attachment(self, stamp: float | None) -> bytes:
-        """Who sends a value, and from which time on it holds: its stamp in s; None: it takes effect at once."""
-        if stamp is not None and self._stop_time is not None and stamp > self._stop_time:
-            self.warn(
-                "its stamps are after the end of the simulation, so its messages hold as soon as they arrive; "
-                "does its publisher run with use_sim_time?"
-            )
-            stamp = None
-        return encode_origin(stamp, self._who)
+        self.who = f"ros {disassembler.topic.name}"
 
 
 class _WatchedVariable(_WarnOnce):

@@ -16,10 +16,11 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import zenoh
+from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
 from ...errors import FmuMeshError
@@ -79,14 +80,14 @@ class RosLink:
         self._view = self._seen(linked=False, clocks=())
         self._thread = threading.Thread(target=self._run, name="ros-link", daemon=True)
 
-    def open(self) -> None:
-        """Declare the token of this gateway, answer queries about the link, and start to watch it."""
+    def open(self, ignored: Mapping[str, int]) -> None:
+        """Declare the token of this gateway, answer queries about the link and ``ignored``, and start to watch it."""
         chunks = map(escape, (self._keys.mesh, socket.gethostname(), str(os.getpid())))
         token = f"@/{self._ros.zid()}/@fmu_mesh/{'/'.join(chunks)}"
         self._entities.append(self._ros.liveliness().declare_token(token))
         # Each gateway answers with its own key: a query returns only the last of several answers with one key.
         key = f"{self._keys.mesh_key('ros')}/{self._ros.zid()}"
-        self._entities.append(self._mesh.declare_queryable(key, lambda query: self._answer(key, query)))
+        self._entities.append(self._mesh.declare_queryable(key, lambda query: self._answer(key, query, ignored)))
         self._thread.start()
 
     def close(self) -> None:
@@ -99,8 +100,9 @@ class RosLink:
         if self._client is not None:
             close_session(self._client)
 
-    def _answer(self, key: str, query: zenoh.Query) -> None:
-        query.reply(key, msgspec.json.encode(self._view), encoding=json_encoding)
+    def _answer(self, key: str, query: zenoh.Query, ignored: Mapping[str, int]) -> None:
+        view = replace(self._view, ignored=dict(ignored))
+        query.reply(key, msgspec.json.encode(view), encoding=json_encoding)
         query.drop()
 
     # --- on the thread

@@ -57,8 +57,8 @@ def message_types(loaded: LoadedConfig, section: RosConfig, findings: Findings) 
         return None
 
 
-def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings) -> RosPlan | None:
-    """Make the plan of the `ros` section.
+def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings, warnings: Findings) -> RosPlan | None:
+    """Make the plan of the `ros` section; ``warnings`` gets what works and may not be meant.
 
     A topic of an instance without a description is not checked.
 
@@ -77,7 +77,10 @@ def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings
     if types is None:  # the names can be checked
         resolver.topics()
         return None
-    return resolver.plan()
+    plan = resolver.plan()
+    for warning in resolver.warnings:
+        warnings.add(*warning)
+    return plan
 
 
 def descriptions_of(infos: Mapping[str, InstanceInfo]) -> dict[str, ModelDescription]:
@@ -133,7 +136,11 @@ def _check_section(config: Config, section: RosConfig, findings: Findings) -> No
 
 
 class Resolver:
-    """Resolves the topics of a section `ros`, or of another one in its place; without types, only names are checked."""
+    """Resolves the topics of a section `ros`, or of another one in its place; without types, only names are checked.
+
+    Attributes:
+        warnings: what works and may not be meant, as the arguments of `Findings.add`.
+    """
 
     def __init__(
         self,
@@ -148,6 +155,7 @@ class Resolver:
         self._descriptions = descriptions
         self._types = types
         self._findings = findings
+        self.warnings: list[tuple[str, str, str]] = []
         self._driven = driven_inputs(config, descriptions)
         self._owners: dict[tuple[str, Direction], str] = {}
         self._messages: dict[str, tuple[str, str]] = {}
@@ -286,7 +294,7 @@ class Resolver:
             constants=tuple(entry.item.constants.items()),
         )
         if self._types is not None:
-            check_topic(entry, topic, self._types, self._findings)
+            topic = check_topic(entry, topic, self._types, self._findings, self.warnings)
         if len(self._findings) == before:
             yield topic
 

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import pairwise
+from operator import getitem
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ import numpy as np
 from ...variables.model_description import Value
 from ...variables.value_types import DTYPES, flattened, nested
 from .cdr import CdrError, Codec, Message
-from .definitions import FLOATS, HEADER, Array, Basic, FieldType, MessageTypes, Nested, Sequence, path_parts
+from .definitions import FLOATS, HEADER, Array, Basic, FieldType, MessageTypes, Nested, Part, Sequence, path_parts
+from .keyed_rows import FieldReader
 from .stamp import in_nanoseconds, to_stamp
 from .topics import Port, Topic
 
@@ -29,7 +31,7 @@ class Assembler:
     """Makes the messages of one published topic.
 
     A message belongs to one point. If the variables have different step sizes, every point of one of them has a
-    message, with the values that hold at that point.
+    message, with the values that hold at that point. The paths of the topic have no keys, only indexes.
 
     Raises:
         CdrError: messages of this type cannot be encoded.
@@ -109,7 +111,7 @@ class Assembler:
 
         return put
 
-    def _place(self, path: str, types: MessageTypes) -> tuple[Any, str | int]:
+    def _place(self, path: str, types: MessageTypes) -> tuple[Any, Part]:
         """The message or list that holds the field at ``path``, and the name or index of the field there.
 
         Sequences on the way are made as long as the path needs them; new elements are empty.
@@ -118,7 +120,7 @@ class Assembler:
         container: Any = self._message
         reached = ""
         for part, following in pairwise(parts):
-            reached += f"[{part}]" if isinstance(part, int) else f".{part}" if reached else part
+            reached += f"[{part}]" if isinstance(part, int) else f".{part}" if reached else str(part)
             if isinstance(following, int):
                 kind = types.field(self.topic.message, reached)
                 container[part] = self._with_length(container[part], following + 1, kind)
@@ -135,30 +137,31 @@ class Assembler:
 
 
 class Disassembler:
-    """Reads the values of the variables from the messages of one subscribed topic."""
+    """Reads the values of the variables from the messages of one subscribed topic.
+
+    Attributes:
+        fields: where the values are; it counts what has no variable.
+    """
 
     def __init__(self, topic: Topic, types: MessageTypes) -> None:
         self.topic = topic
+        self.fields = FieldReader(topic, types, getitem)
         self._codec = Codec(types, topic.message)
         self._stamped = types.has_header(topic.message)
-        self._paths = [path_parts(port.path) for port in topic.ports]
 
-    def values(self, data: bytes) -> tuple[list[Value], int | None]:
+    def values(self, data: bytes) -> tuple[list[Value | None], int | None]:
         """The values of the ports, and the stamp in ns; the stamp is None if it is 0 or if there is no header.
+
+        A value is None if the message has none, so that the present one holds.
 
         Raises:
             CdrError: the bytes are not such a message, or an element of a port is not in it.
         """
         message = self._codec.decode(data)
-        values = []
-        for port, path in zip(self.topic.ports, self._paths, strict=True):
-            value: Any = message
-            try:
-                for part in path:
-                    value = value[part]
-            except IndexError as error:
-                raise CdrError(f"it has no '{port.path}'") from error
-            values.append(_in_shape(value, port))
+        values = [
+            _in_shape(value, port) if value is not None else None
+            for port, value in zip(self.topic.ports, self.fields.read(message), strict=True)
+        ]
         if not self._stamped:
             return values, None
         stamp = message["header"]["stamp"]

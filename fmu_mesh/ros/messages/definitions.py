@@ -1,4 +1,7 @@
-"""ROS message types: their fields and their RIHS01 hashes.
+"""ROS message types: their fields, how a path addresses a field, and their RIHS01 hashes.
+
+A path has the names of fields, indexes (`poses[0]`), and keys. A key finds an element by the text in a field of it
+(`transforms[child_frame_id=tool]`), or in a parallel array of texts (`position[name=elbow]`).
 
 The definitions come from `rosbags` as data; no code that `rosbags` could generate from them is run. The bytes of a
 message are the matter of `fmu_mesh.ros.messages.cdr`.
@@ -11,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from ...errors import ConfigurationError
 from ...installing import importing
@@ -28,9 +32,13 @@ __all__ = [
     "Array",
     "Basic",
     "Distribution",
+    "FieldPath",
     "FieldType",
+    "FieldTypes",
+    "Key",
     "MessageTypes",
     "Nested",
+    "Part",
     "Sequence",
     "UnknownField",
     "UnknownType",
@@ -55,9 +63,10 @@ _NO_FIELDS: Any = [("structure_needs_at_least_one_member", (1, ("uint8", 0)))]
 """What ROS gives a message without fields, on the wire, too."""
 
 _MESSAGE_NAME = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv)/[A-Z][A-Za-z0-9_]*")
-_INDEXED = re.compile(r"(?P<name>[^\[\]]+)\[(?P<index>[^\[\]]*)\]")
 _INDEX = re.compile(r"[0-9]{1,9}")
-_PART = re.compile(r"[^.\[\]]+|\[[0-9]+\]")
+_PART = re.compile(r"""(?:^|\.)([^.\[\]]+)|\[(\w+)=(["']?)(.+?)\3\]|\[([^\]]*)\]""")
+_USUAL_KEY = re.compile(r"(.*_)?(names?|key|id)")
+"""Names of fields whose texts tell rows apart, as in every message of ROS that is a table."""
 
 
 class Basic(msgspec.Struct, frozen=True):
@@ -90,6 +99,29 @@ class Sequence(msgspec.Struct, frozen=True):
 FieldType = Basic | Nested | Array | Sequence
 
 
+class Key(msgspec.Struct, frozen=True):
+    """A part of a path that finds an element by the text of a field; without ``field`` it is an index that is wrong.
+
+    Attributes:
+        table: where the texts are: a path, which an index follows, and the rest; none if they are in a parallel array.
+    """
+
+    field: str
+    text: str
+    table: tuple[str, str] = ("", "")
+
+
+Part = str | int | Key
+
+
+class FieldPath(msgspec.Struct, frozen=True):
+    """What a path leads to, its parts with their texts, and the path with a key for each index that could be one."""
+
+    kind: FieldType
+    steps: tuple[tuple[Part, str], ...]
+    by_key: str
+
+
 class UnknownType(ValueError):
     """No message type has this name; ``names`` lists the known types."""
 
@@ -106,7 +138,81 @@ class UnknownField(ValueError):
         self.names = names
 
 
-class MessageTypes:
+class FieldTypes:
+    """What messages consist of, and what is at a path in them."""
+
+    def fields(self, message: str) -> tuple[tuple[str, FieldType], ...]:
+        """The fields of a message, in order."""
+        raise NotImplementedError
+
+    def field(self, message: str, path: str) -> FieldType:
+        """The type of the field at a path such as `twist.linear.x`, `pose.covariance[7]` or `position[name=elbow]`.
+
+        Raises:
+            UnknownType: there is no such type.
+            UnknownField: there is no such field, or the array has no such index or key.
+        """
+        return self.resolved(message, path).kind
+
+    def resolved(self, message: str, path: str) -> FieldPath:
+        """What a path leads to; raises as `field` does."""
+        kind: FieldType = Nested(message)
+        outer: list[tuple[str, str]] = []  # the messages on the way, by their paths
+        steps: list[tuple[Part, str]] = []
+        reached = by_key = ""
+        for part, text in _pieces(path) or [("", "")]:
+            if isinstance(kind, Nested):
+                outer.append((reached, kind.message))
+            element = kind.element if isinstance(kind, Array | Sequence) else None
+            keys = self._keys(element, outer, reached) if element is not None else {}
+            found = dict(self.fields(kind.message)).get(str(part)) if isinstance(kind, Nested) else element
+            names: tuple[str, ...] = ()
+            usual = reason = ""
+            match part:
+                case str():
+                    found = None if element is not None else found
+                    if isinstance(element, Nested):
+                        reason = f"'{reached}' is an array, write an index, such as {reached}[0]{text}"
+                case _ if element is None:
+                    reason = "it is no array"
+                case Key(field, own) if field:
+                    reason = "" if field in keys else f"'{field}' is no text that tells its elements apart"
+                    rest = path[len(reached) + len(text) :]
+                    names = tuple(f"{reached}[{key}={own}]{rest}" for key in keys)
+                case _:
+                    reason = _index_problem(kind, part)
+                    likely = (key for key, (_, rest) in keys.items() if bool(rest) == isinstance(element, Nested))
+                    usual = next(filter(_USUAL_KEY.fullmatch, likely), "")
+            if found is None or reason:
+                raise UnknownField(message, path, names or tuple(self.paths(message)), reason)
+            steps.append((replace(part, table=keys[part.field]) if isinstance(part, Key) else part, text))
+            kind, reached = found, reached + text
+            by_key += f"[{usual}=…]" if usual else text
+        return FieldPath(kind, tuple(steps), by_key)
+
+    def paths(self, message: str, prefix: str = "") -> Iterator[str]:
+        """The paths of all fields that are not messages; for an array of messages, the paths in its first element."""
+        for name, kind in self.fields(message):
+            if isinstance(kind, Nested):
+                yield from self.paths(kind.message, f"{prefix}{name}.")
+            elif isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
+                yield from self.paths(kind.element.message, f"{prefix}{name}[0].")
+            else:
+                yield f"{prefix}{name}"
+
+    def _keys(self, element: Basic | Nested, outer: list[tuple[str, str]], array: str) -> dict[str, tuple[str, str]]:
+        """The keys that an array of such elements can have, with the table of each."""
+        own = self.fields(element.message) if isinstance(element, Nested) else ()
+        keys = {name: (array, f".{name}") for name, kind in own if getattr(kind, "kind", "") == "string"}
+        for reached, message in reversed(outer):
+            for name, kind in self.fields(message):
+                path = f"{reached}.{name}" if reached else name
+                if path != array and getattr(getattr(kind, "element", None), "kind", "") == "string":
+                    keys.setdefault(name, (path, ""))
+        return keys
+
+
+class MessageTypes(FieldTypes):
     """The message types of a ROS distribution, and custom ones.
 
     Args:
@@ -168,40 +274,6 @@ class MessageTypes:
             raise UnknownType(message, tuple(self.store.fielddefs))
         return tuple((name, _field_type(description)) for name, description in self.store.fielddefs[message][1])
 
-    def field(self, message: str, path: str) -> FieldType:
-        """The type of the field at a path such as `twist.linear.x`, `pose.covariance[7]` or `transforms[0].header`.
-
-        Raises:
-            UnknownType: there is no such type.
-            UnknownField: there is no such field, or the array has no such index.
-        """
-        kind: FieldType = Nested(message)
-        reached = ""
-        for part in path.split("."):
-            indexed = _INDEXED.fullmatch(part)
-            name = indexed["name"] if indexed is not None else part
-            found = dict(self.fields(kind.message)).get(name) if isinstance(kind, Nested) else None
-            reason = ""
-            if isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
-                reason = f"'{reached}' is an array, write an index, such as {reached}[0].{part}"
-            elif found is not None and indexed is not None:
-                reason = _index_problem(found, indexed["index"])
-                found = found.element if isinstance(found, Array | Sequence) else None
-            if found is None or reason:
-                raise UnknownField(message, path, tuple(self.paths(message)), reason)
-            kind, reached = found, f"{reached}.{part}" if reached else part
-        return kind
-
-    def paths(self, message: str, prefix: str = "") -> Iterator[str]:
-        """The paths of all fields that are not messages; for an array of messages, the paths in its first element."""
-        for name, kind in self.fields(message):
-            if isinstance(kind, Nested):
-                yield from self.paths(kind.message, f"{prefix}{name}.")
-            elif isinstance(kind, Array | Sequence) and isinstance(kind.element, Nested):
-                yield from self.paths(kind.element.message, f"{prefix}{name}[0].")
-            else:
-                yield f"{prefix}{name}"
-
     def has_header(self, message: str) -> bool:
         """Whether a message has a field `header` of the type `std_msgs/msg/Header`, and so a stamp."""
         return ("header", Nested(HEADER)) in self.fields(message)
@@ -240,9 +312,21 @@ class MessageTypes:
         return text
 
 
-def path_parts(path: str) -> list[str | int]:
-    """Split a path: `pose.covariance[7]` becomes `["pose", "covariance", 7]`."""
-    return [int(part[1:-1]) if part.startswith("[") else part for part in _PART.findall(path)]
+def path_parts(path: str) -> tuple[Part, ...]:
+    """Split a path: `pose.covariance[7]` becomes `("pose", "covariance", 7)`; what is no path has no parts."""
+    return tuple(part for part, _ in _pieces(path))
+
+
+def _pieces(path: str) -> list[tuple[Part, str]]:
+    """The parts of a path, and the text of each."""
+    pieces: list[tuple[Part, str]] = []
+    end = 0
+    while (found := _PART.match(path, end)) is not None:
+        name, key, _, text, index = found.groups()
+        number: Part = int(index) if _INDEX.fullmatch(index or "") else Key("", index or "")
+        pieces.append((name or (Key(key, text) if key else number), found[0]))
+        end = found.end()
+    return pieces if end == len(path) else []
 
 
 def is_message_name(name: str) -> bool:
@@ -276,7 +360,7 @@ def _element_type(description: object) -> Basic | Nested:
     return kind
 
 
-def _index_problem(kind: FieldType, index: str) -> str:
+def _index_problem(kind: FieldType, index: int | Key) -> str:
     """Why a field cannot have an element with this index; empty if it can."""
     last = MAX_ELEMENTS - 1
     match kind:
@@ -284,8 +368,4 @@ def _index_problem(kind: FieldType, index: str) -> str:
             last = min(last, length - 1)
         case Sequence(_, bound) if bound:
             last = min(last, bound - 1)
-        case Basic() | Nested():
-            return "it is no array"
-    if _INDEX.fullmatch(index) is None or int(index) > last:
-        return f"an index is a whole number from 0 to {last}"
-    return ""
+    return "" if isinstance(index, int) and index <= last else f"an index is a whole number from 0 to {last}"

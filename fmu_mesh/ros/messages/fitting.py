@@ -27,11 +27,13 @@ from .definitions import (
     FieldType,
     MessageTypes,
     Nested,
+    Part,
     Sequence,
     UnknownField,
     UnknownType,
     path_parts,
 )
+from .keyed_rows import by_index
 from .topics import Direction, Port, Topic
 
 __all__ = ["TopicEntry", "carries", "check_topic", "default_type"]
@@ -86,24 +88,40 @@ def carries(target: str, source: str) -> bool:
     return np.can_cast(of, to) and not (to in FLOATS and of in ("int64", "uint64"))
 
 
-def check_topic(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> None:
-    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants."""
+def check_topic(
+    entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings, warnings: list[tuple[str, str, str]]
+) -> Topic:
+    """Add a finding for everything that keeps the messages of ``topic`` from carrying its variables and constants.
+
+    The arguments of a finding go to ``warnings`` for each subscribed element by an index that could be a key.
+
+    Returns:
+        The topic; if it is published, with indexes instead of keys.
+    """
     before = len(findings)
     for port in topic.ports:
         _check_port(entry, topic, port, types, findings)
     if len(findings) > before:
-        return
+        return topic
     if topic.constants and topic.direction == "in":
         found = "constants of a topic that is subscribed"
         findings.add(f"{entry.path}.constants", found, "constants of published messages only")
-        return
+        return topic
     for field, value in topic.constants:
         _check_constant(f"{entry.path}.constants.{field}", topic.message, (field, value), types, findings)
+    for path in (port.path for port in topic.ports if port.direction == "in"):
+        if (by_key := types.resolved(topic.message, path).by_key) != path:
+            found = f"'{path}' of '{topic.message}', whose elements may come in any order"
+            warnings.append((f"{entry.path}.fields.{path}", found, f"a key: {by_key}"))
     if len(findings) == before and topic.direction == "out":
-        _check_places(entry, topic, types, findings)
+        try:
+            topic = _check_places(entry, topic, types, findings)
+        except ValueError as error:
+            findings.add(f"{entry.path}.constants", str(error), "each key once")
     if len(findings) == before and (reason := _why_not_carried(topic, types)) is not None:
         found = f"'{topic.message}' for '{topic.name}': {reason}"
         findings.add(f"{entry.path}.type", found, "messages that can be sent and received")
+    return topic
 
 
 def _why_not_carried(topic: Topic, types: MessageTypes) -> str | None:
@@ -158,22 +176,30 @@ def _check_constant(
         findings.add(place, found, f"a value of the type {kind.kind}")
 
 
-def _check_places(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> None:
-    """Check that each field has one source; the stamp of a header is the simulation time already."""
-    given: dict[tuple[str | int, ...], str] = {}
-    fields = [("fields", port.path) for port in topic.ports] + [("constants", field) for field, _ in topic.constants]
-    for section, field in sorted(fields, key=lambda own: len(path_parts(own[1]))):
-        parts = path_parts(field)
-        heads = [tuple(parts[:end]) for end in range(1, len(parts) + 1)]
+def _check_places(entry: TopicEntry, topic: Topic, types: MessageTypes, findings: Findings) -> Topic:
+    """Check that each field has one source, and return the topic with indexes instead of keys.
+
+    The stamp of a header is the simulation time already.
+    """
+    given: dict[tuple[Part, ...], str] = {}
+    made = by_index(topic, types)
+    written = [("fields", port.path) for port in topic.ports] + [("constants", field) for field, _ in topic.constants]
+    added = [("fields", f"[…={value}]") for _, value in made.constants[len(topic.constants) :]]
+    paths = [*(port.path for port in made.ports), *(path for path, _ in made.constants)]
+    named = zip(paths, [*written, *added], strict=True)
+    for path, (section, field) in sorted(named, key=lambda own: (len(path_parts(own[0])), own[1] not in added)):
+        parts = path_parts(path)
+        heads = [parts[:end] for end in range(1, len(parts) + 1)]
         other = next((given[head] for head in heads if head in given), None)
         if other is not None:
             found = f"'{field}', which '{other}' gives already"
             findings.add(f"{entry.path}.{section}.{field}", found, "a value once for each field")
         given[heads[-1]] = field
-        stamp = field.rpartition(".stamp")[0]
+        stamp = path.rpartition(".stamp")[0]
         if stamp and types.field(topic.message, stamp) == Nested(HEADER):
             found = f"'{field}', which is the simulation time"
             findings.add(f"{entry.path}.{section}.{field}", found, "a field that is no stamp of a header")
+    return made
 
 
 def _unfit(kind: FieldType, variable: Variable, direction: Direction) -> str | None:

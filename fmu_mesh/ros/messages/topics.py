@@ -39,7 +39,7 @@ class Port(msgspec.Struct, frozen=True):
     """One variable and its field in a message.
 
     Attributes:
-        path: the field, such as `twist.linear.x`.
+        path: the field, such as `twist.linear.x`; in a plan, published fields have indexes instead of keys.
         instance: name of the instance; empty for a node that runs a single FMU.
         kind: the part of the key space that the variable is in.
         step_points: base points between two values of the variable.

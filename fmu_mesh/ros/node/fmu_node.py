@@ -20,7 +20,7 @@ from ..messages.definitions import CLOCK
 from ..messages.topics import CLOCK_TOPIC, Topic
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
 from .node_topics import LOG_INTERVAL_S, FmuTopics, own_names, topics_of
-from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, time_message, watch_clock
+from .rclpy_modules import RosNode, RosTypes, message_class, ros_module, steady_timer, time_message, watch_clock
 from .variable_parameters import (
     declare_parameters,
     names_of,
@@ -184,6 +184,11 @@ class FmuNode:
         proposed = description.default_experiment.stop_time
         if settings.stop_time is None and proposed is not None:
             self._log.info(f"the FMU proposes to stop at {proposed!r} s; set stop_time to end there")
+        for topic in topics:
+            for path in (port.path for port in topic.ports if port.direction == "in"):
+                if (by_key := RosTypes().resolved(topic.message, path).by_key) != path:
+                    what = f"'{path}' of '{topic.name}', whose elements may come in any order"
+                    self._log.warning(f"{what}; expected a key: {by_key}")
         carried = {port.variable.name for topic in topics for port in topic.ports}
         for variable in description.with_causality("input", "output"):
             if variable.name not in carried:

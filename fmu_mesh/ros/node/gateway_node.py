@@ -108,7 +108,7 @@ class GatewayNode:
             info = client.info()
             infos = {name: client.instance_info(name) for name in info.instances}
             findings = loaded.findings()
-            plan = resolve(loaded, descriptions_of(infos), findings)
+            plan = resolve(loaded, descriptions_of(infos), findings, loaded.findings())
             findings.raise_any()
             assert plan is not None  # there is a section, or a finding
             self._declare_parameters(client, plan, stack)

@@ -17,7 +17,6 @@ from itertools import pairwise
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from ...config.findings import Findings
 from ...config.yaml_text import Plain, read
@@ -25,13 +24,15 @@ from ...errors import CallRefused, ConfigurationError
 from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import flattened, nested
-from ..messages.definitions import MAX_ELEMENTS, path_parts
+from ..messages.cdr import CdrError
+from ..messages.definitions import Basic, UnknownField, path_parts
 from ..messages.fitting import default_type
+from ..messages.keyed_rows import FieldReader, by_index
 from ..messages.ros_names import topic_problem
 from ..messages.stamp import in_nanoseconds
 from ..messages.topics import Port, Topic
 from .driving import FmuDriver, FmuThread, Update
-from .rclpy_modules import RosNode, message_class, ros_module, time_message
+from .rclpy_modules import RosNode, RosTypes, message_class, ros_module, time_message
 from .variable_parameters import names_of
 
 __all__ = ["LOG_INTERVAL_S", "FmuTopics", "fill", "message_time", "own_names", "topics_of", "values_in"]
@@ -40,7 +41,6 @@ STAMPED = "geometry_msgs/msg/PointStamped"
 """The smallest message type in every ROS that has a header and a float64."""
 STAMPED_FIELD = "point.x"
 
-_PATH = re.compile(r"\w+(\[\d{1,9}\])?(\.\w+(\[\d{1,9}\])?)*", re.ASCII)
 _SEQUENCE = re.compile(r"sequence<(?P<element>.*?)(, (?P<bound>\d+))?>")
 
 _EMPTY: Mapping[str, str | bytes | bool] = {"string": "", "wstring": "", "boolean": False, "octet": b"\0"}
@@ -111,31 +111,29 @@ def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> 
     Sequences are made as long as the paths need them.
     """
     _set_stamp(message, time)
-    for port in topic.ports:
-        owner, last = _place(message, port.path, lambda element: _set_stamp(element, time))
-        value = values[port.variable.name]
+    given = [(port.path, values[port.variable.name], port.variable.shape) for port in topic.ports]
+    for path, value, shape in (*given, *((path, value, ()) for path, value in topic.constants)):
+        owner, last = _place(message, path, lambda element: _set_stamp(element, time))
         if isinstance(last, int):
             owner[last] = value
-        elif port.variable.shape:
-            setattr(owner, last, flattened(value, len(port.variable.shape)))
+        elif shape:
+            setattr(owner, last, flattened(value, len(shape)))
         else:
             # A field of a ROS message refuses every type but its own, so an int must become a float.
             setattr(owner, last, type(getattr(owner, last))(value))
 
 
-def values_in(topic: Topic, message: Any) -> dict[str, Value]:  # noqa: ANN401 a ROS message
+def values_in(fields: FieldReader, message: Any) -> dict[str, Value]:  # noqa: ANN401 a ROS message
     """The values in a message, by variable.
 
     Raises:
-        IndexError: a sequence in the message is too short for a path.
+        CdrError: a sequence in the message is too short for a path, or not as long as its keys.
     """
     values: dict[str, Value] = {}
-    for port in topic.ports:
-        value = message
-        for part in path_parts(port.path):
-            value = value[part] if isinstance(part, int) else getattr(value, part)
+    for port, value in zip(fields.topic.ports, fields.read(message), strict=True):
         shape = port.variable.shape
-        values[port.variable.name] = nested(list(value), shape) if shape else value
+        if value is not None:
+            values[port.variable.name] = nested(list(value), shape) if shape else value
     return values
 
 
@@ -186,7 +184,13 @@ def _mapped(entry: str, ends: Mapping[str, Variable], problems: list[str]) -> To
         problems.append(f"'{name}' has inputs and outputs; a topic goes in one direction")
     if len(problems) > before:
         return None
-    return _topic(name, mapping.type, {path: ends[variable] for path, variable in mapping.fields.items()})
+    topic = _topic(name, mapping.type, {path: ends[variable] for path, variable in mapping.fields.items()})
+    if topic.direction == "in":
+        return topic
+    topic = by_index(topic, RosTypes())
+    paths = [*(port.path for port in topic.ports), *(path for path, _ in topic.constants)]
+    problems += [f"'{path}' in '{name}' has two sources" for path in dict.fromkeys(paths) if paths.count(path) > 1]
+    return topic
 
 
 def _parsed(entry: str) -> tuple[str, _Message] | None:
@@ -204,47 +208,32 @@ def _parsed(entry: str) -> tuple[str, _Message] | None:
 
 def _check_field(topic: str, message: str, path: str, problems: list[str]) -> None:
     try:
-        sample = message_class(message)()
+        kind = RosTypes().field(message, path)
     except ConfigurationError as error:
         problems.append(f"'{topic}': {error.message.rstrip('.')}")
-        return
-    if _PATH.fullmatch(path) is None:
-        problems.append(f"'{topic}': '{path}' is no field such as 'poses[0].position.x'")
-        return
-    try:
-        owner, last = _place(sample, path)
-        field = owner[last] if isinstance(last, int) else getattr(owner, last)
-    except IndexError as error:
-        problems.append(f"'{topic}': '{path}' of '{message}' is beyond its {error} elements")
-    except (AttributeError, TypeError):
-        problems.append(f"'{topic}': '{message}' has no field '{path}'")
+    except UnknownField as error:
+        near = nearest(path, error.names)
+        problems.append(f"'{topic}': {error}{f'; did you mean {near!r}?' if near else ''}")
     else:
-        if not isinstance(field, bool | int | float | str | bytes | np.generic):
+        if not isinstance(kind, Basic):
             problems.append(f"'{topic}': '{path}' of '{message}' is no single value")
 
 
-def _place(message: Any, path: str, passed: Callable[[Any], None] = lambda _owner: None) -> tuple[Any, str | int]:  # noqa: ANN401 a ROS message
+def _place(message: Any, path: str, passed: Callable[[Any], None]) -> tuple[Any, Any]:  # noqa: ANN401 a ROS message
     """The message or array that holds the field at a path, and the name or index of the field there.
 
     Sequences on the way are made as long as the path needs them.
-
-    Raises:
-        AttributeError: there is no such field.
-        IndexError: an array cannot have so many elements; its text is the largest number of elements.
-        TypeError: a field with an index is not an array.
     """
     parts = path_parts(path)
     owner = message
     for part, following in pairwise(parts):
-        if isinstance(following, int):
-            assert isinstance(part, str)  # ROS has no arrays of arrays
-            _lengthen(owner, part, following + 1)
-            owner = getattr(owner, part)
-        elif isinstance(part, int):
+        if isinstance(part, int):
             owner = owner[part]
             passed(owner)
-        else:
-            owner = getattr(owner, part)
+            continue
+        if isinstance(following, int):
+            _lengthen(owner, str(part), following + 1)
+        owner = getattr(owner, str(part))
     return owner, parts[-1]
 
 
@@ -252,9 +241,6 @@ def _lengthen(owner: Any, name: str, length: int) -> None:  # noqa: ANN401 a ROS
     """Make the array ``name`` of a message at least ``length`` elements long; new elements are empty."""
     elements = getattr(owner, name)
     sequence = _SEQUENCE.fullmatch(owner.get_fields_and_field_types()[name])
-    most = len(elements) if sequence is None else int(sequence["bound"] or MAX_ELEMENTS)
-    if length > most:
-        raise IndexError(most)
     if sequence is not None and length > len(elements):
         kind = sequence["element"]
         package, slash, own = kind.partition("/")
@@ -281,7 +267,7 @@ class FmuTopics:
         self._now = now
         self._publishers: list[tuple[Topic, Any, Any]] = []
         self._subscriptions: list[Any] = []
-        self._held: dict[str, tuple[Topic, Any, int]] = {}
+        self._held: dict[str, tuple[FieldReader, Any, int]] = {}
         self._started = False
         self._closed = False
         self._waiting = 0
@@ -305,8 +291,10 @@ class FmuTopics:
             self._publishers.append((topic, publisher, kind))
             return
 
+        fields = FieldReader(topic, RosTypes(), getattr)
+
         def arrived(message: Any) -> None:  # noqa: ANN401 a ROS message
-            self._arrived(topic, message)
+            self._arrived(fields, message)
 
         self._subscriptions.append(
             self._node.create_subscription(kind, topic.name, arrived, _DEPTH, qos_overriding_options=overrides)
@@ -314,8 +302,8 @@ class FmuTopics:
 
     def start(self) -> None:
         """Give the FMU the messages that were kept, and from now on every message."""
-        for topic, message, arrived in self._held.values():
-            self._thread.call(self._take, topic, message, arrived)
+        for fields, message, arrived in self._held.values():
+            self._thread.call(self._take, fields, message, arrived)
         self._held.clear()
         self._started = True
 
@@ -341,31 +329,34 @@ class FmuTopics:
         for _, publisher, _ in self._publishers:
             self._node.destroy_publisher(publisher)
 
-    def _arrived(self, topic: Topic, message: Any) -> None:  # noqa: ANN401 a ROS message
-        arrived = self._now()
+    def _arrived(self, fields: FieldReader, message: Any) -> None:  # noqa: ANN401 a ROS message
+        arrived, name = self._now(), fields.topic.name
         if not self._started:
-            self._held[topic.name] = (topic, message, arrived)
+            self._held[name] = (fields, message, arrived)
             return
         with self._count:
             full = self._waiting >= _MAX_WAITING
             self._waiting += not full
         if full:
             self._log.error(
-                f"{_MAX_WAITING} messages wait for the FMU; one on '{topic.name}' is lost",
+                f"{_MAX_WAITING} messages wait for the FMU; one on '{name}' is lost",
                 throttle_duration_sec=LOG_INTERVAL_S,
             )
             return
-        self._thread.submit(self._take, topic, message, arrived, waited=1)
+        self._thread.submit(self._take, fields, message, arrived, waited=1)
 
     # --- on the thread of the FMU
 
-    def _take(self, topic: Topic, message: Any, arrived: int, waited: int = 0) -> None:  # noqa: ANN401 a ROS message
+    def _take(self, fields: FieldReader, message: Any, arrived: int, waited: int = 0) -> None:  # noqa: ANN401 a ROS message
         with self._count:
             self._waiting -= waited
         if self._closed:
             return
         try:
-            for variable, value in values_in(topic, message).items():
+            for variable, value in values_in(fields, message).items():
                 self._driver.set_input(variable, message_time(message, arrived), value)
-        except (CallRefused, IndexError) as error:
-            self._log.error(f"a message on '{topic.name}' was left out: {error}", throttle_duration_sec=LOG_INTERVAL_S)
+        except (CallRefused, CdrError) as error:
+            text = f"a message on '{fields.topic.name}' was left out: {error}"
+            self._log.error(text, throttle_duration_sec=LOG_INTERVAL_S)
+        if fields.warning:
+            self._log.warning(f"'{fields.topic.name}': {fields.warning}")

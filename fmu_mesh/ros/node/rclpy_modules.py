@@ -7,6 +7,7 @@ needed.
 from __future__ import annotations
 
 import importlib
+import re
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -14,12 +15,16 @@ from typing import Any
 
 from ...errors import ConfigurationError
 from ..gateway.link import two_clocks
+from ..messages.definitions import Array, Basic, FieldType, FieldTypes, Nested, Sequence
 from ..messages.topics import CLOCK_TOPIC
 
-__all__ = ["RosNode", "message_class", "ros_module", "steady_timer", "time_message", "watch_clock"]
+__all__ = ["RosNode", "RosTypes", "message_class", "ros_module", "steady_timer", "time_message", "watch_clock"]
 
 _INTERVAL_S = 1.0
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
+
+_ARRAY = re.compile(r"(?P<sequence>sequence<)?(?P<element>.*?)(, (?P<bound>\d+))?(>|\[(?P<length>\d+)\])")
+_KINDS = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
 
 RosNode = Any
 """`rclpy.node.Node`, which has no types where ROS is not installed."""
@@ -56,6 +61,26 @@ def message_class(type_name: str) -> Any:  # noqa: ANN401 as above
     if found is None:
         raise ConfigurationError(f"the ROS package '{parts[0]}' has no message type '{parts[2]}'.")
     return found
+
+
+class RosTypes(FieldTypes):
+    """The message types of the ROS of this Python."""
+
+    def fields(self, message: str) -> tuple[tuple[str, FieldType], ...]:
+        """The fields of a message, in order; raises as `message_class` does."""
+        kinds: dict[str, str] = message_class(message).get_fields_and_field_types()
+        return tuple((name, _field_type(kind)) for name, kind in kinds.items())
+
+
+def _field_type(text: str) -> FieldType:
+    """The field that rclpy describes as `double`, `double[36]`, `geometry_msgs/Pose` or `sequence<octet, 3>`."""
+    if (found := _ARRAY.fullmatch(text)) is not None and (found["sequence"] or found["length"]):
+        element = _field_type(found["element"])
+        assert isinstance(element, Basic | Nested)  # ROS has no arrays of arrays
+        return Array(element, int(found["length"])) if found["length"] else Sequence(element, int(found["bound"] or 0))
+    package, slash, name = text.partition("/")
+    kind = package.partition("<")[0]  # without the length limit of a string
+    return Nested(f"{package}/msg/{name}") if slash else Basic(_KINDS.get(kind, kind))
 
 
 def time_message(time: int) -> Any:  # noqa: ANN401 as above
