@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,12 @@ from fmu_mesh.ros.messages.simulation_types import (
     SimulatorFeature,
     define_simulation_types,
 )
-from tests.helpers import Launched, Place, rows_of, wait_until, write_config
-from tests.ros.peers import need
+from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
+from tests.ros.peers import Peer, free_port, need
 from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
 
 ros_or_skip()
-BUILT = built_types_or_skip()
+SHARED = Path(built_types_or_skip()["LD_LIBRARY_PATH"].split(os.pathsep)[0]).parent / "share/simulation_interfaces/srv"
 need("mujoco")
 
 WORLD = Path(__file__).parents[2] / "configs/worlds/fluid_body.xml"
@@ -115,10 +116,9 @@ def started(request: pytest.FixtureRequest, ros: Ros, place: Place) -> tuple[Sim
 def test_type_hashes_are_those_of_the_generator_of_ros() -> None:
     types = MessageTypes("kilted")
     define_simulation_types(types)
-    shared = Path(BUILT["LD_LIBRARY_PATH"].split(os.pathsep)[0]).parent / "share/simulation_interfaces/srv"
 
     for kind in SIMULATION_SERVICES:
-        described = json.loads((shared / f"{kind}.json").read_text(encoding="utf-8"))["type_hashes"]
+        described = json.loads((SHARED / f"{kind}.json").read_text(encoding="utf-8"))["type_hashes"]
         hashes = {own["type_name"]: own["hash_string"] for own in described}
         for name in (own for own in hashes if own.startswith("simulation_interfaces/")):
             assert types.type_hash(name) == hashes[name], name
@@ -205,7 +205,7 @@ def test_state_is_told_and_mesh_pauses_during_a_long_step(started: tuple[Simulat
     "started", [{"factor": 0.001, "simulation_interfaces": {"paced": False}}], indirect=True, ids=["unpaced"]
 )
 def test_steps_that_are_not_paced_are_faster_than_real_time_factor(
-    started: tuple[Simulator, Launched, Any], place: Place
+    started: tuple[Simulator, Launched, Any],
 ) -> None:
     simulator, _launched, _peer = started
 
@@ -252,3 +252,55 @@ def test_action_steps_with_feedback_and_can_be_cancelled(started: tuple[Simulato
     assert refused.result == ResultCode.OPERATION_FAILED
     assert "playing" in refused.error_message
     client.destroy()
+
+
+def test_services_on_keys_of_rmw_zenoh_answer_an_independent_client(place: Place) -> None:
+    need("zenoh_ros2_sdk")
+    port = free_port()
+    router = place.start("router", "--listen", f"tcp/127.0.0.1:{port}")
+    wait_until(lambda: router.output, "the router")
+    at = {"profile": "rmw_zenoh", "domain": 7, "connect": [f"tcp/127.0.0.1:{port}"], "namespace": "/lab"}
+    config = configured(place, distribution="kilted", **at)
+    launched = place.start("launch", config, "--paused", "--no-progress")
+    services = ["GetSimulatorFeatures", "GetSimulationState", "SetSimulationState", "StepSimulation", "GetEntityState"]
+    orders = {"port": port, "domain": 7, "namespace": "/lab", "types": str(SHARED), "services": services}
+    wait_until(lambda: row_count(place.folder / "lab.csv"), "point 0")
+
+    with Peer("rmw_zenoh_peer.py", "simulation", orders) as peer:
+        peer.answer(0)
+        number = 0
+
+        def asked(kind: str, **fields: object) -> dict[str, Any]:
+            nonlocal number
+            number += 1
+            peer.say(order=[kind, fields])
+            answer: dict[str, Any] = peer.answer(number)["answer"]
+            return answer
+
+        features = asked("GetSimulatorFeatures")["features"]["features"]
+        before = asked("GetSimulationState")["state"]["state"]
+        stepped = asked("StepSimulation", steps=100)["result"]
+        moved = asked("GetEntityState", entity="world.cube")["state"]
+        refused = asked("GetEntityState", entity="nobody")["result"]
+        ended = asked("SetSimulationState", state=int(SimulationStates.QUITTING))["result"]
+    launched.wait()
+    router.signal(signal.SIGTERM)
+    router.wait()
+
+    assert SimulatorFeature.STEP_SIMULATION_MULTIPLE in features
+    assert SimulatorFeature.STEP_SIMULATION_ACTION not in features, "actions are there through rclpy only"
+    assert before == SimulationStates.PAUSED
+    assert (stepped["result"], stepped["error_message"]) == (ResultCode.OK, "")
+    assert moved["pose"]["position"]["x"] == rows_of(place.folder / "lab.csv")[100][1] != 0.0
+    assert refused == {**refused, "result": ResultCode.NOT_FOUND, "error_message": "there is no entity 'nobody'"}
+    assert ended["result"] == ResultCode.OK
+
+
+def test_profile_of_a_bridge_is_refused_with_a_way_out(place: Place) -> None:
+    config = configured(place, profile="ros2dds")
+
+    done = place.run("check", config)
+
+    assert done.wait() == 2
+    assert "ros.simulation_interfaces" in done.errors
+    assert "the profile rmw_zenoh or rclpy" in done.errors
