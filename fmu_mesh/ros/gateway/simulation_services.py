@@ -6,7 +6,7 @@ come: here as queries of Zenoh, in `fmu_mesh.ros.node.simulation_server` through
 
 # Threads: requests are answered on several threads at once, because one of them may wait for a long step while others
 # ask for the state, or pause. Two steps at once would add up to another one than either asked for, so the second is
-# refused (`_stepping`). The mesh itself decides on everything else, and its answer is the result.
+# refused (`_stepping`). The mesh itself decides on everything else, and its answer is the result (ADR 0030).
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class SimulationServices:
             response.update(self._answers[kind](request))
         except _Refusal as refusal:
             code, text = refusal.code, str(refusal)
-        except FmuMeshError as error:
+        except (FmuMeshError, zenoh.ZError) as error:  # Zenoh: the session is closed
             failed = ResultCode.STATE_TRANSITION_ERROR, ResultCode.OPERATION_FAILED
             code, text = failed[kind != "SetSimulationState"], str(error)
         if "result" in response:

@@ -3,7 +3,7 @@
 # Threads: the executor of rclpy calls `_answer`, and has to go on while a request waits for a long step. So `_answer`
 # is a coroutine: one of `ServiceThreads` asks the mesh, and sets the result of a future. The executor would not notice;
 # it wakes for the callback of the future. A service that is destroyed cannot respond, so that waits for the last
-# response (`close`).
+# response (`close`, ADR 0031).
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class SimulationServer:
         self._services = services
         self._namespace = namespace
         self._threads = ServiceThreads("simulation", SIMULATION_THREADS)
+        self._working = ExitStack()
         self._entities = ExitStack()
         self._under_way = 0
         self._closed = False
@@ -59,11 +60,12 @@ class SimulationServer:
             callback_group=group,
         )
         self._entities.callback(server.destroy)
-        self._entities.enter_context(self._threads)
+        self._working.enter_context(self._threads)
 
     def close(self) -> None:
         """Requests do not wait for the mesh any more; destroy the services once all of them are answered."""
         self._services.close()
+        self._working.close()
         self._closed = True
         if not self._under_way:
             self._entities.close()
@@ -114,6 +116,5 @@ class SimulationServer:
             goal.canceled()
         else:
             goal.abort()
-        result = action.Result()
-        result.result.result, result.result.error_message = int(outcome["result"]), outcome["error_message"]
-        return result
+        message = ros_module("simulation_interfaces.msg").Result
+        return action.Result(result=message(result=int(outcome["result"]), error_message=outcome["error_message"]))
