@@ -11,7 +11,7 @@ import pytest
 
 from tests.helpers import FMUS, Place, write_config
 from tests.ros.peers import need
-from tests.ros.ros_peer import Ros, ros_or_skip
+from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
 
 ros_or_skip()
 need("sensor_msgs")
@@ -94,7 +94,7 @@ def test_joint_commands_reach_their_joints_through_the_gateway_in_any_order(
 
 
 def test_frames_are_read_and_published_by_their_names(ros: Ros, place: Place) -> None:
-    need("tf2_msgs")
+    built_types_or_skip()
     from geometry_msgs.msg import TransformStamped  # noqa: PLC0415 only where ROS is installed
     from tf2_msgs.msg import TFMessage  # noqa: PLC0415 as above
 

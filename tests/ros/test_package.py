@@ -196,13 +196,14 @@ def test_the_launch_file_with_a_gateway_shows_ros_the_mesh(
     description = described(SOURCE / "launch/mesh_and_gateway.launch.py", monkeypatch)
     subscription, angles = ros.collect(ros.peer(), Float64, "/pendulum/a")
 
-    with Launch(ros, tmp_path, description, config=str(config(tmp_path, stop_time=8.0))) as launch:
+    with Launch(ros, tmp_path, description, config=str(config(tmp_path, stop_time=600.0))) as launch:
         ros.matched(subscription)
         ros.until(lambda: angles, "an angle")
+        subprocess.run([sys.executable, "-Pm", "fmu_mesh", "stop", "pair"], check=True, timeout=DEADLINE_S)
         launch.until_over()
 
     assert launch.shut_down == "the mesh has ended"
-    assert sorted(launch.exits) == [("fmu_mesh_gateway", 0), ("mesh", 0), ("mesh_ready", 0)]
+    assert sorted(launch.exits) == [("fmu_mesh_gateway", 0), ("mesh", 130), ("mesh_ready", 0)]
 
 
 def test_the_launch_file_of_one_fmu_activates_its_node(

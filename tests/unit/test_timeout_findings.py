@@ -59,7 +59,7 @@ def written(folder: Path, **inputs: str) -> Path:
         ("gain", "{u: {timeout: {then: hold}}}", "timeout.after: missing"),
         ("gain", "{u: {timeout: {after: 1}}}", "timeout.then: missing"),
         ("gain", "{u: {timeout: {after: soon, then: hold}}}", "timeout.after: 'soon'"),
-        ("gain", "{u: {timeot: {after: 1, then: hold}}}", "unknown key.*Did you mean 'timeout'"),
+        ("gain", "{u: {timeoutt: {after: 1, then: hold}}}", "unknown key.*Did you mean 'timeout'"),
         (
             "gain",
             "{u: {timeout: {after: 1, then: off}}}",
