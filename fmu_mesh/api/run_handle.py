@@ -22,7 +22,7 @@ from ..run.options import StartOptions
 from ..text import shown
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
-from ..wire.client.waiting import replay, rest, wait_for, wait_for_start
+from ..wire.client.waiting import replay, wait_for, wait_for_start
 from ..wire.views import (
     Command,
     CommandAnswer,
@@ -351,14 +351,20 @@ class Run:
 
     # --- steering
 
-    def pause(self) -> CommandAnswer:
-        """Pause the mesh; returns when all instances have reached the point of the answer."""
-        return rest(self._steered(), Command("pause"))
+    @checked
+    def pause(self, *, timeout: float | None = None) -> CommandAnswer:
+        """Pause the mesh; returns when all instances have reached the point of the answer.
+
+        Raises:
+            DeadlineExceeded: they have not in ``timeout`` s, by default that of every question; the mesh pauses later.
+            MeshLost: the mesh has ended, or another program has let it run on or pause elsewhere.
+        """
+        return self._steered().rest(Command("pause"), timeout)
 
     @checked
-    def step(self, points: int = 1) -> CommandAnswer:
-        """Run some points and pause again; returns when the mesh has paused."""
-        return rest(self._steered(), Command("step", points))
+    def step(self, points: int = 1, *, timeout: float | None = None) -> CommandAnswer:
+        """Run some points and pause again; returns when the mesh has paused. For ``timeout`` and errors see `pause`."""
+        return self._steered().rest(Command("step", points), timeout)
 
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""

@@ -8,7 +8,7 @@ does not share this memory gets grants and reports its progress by messages.
 # WHY one thread decides, and which others there are:
 #
 # The process of a master has its main thread, which is in `Master.run`; the thread of the recorder, which only reads
-# `has_begun`; and the threads of Zenoh, on which queries, tokens and messages arrive. None of those changes a state:
+# `wanted`; and the threads of Zenoh, on which queries, tokens and messages arrive. None of those changes a state:
 # they post to the inbox and ring the bell of this process, and the main thread runs what was posted when it next wakes
 # (ADR 0008). So there is no lock here. `interrupt` posts in front of all others, because a person waits for it.
 #
@@ -63,7 +63,7 @@ from ..wire.runtime import this_host
 from ..wire.session import tokens
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
-from ..wire.views import Command, MeshInfo, MeshStatus
+from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from ..wire.ways import Ways
 from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
 from .master_streams import MasterStreams
@@ -71,6 +71,7 @@ from .members import Followers, Members
 from .mesh_server import STATUS_S, Events, MasterServer
 from .pacing import GrantWatch, Pacer, RunClock
 from .registrations import spoken
+from .resting import Resting
 
 __all__ = ["Master", "MasterSettings"]
 
@@ -130,6 +131,7 @@ class Master:
         self._states = MasterStates(plan, paused=settings.paused)
         self._pacer = Pacer(plan, config.simulation.real_time_factor)
         self._clock = RunClock()
+        self._awake = AwakeClock()
         self._watch = GrantWatch() if settings.profile else None
         memory_of = HostMemory.create if self._shares else HostMemory.private
         self._memory = memory_of(next(iter(plan.nodes.values())).memory, MASTER)
@@ -144,6 +146,8 @@ class Master:
         registrations = self._states.registrations
         self._members = Members(registrations, session, self._run_keys, offer, settings.launch, meeting)
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
+        self._resting = Resting(config.mesh, self._states, self._answer)
+        self._published: tuple[MeshState, bool] = ("starting", False)
         self._tokens = ExitStack()
 
     def memory_for(self, participant: str) -> HostMemory | None:
@@ -188,7 +192,7 @@ class Master:
         Raises:
             FmuMeshError: why the run ended early; all nodes have been informed.
         """
-        states, awake = self._states, AwakeClock()
+        states, awake = self._states, self._awake
         try:
             while not states.is_over:
                 pause_s = self._decide(awake())
@@ -237,17 +241,20 @@ class Master:
             if states.takes_commands and states.paced:
                 paced, pause_s = self._pacer.limit(paced, states.granting.reached)
             stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
-            before, actions = states.state, states.decide(now, paced, stopped)
-            if not states.moves:  # at once: to publish takes as long as thousands of points
-                self._clock.stop()
-            if states.state != before and not states.is_over:
-                self._server.publish_status(at_once=True)
+            actions = states.decide(now, paced, stopped)
             if states.moves:
                 self._clock.start()
+            else:
+                self._clock.stop()
             for action in actions:
                 self._do(action)
             if not actions:
                 break
+        self._resting.settle(now)
+        # After what there is to do: to publish takes as long as thousands of points.
+        (state, rested), self._published = self._published, (states.state, states.rests)
+        if (states.state != state or (states.rests and not rested)) and not states.is_over:
+            self._server.publish_status(at_once=True)
         if self._watch is not None and states.takes_commands:
             self._watch.note(states.granting.holder(hold=states.hold, paced=paced))
         return pause_s
@@ -345,17 +352,26 @@ class Master:
         if states.takes_commands:
             claimed = self._memory.withdraw_grant() if states.granting.sharing else 0
             answer = states.command(command, claimed)
-            query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
+            if command.wait and answer.hold is not None:
+                self._resting.add(query, answer, self._awake() + command.wait)
+            else:
+                self._answer(query, answer)
         else:
             query.reply_err(f"the mesh is {states.state}; there is nothing to {command.command}")
-        query.drop()
+            query.drop()
+
+    def _answer(self, query: zenoh.Query, answer: CommandAnswer) -> None:
+        key = self._keys.mesh_key("command")
+        with self._inbox.refusals.guard(key):  # the client may be gone
+            query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
+            query.drop()
 
     # --- views
 
     @property
-    def has_begun(self) -> bool:
-        """Whether all nodes have reached the first point; from any thread."""
-        return self._states.granting.slowest >= 0
+    def wanted(self) -> int:
+        """As that of the states; negative until all nodes have reached the first point. From any thread."""
+        return self._states.wanted if self._states.granting.slowest >= 0 else -1
 
     @property
     def ended_by(self) -> TerminationRequested | NotFinite | None:

@@ -33,6 +33,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import msgspec
@@ -152,10 +153,15 @@ class MasterStates:
         return self.takes_commands and self.granting.slowest < self.wanted
 
     @property
+    def rests(self) -> bool:
+        """Whether all nodes have reached the point of a pause."""
+        return self.state == "paused" and self.hold is not None and self.granting.slowest >= self.hold
+
+    @property
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
-        last_point = self.granting.last_point
-        return last_point if self.hold is None else min(self.hold, last_point)
+        last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
+        return last_point if hold is None else min(hold, last_point)
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
@@ -225,7 +231,7 @@ class MasterStates:
 
         Only while it `takes_commands`. No node of this host passes ``claimed`` until the grant is raised again.
         """
-        granting, before = self.granting, self.hold
+        granting, before, rested = self.granting, self.hold, self.rests
         self.hold = point = granting.halt(claimed)
         self.paced = command.paced
         self._actions.append(RaiseGrant(point))
@@ -241,6 +247,8 @@ class MasterStates:
         if command.command in ("resume", "step"):
             self._actions.append(FollowClock(granting.reached))
         self._moved_at = self._slowest_moved_at = None
+        if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
+            self._sent_at = -math.inf
         return CommandAnswer(command.command, self.state, granting.slowest, self.hold)
 
     def fail(self, error: FmuMeshError) -> None:

@@ -45,6 +45,7 @@ from ..results.growth import GrowthWatch, ReadColumn
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
+from ..simtime import ENDLESS
 from ..system.plan import RECORDER, Link, NodePlan
 from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
@@ -92,7 +93,8 @@ class Recorder:
     Args:
         session: the session of this process; the caller closes it.
         files: the result files, in the order of the plan; closed by the recorder.
-        has_begun: whether all instances have reached point 0; nothing is written before.
+        wanted: the point up to which the master lets nodes step, such as that of a pause; negative until all instances
+            have reached point 0, and nothing is written before.
         notes: the folder of the run, if somebody counts the rows when this process was killed (`rows_left`).
         memory: that of the master's process, if others exchange rows through it or through its row streams.
         mirror_of: where the rows of a link come to that has a row stream.
@@ -105,7 +107,7 @@ class Recorder:
         plan: NodePlan,
         session: zenoh.Session,
         files: Sequence[ResultFile],
-        has_begun: Callable[[], bool] = lambda: True,
+        wanted: Callable[[], int] = lambda: ENDLESS,
         *,
         growth: GrowthWatch | None = None,
         notes: Path | None = None,
@@ -123,7 +125,7 @@ class Recorder:
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
         self._files = RecordFiles(files, growth, notes)
-        self._has_begun = has_begun
+        self._wanted = wanted
         self._written = 0
         self._told = 0
         self._flushed = 0.0
@@ -235,12 +237,13 @@ class Recorder:
                 self._take(message)
 
     def _wishes(self) -> list[Wish] | None:
-        """Wake up when many rows can be written, or all that are left; first for point 0. None: they are there."""
-        last_point, complete = self._plan.grid.last_point, self._complete()
+        """Wake up when many rows can be written, or all up to a pause or to the end; None: they are there."""
+        wanted, complete = self._wanted(), self._complete()
+        last_point = self._plan.grid.last_point
         if self._written > last_point:
             return []
-        due = min(self._written + self._wake_rows if complete >= 0 else 0, last_point)
-        if self._written <= complete and complete >= due and (self._written or self._has_begun()):
+        due = min(self._written + self._wake_rows if complete >= 0 else 0, max(self._written, wanted), last_point)
+        if self._written <= complete and complete >= due and (self._written or wanted >= 0):
             return None
         slowest = min(self._sources.values(), key=lambda source: source.covered)
         rows = due // slowest.link.step_points + 1
@@ -282,7 +285,7 @@ class Recorder:
 
     def _write_rows(self) -> None:
         rows = self._complete() + 1
-        if not (self._written or self._has_begun()):
+        if not self._written and self._wanted() < 0:
             return
         while (first := self._written) < rows:
             end = min(rows, first - first % self._rows + self._rows, first + _WRITE_ROWS)  # read without wrap-around

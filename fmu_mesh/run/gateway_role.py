@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from ..errors import ConfigurationError, Interrupted
 from ..ros.gateway.gateway import Gateway, open_profiles
-from ..ros.gateway.link import RosLink
+from ..ros.gateway.link import RosLink, open_ros
 from ..ros.gateway.mapping import resolve
 from ..ros.messages.topics import RosPlan
 from ..system.plan import MASTER
@@ -45,14 +45,11 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
         at, lease_s = _master_at(run, process), config.timeouts.link
         mesh = open_session(Wiring(mode="client", connect=at, patience_s=patience_s, lease_s=lease_s))
         stack.callback(close_session, mesh)
-        # A peer that gossips, as the nodes of ROS are: a router does not forward between peers, it introduces them.
-        # They have ports, and this process connects to them; a port of its own would be open to every user of the host.
-        wiring = Wiring(mode="peer", listen=tuple(section.listen), connect=tuple(section.connect), gossip=True)
-        ros = open_session(wiring)
+        as_peer, ros = open_ros(section, process.folder)
         stack.callback(close_session, ros)
         keys = Keys(config.zenoh.key_prefix, config.mesh)
         profiles = stack.enter_context(open_profiles(section, ros, ros_plan, mesh, keys))
-        link = RosLink(section, ros, mesh, keys, clock=ros_plan.clock_points is not None)
+        link = RosLink(section, ros, mesh, keys, profiles, clock=ros_plan.clock_points is not None, as_peer=as_peer)
         stack.callback(link.close)
         gateway = Gateway(ros_plan, mesh, keys, run.plan.grid, profiles)
         link.open(gateway.ignored)

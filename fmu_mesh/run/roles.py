@@ -234,7 +234,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                     plan.nodes[RECORDER],
                     session,
                     results,
-                    lambda: master.has_begun,
+                    lambda: master.wanted,
                     growth=GrowthWatch(plan),
                     notes=process.folder if process.is_child else None,
                     launch=process.launch,

@@ -17,7 +17,7 @@ from ..config.mesh import TimeoutsConfig, ZenohConfig
 from ..files import beside
 from ..system.plan import MASTER
 from ..wire.runtime import socket_endpoint
-from ..wire.session import Wiring, is_socket
+from ..wire.session import Wiring, host_of, is_socket
 
 __all__ = ["is_socket", "leaves_host", "patient", "wiring"]
 
@@ -70,8 +70,7 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
 
 def leaves_host(endpoint: str) -> bool:
     """Whether other hosts can connect to a process that listens at this endpoint."""
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    host = address.rpartition(":")[0].strip("[]")
+    host = host_of(endpoint)
     try:
         return not ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import queue
 import re
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -129,6 +130,24 @@ class Wiring(msgspec.Struct, frozen=True):
 def is_socket(endpoint: str) -> bool:
     """Whether an endpoint is a Unix socket, which is protected by the permissions of its folder."""
     return endpoint.startswith("unixsock-stream/")
+
+
+def host_of(endpoint: str) -> str:
+    """The address or the name of the host in an endpoint of a network."""
+    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+    return address.rpartition(":")[0].strip("[]")
+
+
+def is_of_this_host(endpoint: str) -> bool:
+    """Whether it is a Unix socket, or an address of an interface of this host."""
+    if is_socket(endpoint):
+        return True
+    with suppress(OSError, UnicodeError):  # nobody knows this name, as yet, or it is none
+        for family, *_, address in socket.getaddrinfo(host_of(endpoint), None, type=socket.SOCK_DGRAM):
+            with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.bind(address)  # the system refuses the addresses of others
+                return True
+    return False
 
 
 def open_session(wiring: Wiring) -> zenoh.Session:
@@ -255,7 +274,8 @@ def undeclare_all(*entities: Iterable[Any]) -> None:
 class Question(msgspec.Struct, frozen=True):
     """A query that waits ``deadline_s`` seconds for its answer; an error names ``whom`` it was for.
 
-    It overtakes messages of a lower ``priority``, and follows earlier ones of the same.
+    It overtakes messages of a lower ``priority``, and follows earlier ones of the same. It is sent ``once`` where its
+    repetition would have an effect: then the loss of the answer ends in the deadline.
     """
 
     key: str
@@ -264,6 +284,7 @@ class Question(msgspec.Struct, frozen=True):
     payload: bytes | None = None
     attachment: bytes | None = None
     priority: zenoh.Priority = zenoh.Priority.DEFAULT
+    once: bool = False
 
 
 def ask(session: zenoh.Session, question: Question, over: Callable[[], bool] = lambda: False) -> bytes:
@@ -287,14 +308,15 @@ def answers(
         MeshLost: the answer was an error, whose text is the message; or the answer is not needed any more.
     """
     end = time.monotonic() + question.deadline_s
-    changed = threading.Event()
+    changed, sent = threading.Event(), False
     encoding = json_encoding if question.payload is not None else None
     with session.declare_querier(question.key, timeout=question.deadline_s, priority=question.priority) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
             while (left := end - time.monotonic()) > 0:
                 changed.clear()
-                if matches(querier):
+                if matches(querier) and not (sent and question.once):
+                    sent = True
                     # Zenoh does not report that the process of the queryable is gone: it would wait for the timeout.
                     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
                     handler = Callback(replies.put, partial(replies.put, None))

@@ -23,6 +23,7 @@ __all__ = [
     "MeshInfo",
     "MeshState",
     "MeshStatus",
+    "RosTopicView",
     "RosView",
     "SetAnswer",
     "VariableView",
@@ -247,6 +248,14 @@ class MeshStatus(msgspec.Struct, frozen=True):
     cut: dict[str, float] = {}
 
 
+class RosTopicView(msgspec.Struct, frozen=True):
+    """A topic that a gateway publishes (out) or subscribes to (in), and whether a subscriber or publisher is there."""
+
+    topic: str
+    direction: Literal["in", "out"]
+    matched: bool
+
+
 class RosView(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/ros/<id>`: the link of a gateway to ROS.
 
@@ -255,6 +264,7 @@ class RosView(msgspec.Struct, frozen=True):
         connected: whether a bridge or router answers.
         activity: the same as text, such as `nobody answers at tcp/127.0.0.1:7447`.
         other_clocks: other publishers of `/clock`, as text.
+        topics: all of them; what is published reaches a subscriber if it is matched.
         ignored: by topic, how many elements of messages had keys that no variable has.
     """
 
@@ -263,6 +273,7 @@ class RosView(msgspec.Struct, frozen=True):
     connected: bool
     activity: str
     other_clocks: tuple[str, ...] = ()
+    topics: tuple[RosTopicView, ...] = ()
     ignored: dict[str, int] = {}
 
 
@@ -272,11 +283,13 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     Attributes:
         points: for `step` only.
         paced: for `step` only: whether the real-time factor limits it.
+        wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests.
     """
 
     command: Literal["pause", "resume", "step", "stop"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
     paced: bool = True
+    wait: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
@@ -285,9 +298,11 @@ class CommandAnswer(msgspec.Struct, frozen=True):
     Attributes:
         point: the last point that every instance has reached.
         hold: the point at which all of them will pause; None if the mesh continues to run.
+        error: why an answer that has waited comes before they have.
     """
 
     command: str
     state: MeshState
     point: int
     hold: int | None = None
+    error: ErrorReport | None = None

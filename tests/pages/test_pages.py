@@ -361,6 +361,7 @@ NOT_RUN = [
         "$ fmu-mesh status pendulum_ros",
         "the run takes 2 s; tests/ros/test_link.py reads this line",
     ),
+    ("docs/ros.md", "ROS", "needs two hosts; tests/ros/test_router_elsewhere.py has them"),
     (
         "docs/ros.md",
         "$ ros2 param get /pendulum_ros gain.k",

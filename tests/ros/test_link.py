@@ -9,6 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from fmu_mesh.config.mesh import RosConfig
+from fmu_mesh.ros.gateway.link import open_ros
+from fmu_mesh.wire.session import Wiring, close_session, open_session
 from tests.helpers import Launched, Place, rows_of, wait_until, write_config
 from tests.ros.peers import Peer, bridge, bridge_binary, free_port, need
 
@@ -102,6 +107,53 @@ def test_a_router_without_a_bridge_is_no_link_to_dds(place: Place) -> None:
             f"connected at tcp/127.0.0.1:{port}, but no bridge to DDS is there, so ROS on DDS gets"
         )
         assert [(own["connected"], own["other_clocks"]) for own in seen(place, "lab")] == [(True, [])]
+
+
+def test_status_tells_for_each_topic_whether_somebody_is_there(place: Place) -> None:
+    port = free_port()
+    topics = [{"topic": "/angle", "variable": "gain.y"}, {"topic": "/command", "variable": "gain.u"}]
+    router = open_session(Wiring(mode="router", listen=(f"tcp/127.0.0.1:{port}",)))
+    token = f"@/{router.zid()}/@ros2_lv/MP/command/std_msgs§msg§Float64/:1:0:0,10"  # as a bridge has it
+
+    def matched(*names: str) -> bool:
+        [gateway] = seen(place, "lab")
+        return {own["topic"] for own in gateway["topics"] if own["matched"]} == {*names}
+
+    with launched(place, configured(place, "lab", port, topics=topics)):
+        status_says(place, "lab", "ROS    nobody subscribes to /angle, /clock")
+        subscriber, publisher = router.declare_subscriber("angle"), router.liveliness().declare_token(token)
+        wait_until(lambda: matched("/angle", "/command"), "both topics")
+        lines = place.run("status", "lab").output.splitlines()
+        subscriber.undeclare()
+        publisher.undeclare()
+        wait_until(matched, "nobody")
+
+    assert [line for line in lines if line.startswith("ROS")][1:] == [
+        "ROS    somebody subscribes to /angle",
+        "ROS    nobody subscribes to /clock",
+        "ROS    somebody publishes /command",
+    ]
+    close_session(router)
+
+
+@pytest.mark.parametrize(
+    ("section", "as_peer"),
+    [
+        (RosConfig(), True),
+        (RosConfig(connect=["tcp/192.0.2.1:7447"]), False),
+        (RosConfig(connect=["tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447"], profile="rmw_zenoh"), False),
+        (RosConfig(connect=["tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447"]), True),
+        (RosConfig(connect=["tcp/192.0.2.1:7447"], listen=["tcp/127.0.0.1:0"]), True),
+    ],
+    ids=["here", "elsewhere", "a_second_router", "a_second_bridge", "listening"],
+)
+def test_a_gateway_is_a_client_of_another_host(tmp_path: Path, section: RosConfig, as_peer: bool) -> None:  # noqa: FBT001  a parameter
+    is_peer, session = open_ros(section, tmp_path)
+
+    close_session(session)
+
+    assert is_peer is as_peer
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_two_meshes_behind_one_bridge_name_each_other_and_the_clock(place: Place) -> None:

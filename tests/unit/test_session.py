@@ -6,12 +6,13 @@ import socket
 import threading
 from typing import cast
 
+import psutil
 import pytest
 import zenoh
 
-from fmu_mesh.errors import ConfigurationError, MeshLost
+from fmu_mesh.errors import ConfigurationError, DeadlineExceeded, MeshLost
 from fmu_mesh.wire.client.mesh_client import key_expression
-from fmu_mesh.wire.session import Question, Wiring, ask, close_session, open_session
+from fmu_mesh.wire.session import Question, Wiring, ask, close_session, is_of_this_host, open_session
 from tests.helpers import DEADLINE_S
 
 
@@ -54,6 +55,46 @@ def test_a_question_that_nobody_wants_answered_any_more_ends() -> None:
     with pytest.raises(MeshLost, match="this process does not wait any more"):
         ask(session, Question("nobody/there", "nobody", 10 * DEADLINE_S), lambda: True)
 
+    close_session(session)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "here"),
+    [
+        ("unixsock-stream//run/fmu_mesh/a.sock", True),
+        ("tcp/127.0.0.1:7447", True),
+        ("tls/localhost:7447?rel=1#iface=lo", True),
+        ("udp/127.1.2.3:7447", True),
+        ("tcp/192.0.2.1:7447", False),  # an address for documentation
+        ("tcp/[2001:db8::1]:7447", False),
+        (f"tcp/{64 * 'x'}:7447", False),  # too long for a name
+    ],
+)
+def test_an_endpoint_is_of_this_host_or_of_another(endpoint: str, here: bool) -> None:  # noqa: FBT001  a parameter
+    assert is_of_this_host(endpoint) is here
+
+
+def test_all_addresses_of_the_interfaces_are_of_this_host() -> None:
+    own = [one.address for several in psutil.net_if_addrs().values() for one in several if one.family == socket.AF_INET]
+
+    assert [address for address in own if not is_of_this_host(f"tcp/{address}:7447")] == []
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_question_that_is_sent_once_is_not_repeated(once: bool) -> None:  # noqa: FBT001  a parameter of the test
+    session, asked = open_session(Wiring()), threading.Semaphore(0)
+
+    def answer_nothing(query: zenoh.Query) -> None:
+        asked.release()
+        query.drop()
+
+    queryable = session.declare_queryable("somebody/there", answer_nothing)
+    with pytest.raises(DeadlineExceeded):
+        ask(session, Question("somebody/there", "somebody", 0.5, once=once))
+
+    assert asked.acquire(timeout=DEADLINE_S)
+    assert asked.acquire(blocking=False) is not once
+    queryable.undeclare()
     close_session(session)
 
 

@@ -8,7 +8,7 @@ import msgspec
 
 from ...pictures.tables import pairs, table
 from ...simtime import ENDLESS
-from ...text import short_number
+from ...text import listed, short_number
 from ...wire.client.readings import Reading
 from ...wire.views import ConnectionView, InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView, VariableView
 
@@ -70,9 +70,24 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
                 for view in ros
                 for topic, count in view.ignored.items()
             ),
+            *(
+                ("ROS", f"{words} {listed(names)}")
+                for view in ros
+                for words, which in _MATCHED.items()
+                if view.connected
+                and (names := [own.topic for own in view.topics if (own.direction, own.matched) == which])
+            ),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
+
+
+_MATCHED = {
+    "somebody subscribes to": ("out", True),
+    "nobody subscribes to": ("out", False),
+    "somebody publishes": ("in", True),
+    "nobody publishes": ("in", False),
+}
 
 
 def instance_status(status: InstanceStatus) -> list[str]:

@@ -27,7 +27,7 @@ from __future__ import annotations
 import logging
 import queue
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
@@ -49,7 +49,7 @@ from ..messages.cdr import CdrError, Codec
 from ..messages.definitions import CLOCK
 from ..messages.stamp import to_stamp
 from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
-from .profile import Profile, Put, Ros2Dds
+from .profile import Profile, Put, Ros2Dds, ZenohProfile
 from .rmw_zenoh import ParameterServices, RmwZenoh
 from .simulation_services import SimulationServices
 
@@ -68,9 +68,9 @@ Event = Callable[[], None]
 @contextmanager
 def open_profiles(
     section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys
-) -> Iterator[dict[str, Profile]]:
+) -> Iterator[dict[str, ZenohProfile]]:
     """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the services."""
-    profiles: dict[str, Profile] = {}
+    profiles: dict[str, ZenohProfile] = {}
     with ExitStack() as stack:
         for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
             profile = RmwZenoh(ros, plan, section.domain) if name == "rmw_zenoh" else Ros2Dds(ros, plan.types)
@@ -96,7 +96,7 @@ class Gateway:
     """
 
     def __init__(
-        self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: dict[str, Profile]
+        self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: Mapping[str, Profile]
     ) -> None:
         self.ignored: dict[str, int] = {}
         self._plan = plan

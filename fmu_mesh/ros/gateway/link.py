@@ -1,12 +1,13 @@
 """The link of a gateway to ROS: whether a bridge or router is there, and who else publishes `/clock`.
 
 Owns a thread that watches the link, warns of each change once, and keeps the answer to `…/mesh/ros`. Nothing waits for
-this thread. A router does not pass tokens on between peers, and the gateway is a peer. So a second session, a client,
+this thread. A router does not pass tokens on between peers. So where the gateway is a peer, a second session, a client,
 is opened as soon as the router answers, to see the tokens of others.
 """
 
 # Threads: `ros-link` looks at the link four times a second and writes `_view`; Zenoh calls `_token_changed` and
-# `_answer` on threads of its own, which take the lock of the tokens or read `_view`. Nobody waits for `ros-link` but
+# `_answer` on threads of its own, which take the lock of the tokens, read `_view`, and ask publishers of the other
+# session whether they match: only then is it looked at each topic. Nobody waits for `ros-link` but
 # `close`, at most 3 s: to open a session may take long where nobody answers (ADR 0030).
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import socket
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import msgspec
 import zenoh
@@ -25,26 +27,54 @@ from msgspec.structs import replace
 from ...config.mesh import RosConfig
 from ...errors import FmuMeshError
 from ...wire.keys import Keys, escape, unescape
-from ...wire.session import Wiring, close_session, open_session, undeclare_all
+from ...wire.session import Wiring, close_session, is_of_this_host, open_session, undeclare_all
 from ...wire.values import json_encoding
 from ...wire.views import RosView
+from .profile import ZenohProfile, topic_in
 
-__all__ = ["RosLink", "two_clocks"]
+__all__ = ["RosLink", "open_ros", "two_clocks"]
 
 log = logging.getLogger(__name__)
 
 _INTERVAL_S = 0.25
 _PATIENCE_S = 3.0
 _OPEN_S = 1.0
+_OWN_S = 20.0
+"""How long it may take to reach another session of this process."""
 # Longer than one look at the link, which may wait for a bridge that does not answer.
 _WATCH_END_S = 3.0
 _MAX_WARNINGS = 20
 
 _BRIDGES = "@/*/@ros2_lv"
-_BRIDGED_CLOCKS = "@/*/@ros2_lv/MP/clock/**"
+_BRIDGED = "@/*/@ros2_lv/MP/**"
+_CLOCK_TOPICS = ("clock", "%clock")
 _GATEWAYS = "@/*/@fmu_mesh/*/*/*"
 
 _WHO = {"ros2dds": ("the bridge", "zenoh-bridge-ros2dds"), "rmw_zenoh": ("the router", "rmw_zenohd")}
+
+
+def open_ros(section: RosConfig, folder: Path) -> tuple[bool, zenoh.Session]:
+    """Whether the gateway is a peer in the network of ROS, and its session there; ``folder`` is that of the run.
+
+    A router of ROS introduces peers to each other, and forwards nothing between them. On one host, nodes have ports to
+    which this process connects, so it is a peer, which is faster (a port of its own would be open to every user). Those
+    of another host cannot be reached like this, and their router forwards to clients. A client has one link, to the
+    first endpoint that answers. So with several bridges the gateway stays a peer: topics end there, in DDS.
+    """
+    endpoints = tuple(section.connect)
+    are_bridges = section.profile == "ros2dds" and len(endpoints) > 1
+    if section.listen or are_bridges or all(map(is_of_this_host, endpoints)):
+        return True, open_session(Wiring(listen=tuple(section.listen), connect=endpoints, gossip=True))
+    client = Wiring(mode="client", connect=endpoints, patience_s=_OPEN_S)
+    try:
+        return False, open_session(client)
+    except FmuMeshError:  # nobody answers, which `RosLink` reports
+        # Zenoh opens no client without a router, but a client that loses its router connects again to any endpoint.
+        at = f"unixsock-stream/{folder}/ros.sock"
+        router = open_session(Wiring(mode="router", listen=(at,)))
+        session = open_session(replace(client, connect=(at, *endpoints), patience_s=_OWN_S))
+        router.close()
+        return False, session
 
 
 def two_clocks(other: str, setting: str) -> str:
@@ -58,8 +88,20 @@ def two_clocks(other: str, setting: str) -> str:
 class RosLink:
     """Watches the link of one gateway. Call `open` first and `close` last. The caller closes both sessions."""
 
-    def __init__(self, section: RosConfig, ros: zenoh.Session, mesh: zenoh.Session, keys: Keys, *, clock: bool) -> None:
+    def __init__(  # noqa: PLR0913  one gateway and its surroundings
+        self,
+        section: RosConfig,
+        ros: zenoh.Session,
+        mesh: zenoh.Session,
+        keys: Keys,
+        profiles: Mapping[str, ZenohProfile],
+        *,
+        clock: bool,
+        as_peer: bool,
+    ) -> None:
         self._section = section
+        self._profiles = profiles
+        self._as_peer = as_peer
         self._ros = ros
         self._mesh = mesh
         self._keys = keys
@@ -101,7 +143,11 @@ class RosLink:
             close_session(self._client)
 
     def _answer(self, key: str, query: zenoh.Query, ignored: Mapping[str, int]) -> None:
-        view = replace(self._view, ignored=dict(ignored))
+        with self._changed:
+            tokens = sorted(self._tokens)
+        others = [token for token in tokens if "/MP/" in token and f"/{self._ros.zid()}/" not in token]
+        topics = tuple(topic for profile in self._profiles.values() for topic in profile.topics(others))
+        view = replace(self._view, topics=topics, ignored=dict(ignored))
         query.reply(key, msgspec.json.encode(view), encoding=json_encoding)
         query.drop()
 
@@ -129,8 +175,8 @@ class RosLink:
         return any(True for zids in (self._ros.info.routers_zid(), self._ros.info.peers_zid()) for _ in zids)
 
     def _watch_tokens(self) -> None:
-        session = self._ros  # sees all tokens if others connect to this gateway directly
-        if self._section.connect:
+        session = self._ros  # sees all tokens as a client, or if others connect to this gateway directly
+        if self._as_peer and self._section.connect:
             try:
                 wiring = Wiring(mode="client", connect=tuple(self._section.connect), patience_s=_OPEN_S)
                 session = self._client = open_session(wiring)
@@ -138,7 +184,7 @@ class RosLink:
                 return
         self._watches_tokens = True
         # In this order, the name of a gateway arrives before the topics that it publishes.
-        for key in (_GATEWAYS, _BRIDGES, _BRIDGED_CLOCKS, f"@ros2_lv/{self._section.domain}/*/*/*/MP/*/*/*/%clock/**"):
+        for key in (_GATEWAYS, _BRIDGES, _BRIDGED, f"@ros2_lv/{self._section.domain}/*/*/*/MP/**"):
             self._entities.append(session.liveliness().declare_subscriber(key, self._token_changed, history=True))
 
     def _token_changed(self, sample: zenoh.Sample) -> None:
@@ -200,7 +246,7 @@ class RosLink:
         with self._changed:
             keys = sorted(self._tokens)
         names = {key.split("/")[1]: key.split("/")[3:] for key in keys if "/@fmu_mesh/" in key}
-        clocks = [key.split("/") for key in keys if "/MP/" in key]
+        clocks = [key.split("/") for key in keys if "/MP/" in key and topic_in(key)[0] in _CLOCK_TOPICS]
         own = str(self._ros.zid())
         return tuple(
             _described(chunks, names.get(zid))

@@ -8,16 +8,17 @@ contain the type hash, as in ROS since Iron.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
 import zenoh
 
-from ...wire.session import undeclare_all
+from ...wire.session import matches, undeclare_all
+from ...wire.views import RosTopicView
 from ..messages.definitions import MessageTypes
 from ..messages.topics import Reliability, Topic
 
-__all__ = ["DEPTH", "Profile", "Put", "Ros2Dds", "Take", "ZenohProfile"]
+__all__ = ["DEPTH", "Profile", "Put", "Ros2Dds", "Take", "ZenohProfile", "topic_in"]
 
 Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
@@ -51,7 +52,8 @@ class ZenohProfile:
         self._session = session
         self._types = types
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._publishers: list[zenoh.Publisher] = []
+        self._publishers: list[tuple[str, zenoh.Publisher]] = []
+        self._subscribed: list[tuple[str, str]] = []
         self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
 
     def publish(self, topic: Topic) -> Put:
@@ -63,7 +65,7 @@ class ZenohProfile:
             encoding=zenoh.Encoding.APPLICATION_CDR,
             congestion_control=control.BLOCK if topic.reliability == "reliable" else control.DROP,
         )
-        self._publishers.append(publisher)
+        self._publishers.append((topic.name, publisher))
         attached = self._attached(self._announce("MP", topic.name, topic.message, topic.reliability))
         return lambda data, time: publisher.put(data, attachment=attached(time))
 
@@ -71,11 +73,19 @@ class ZenohProfile:
         """Declare a subscriber of ``topic``."""
         key = self._key(topic.name, topic.message)
         self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
-        self._announce("MS", topic.name, topic.message, topic.reliability)
+        self._subscribed.append((topic.name, self._announce("MS", topic.name, topic.message, topic.reliability)))
 
     def close(self) -> None:
         """Undeclare everything, tokens first."""
-        undeclare_all(self._tokens, self._publishers, self._others)
+        undeclare_all(self._tokens, (own for _, own in self._publishers), self._others)
+
+    def topics(self, tokens: Iterable[str]) -> Iterator[RosTopicView]:
+        """All topics; ``tokens`` are those of publishers of others."""
+        published = {topic_in(token) for token in tokens}
+        for name, publisher in self._publishers:
+            yield RosTopicView(name, "out", matches(publisher))
+        for name, token in self._subscribed:
+            yield RosTopicView(name, "in", topic_in(token) in published)
 
     def _key(self, name: str, message: str) -> str:
         """The key of a topic or a service."""
@@ -94,6 +104,12 @@ class ZenohProfile:
     def _attached(self, token: str) -> Callable[[float], bytes | None]:  # noqa: ARG002  another profile needs it
         """What goes with a sample of a publisher with this token at a time in s."""
         return lambda _time: None
+
+
+def topic_in(token: str) -> tuple[str, ...]:
+    """Name, type and hash in the token of a publisher or a subscriber; in that of a bridge, name and type."""
+    chunks = token.split("/")
+    return tuple(chunks[4:6] if chunks[0] == "@" else chunks[9:12])
 
 
 class Ros2Dds(ZenohProfile):

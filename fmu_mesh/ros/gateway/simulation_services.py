@@ -24,7 +24,6 @@ from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import FmuMeshError
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Reading, Target
-from ...wire.client.waiting import rest
 from ...wire.keys import Keys
 from ...wire.views import Command
 from ..messages.cdr import Codec, Message
@@ -87,7 +86,6 @@ class SimulationServices:
         self._action = action
         self._closed = threading.Event()
         self._client = MeshClient(mesh, keys, (), _ANSWER_S, self._closed.is_set)
-        self._stepping_client = MeshClient(mesh, keys, (), _LONGEST_STEP_S, self._closed.is_set)
         self._stepping = threading.Lock()
         self._is_stopped = False
         self._known: dict[str, list[Target]] | None = None
@@ -172,7 +170,7 @@ class SimulationServices:
                 self._client.command(Command("resume"))
             case SimulationStates.PAUSED:
                 if now != SimulationStates.STOPPED:  # otherwise it rests at its first point
-                    rest(self._client, Command("pause"))
+                    self._client.rest(Command("pause"))
             case SimulationStates.STOPPED:
                 self._begin_again(pause=now == SimulationStates.PLAYING)
             case SimulationStates.QUITTING:
@@ -188,7 +186,7 @@ class SimulationServices:
             raise _Refusal(ResultCode.OPERATION_FAILED, text)
         try:
             if request["steps"]:
-                rest(self._stepping_client, Command("step", request["steps"], paced=self._section.paced))
+                self._client.rest(Command("step", request["steps"], paced=self._section.paced), _LONGEST_STEP_S)
         finally:
             self._stepping.release()
         return {}
@@ -204,7 +202,7 @@ class SimulationServices:
         if _RESET is None:
             raise _Refusal(ResultCode.FEATURE_UNSUPPORTED, "this mesh cannot be reset")
         if pause:
-            rest(self._client, Command("pause"))
+            self._client.rest(Command("pause"))
         _RESET(self._client)
 
     # --- the bodies of worlds

@@ -23,8 +23,9 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 import zenoh
+from msgspec.structs import replace
 
-from ...errors import ConfigurationError, DeadlineExceeded, MeshLost, MessageRefused
+from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
 from ...text import did_you_mean, is_pattern, listed, matching, shown
 from ..keys import SUBSCRIBED, Keys
 from ..messages import decode_json
@@ -50,6 +51,8 @@ View = TypeVar("View")
 
 # How often a wait for the mesh asks whether it has ended meanwhile; there is no event for both.
 _END_CHECK_S = 0.05
+_ANSWER_S = 0.25
+"""So long before the deadline of `rest`, the mesh says what it still waits for."""
 
 
 class MeshClient:
@@ -199,7 +202,7 @@ class MeshClient:
             key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
             # An answer may be lost where this process reads too slowly; it is asked for again.
             for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
-                for sample in self._ask(asked, f"the values of instance '{instance}'"):
+                for sample in self._ask(Question(asked, f"the values of instance '{instance}'", self._timeout_s)):
                     if (reading := reading_among(own, sample)) is not None:
                         readings[reading.key] = reading
         return [readings[target.key] for target in targets if target.key in readings]
@@ -216,23 +219,41 @@ class MeshClient:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
         return self._view(target.key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
 
-    def command(self, command: Command) -> CommandAnswer:
+    def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
-        payload = msgspec.json.encode(command)
-        return self._view(self.keys.mesh_key("command"), CommandAnswer, self._who, payload)
+        key, payload = self.keys.mesh_key("command"), msgspec.json.encode(command)
+        question = Question(key, self._who, timeout_s or self._timeout_s, payload, once=True)
+        return _understood(self._ask(question)[0], CommandAnswer, self._who)
+
+    def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
+        """Pause or step the mesh; the answer comes when it has paused, and has the point at which it has.
+
+        Raises:
+            FmuMeshError: it does not come to this point, or not in ``timeout_s``, by default the deadline of a query.
+        """
+        timeout_s = timeout_s if timeout_s is not None else self._timeout_s
+        answer = self.command(replace(command, wait=max(timeout_s - _ANSWER_S, timeout_s / 2)), timeout_s)
+        if answer.error is not None:
+            raise from_report(answer.error)
+        return answer
 
     @contextmanager
     def statuses(self, timeout_s: float | None = None) -> Iterator[Iterator[MeshStatus]]:
-        """Every status of the mesh from now on, ten times a second, to the last one; none if the mesh is gone already.
+        """The status of the mesh and every later one to the last; none if the mesh is gone already.
 
-        After ``timeout_s`` seconds (by default the deadline of a query) the iterator raises `DeadlineExceeded`.
+        They come ten times a second, and at once with another state or when the mesh has come to rest. After
+        ``timeout_s`` seconds (by default the deadline of a query) the iterator raises `DeadlineExceeded`.
         """
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         deadline = time.monotonic() + timeout_s
         with Follower[MeshStatus](self.session, self.keys) as follower:
             follower.subscribe({self.keys.mesh_key("status")}, partial(_decoded, kind=MeshStatus))
             there = self._is_there(follower, min(timeout_s, self._timeout_s))
-            yield follower.to_the_last(deadline) if there else iter(())
+            now = []
+            if there:
+                with suppress(FmuMeshError):  # it has just ended, and its last status has come
+                    now.append(self.status())
+            yield chain(now, follower.to_the_last(deadline)) if there else iter(())
 
     @contextmanager
     def watch(self, targets: Sequence[Target]) -> Iterator[Iterator[Reading]]:
@@ -340,15 +361,13 @@ class MeshClient:
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
     ) -> View:
-        return _understood(self._ask(key, who, payload, attachment)[0], kind, who)
+        return _understood(self._ask(Question(key, who, self._timeout_s, payload, attachment))[0], kind, who)
 
-    def _ask(
-        self, key: str, who: str, payload: bytes | None = None, attachment: bytes | None = None
-    ) -> list[zenoh.Sample]:
+    def _ask(self, question: Question) -> list[zenoh.Sample]:
         try:
-            return answers(self.session, Question(key, who, self._timeout_s, payload, attachment), self._is_over)
+            return answers(self.session, question, self._is_over)
         except DeadlineExceeded:
-            text = f"no answer from {who} within {self._timeout_s:g} s."
+            text = f"no answer from {question.whom} within {question.deadline_s:g} s."
             raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
         except MeshLost as error:
             self._is_over()

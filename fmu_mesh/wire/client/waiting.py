@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Final
 
-from msgspec.structs import replace
-
 from ...errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
 from ..messages import SetValue
-from ..views import Command, CommandAnswer, MeshState, MeshStatus
+from ..views import Command, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .readings import Target
 
-__all__ = ["go_on", "paused_at", "replay", "rest", "wait_for", "wait_for_start", "wait_until_at"]
+__all__ = ["go_on", "paused_at", "replay", "wait_for", "wait_for_start", "wait_until_at"]
 
 _START_S: Final = 120.0
 
@@ -37,31 +35,6 @@ _GOES_AND_RESTS: Final = 2
 """Running and paused have the same rank: a mesh can change from each of them to the other."""
 # How long an instance may stay at one point before it has come to the next value of a replay.
 _NEXT_VALUE_S: Final = 60.0
-
-
-def rest(client: MeshClient, command: Command) -> CommandAnswer:
-    """Pause or step a mesh; return when it has paused, with the point at which it has.
-
-    Raises:
-        ConfigurationError: it refused.
-        MeshLost: it ended or was resumed before, or did not pause in time.
-        FmuMeshError: it has failed before.
-    """
-    mesh, what, last = client.keys.mesh, "come to rest", None
-    with client.statuses() as statuses:  # before the command, so that the last status of a short run is not missed
-        answer, holds = client.command(command), False
-        try:
-            for last in statuses:
-                holds = holds or last.state == "paused"
-                if last.state in ("stopping", "done", "failed") or (holds and last.state != "paused"):
-                    raise _ended(last, what)
-                if holds and (answer.hold is None or last.point >= answer.hold):
-                    return replace(answer, point=last.point)
-        except DeadlineExceeded:
-            at = (last or answer).point
-            text = f"mesh '{mesh}' is at point {at}, on its way to point {answer.hold}, where it is going to rest."
-            raise DeadlineExceeded(text, hint="A larger `timeout=...` waits longer.") from None
-    raise _gone(mesh, what)
 
 
 def paused_at(client: MeshClient, command: Command) -> int:
@@ -184,4 +157,4 @@ def replay(client: MeshClient, values: Sequence[SetValue], last_point: int | Non
     if last_point is None:
         client.command(Command("resume"))
         return
-    rest(client, Command("step", last_point - hold) if last_point > hold else Command("pause"))
+    client.rest(Command("step", last_point - hold) if last_point > hold else Command("pause"), _NEXT_VALUE_S)
