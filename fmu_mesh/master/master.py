@@ -238,7 +238,7 @@ class Master:
         self._look_at_streams(now)
         while True:
             paced = states.wanted
-            if states.takes_commands and states.paced:
+            if states.takes_commands:
                 paced, pause_s = self._pacer.limit(paced, states.granting.reached)
             stopped = self._members.stopped() if states.slowest_silent_s(now) > states.deadlines.step else ()
             actions = states.decide(now, paced, stopped)
@@ -290,8 +290,8 @@ class Master:
                 self._open_streams(ways)
                 entries = TIME_LINE_ENTRIES // len(self._states.plan.nodes) if self._watch is not None else 0
                 self._members.welcome(entries, ways)
-            case FollowClock(point):
-                self._pacer.start(point)
+            case FollowClock(point, paced):
+                self._pacer.start(point, paced=paced)
             case RaiseGrant(point):
                 self._memory.grant.raise_to(point)
             case RaiseSent(point):

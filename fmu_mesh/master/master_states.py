@@ -67,9 +67,10 @@ class AnswerAll(msgspec.Struct, frozen=True):
 
 
 class FollowClock(msgspec.Struct, frozen=True):
-    """The point is due now by the wall clock."""
+    """The point is due now by the wall clock, which does not limit the grant unless the run is ``paced``."""
 
     point: int
+    paced: bool = True
 
 
 class RaiseGrant(msgspec.Struct, frozen=True):
@@ -107,7 +108,6 @@ class MasterStates:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
         hold: the point at which all nodes pause.
-        paced: whether the wall clock limits the grant: not in a step that asks for it.
         reports: how nodes have ended, by name.
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
@@ -126,7 +126,6 @@ class MasterStates:
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
         self.hold = 0 if paused else None
-        self.paced = True
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -233,7 +232,6 @@ class MasterStates:
         """
         granting, before, rested = self.granting, self.hold, self.rests
         self.hold = point = granting.halt(claimed)
-        self.paced = command.paced
         self._actions.append(RaiseGrant(point))
         match command.command:
             case "pause":
@@ -245,7 +243,7 @@ class MasterStates:
             case "stop":
                 self._stop(point)
         if command.command in ("resume", "step"):
-            self._actions.append(FollowClock(granting.reached))
+            self._actions.append(FollowClock(granting.reached, command.paced))
         self._moved_at = self._slowest_moved_at = None
         if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
             self._sent_at = -math.inf

@@ -282,7 +282,7 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
     Attributes:
         points: for `step` only.
-        paced: for `step` only: whether the real-time factor limits it.
+        paced: for `step` and `resume`: whether the real-time factor limits what follows.
         wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests.
     """
 

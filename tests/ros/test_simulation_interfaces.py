@@ -176,15 +176,32 @@ def test_bodies_of_world_are_entities_with_pose_and_twist(
     assert simulator("SetEntityState", entity="world.cube").result.result == ResultCode.FEATURE_UNSUPPORTED
 
 
-def test_what_cannot_be_done_is_answered_as_unsupported(started: tuple[Simulator, Launched, Any]) -> None:
+def test_reset_begins_again_at_first_point_with_equal_values(started: tuple[Simulator, Launched, Any]) -> None:
     simulator, _launched, _peer = started
-    features = simulator("GetSimulatorFeatures").features.features
 
-    if SimulatorFeature.SIMULATION_RESET not in features:
+    def cube() -> tuple[int, float, float]:
+        state = simulator("GetEntityState", entity="world.cube").state
+        return state.header.stamp.nanosec, state.pose.position.x, state.twist.linear.x
+
+    assert simulator("ResetSimulation", scope=1).result.result == ResultCode.FEATURE_UNSUPPORTED, "the time alone"
+    if SimulatorFeature.SIMULATION_RESET not in simulator("GetSimulatorFeatures").features.features:
         assert simulator("ResetSimulation").result.result == ResultCode.FEATURE_UNSUPPORTED
         assert simulator.set(SimulationStates.STOPPED)[0] == ResultCode.FEATURE_UNSUPPORTED
-    assert simulator("ResetSimulation", scope=1).result.result == ResultCode.FEATURE_UNSUPPORTED
+        pytest.skip("this version of a mesh cannot be reset")
+    first = cube()
+    assert simulator("StepSimulation", steps=100).result.result == ResultCode.OK
+    moved = cube()
+    assert simulator("ResetSimulation").result.result == ResultCode.OK
     assert simulator.state == SimulationStates.PAUSED
+    assert cube() == first != moved
+    assert simulator("StepSimulation", steps=100).result.result == ResultCode.OK
+    assert cube() == moved
+    assert simulator.set(SimulationStates.PLAYING) == (ResultCode.OK, "")
+    assert simulator.set(SimulationStates.STOPPED) == (ResultCode.OK, "")
+    assert (simulator.state, cube()) == (SimulationStates.STOPPED, first)
+    assert simulator("StepSimulation").result.result == ResultCode.OPERATION_FAILED, "a stopped one is no paused one"
+    assert simulator.set(SimulationStates.PAUSED) == (ResultCode.OK, "")
+    assert (simulator.state, cube()) == (SimulationStates.PAUSED, first)
 
 
 @pytest.mark.parametrize("started", [{"factor": 1.0}], indirect=True)
@@ -198,6 +215,9 @@ def test_state_is_told_and_mesh_pauses_during_a_long_step(started: tuple[Simulat
 
     ros.until(long_step.done, "the end of the step")
     assert second.result == ResultCode.OPERATION_FAILED
+    ended = long_step.result().result
+    assert ended.result == ResultCode.OPERATION_FAILED
+    assert "before point 600000: another program controls it too" in ended.error_message
     assert simulator.state == SimulationStates.PAUSED
 
 
@@ -259,7 +279,12 @@ def test_services_on_keys_of_rmw_zenoh_answer_an_independent_client(place: Place
     port = free_port()
     router = place.start("router", "--listen", f"tcp/127.0.0.1:{port}")
     wait_until(lambda: router.output, "the router")
-    at = {"profile": "rmw_zenoh", "domain": 7, "connect": [f"tcp/127.0.0.1:{port}"], "namespace": "/lab"}
+    at: dict[str, Any] = {
+        "profile": "rmw_zenoh",
+        "domain": 7,
+        "connect": [f"tcp/127.0.0.1:{port}"],
+        "namespace": "/lab",
+    }
     config = configured(place, distribution="kilted", **at)
     launched = place.start("launch", config, "--paused", "--no-progress")
     services = ["GetSimulatorFeatures", "GetSimulationState", "SetSimulationState", "StepSimulation", "GetEntityState"]
