@@ -54,13 +54,14 @@ def configured(place: Place, *, factor: float = 0.0, stop_time: float = 1000.0, 
 class Simulator:
     """A client of each service of the mesh."""
 
-    def __init__(self, ros: Ros, peer: Any, namespace: str = "") -> None:  # noqa: ANN401 types of rclpy
+    def __init__(self, ros: Ros, node: Any, peer: Any) -> None:  # noqa: ANN401 types of rclpy
         import simulation_interfaces.srv as services  # noqa: PLC0415 only where it is built
 
+        self.node = node
         self._ros = ros
         self._services = services
         self._clients = {
-            kind: peer.create_client(getattr(services, kind), f"{namespace}/{name}")
+            kind: peer.create_client(getattr(services, kind), f"/{name}")
             for kind, name in {
                 "GetSimulatorFeatures": "get_simulator_features",
                 "GetSimulationState": "get_simulation_state",
@@ -106,7 +107,7 @@ def started(request: pytest.FixtureRequest, ros: Ros, place: Place) -> tuple[Sim
     place.note()
     node = ros.fmu(config=str(config))
     peer = ros.peer()
-    simulator = Simulator(ros, peer)
+    simulator = Simulator(ros, node, peer)
     ros.until(lambda: str(node.trigger_configure()).endswith("SUCCESS"), "the mesh")
     node.trigger_activate()
     ros.known_to("/fmi_adapter_node", peer)
@@ -219,6 +220,26 @@ def test_state_is_told_and_mesh_pauses_during_a_long_step(started: tuple[Simulat
     assert ended.result == ResultCode.OPERATION_FAILED
     assert "before point 600000: another program controls it too" in ended.error_message
     assert simulator.state == SimulationStates.PAUSED
+
+
+@pytest.mark.parametrize("started", [{"factor": 1.0}], indirect=True)
+def test_node_that_is_deactivated_answers_a_waiting_step_and_comes_back(
+    started: tuple[Simulator, Launched, Any], ros: Ros
+) -> None:
+    simulator, _launched, peer = started
+    services = [own.srv_name for own in simulator.node.services]
+    long_step = simulator.sent("StepSimulation", steps=600_000)
+    ros.until(lambda: simulator.state == SimulationStates.PLAYING, "the step")
+
+    simulator.node.trigger_deactivate()
+    ros.until(long_step.done, "its answer")
+    ros.until(lambda: len([*simulator.node.services]) == len(services) - len(SIMULATION_SERVICES), "no services")
+
+    assert long_step.result().result.result == ResultCode.OPERATION_FAILED
+    simulator.node.trigger_activate()
+    ros.known_to("/fmi_adapter_node", peer)
+    again = Simulator(ros, simulator.node, ros.peer("later"))
+    assert again.set(SimulationStates.PLAYING)[0] == ResultCode.OK
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from ...errors import FmuMeshError
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Reading, Target
 from ...wire.keys import Keys
-from ...wire.views import Command
+from ...wire.views import Command, MeshState
 from ..messages.cdr import Codec, Message
 from ..messages.definitions import MessageTypes
 from ..messages.ros_names import absolute, service_name
@@ -53,6 +53,12 @@ _LONGEST_STEP_S = 3600.0
 _LOOKS = 20
 _TIME_AND_STATE = 1 | 2
 """Bits of SCOPE_TIME and SCOPE_STATE; SCOPE_ALL has them, too, and SCOPE_DEFAULT is 0."""
+_STATES: dict[MeshState, SimulationStates] = {
+    "starting": SimulationStates.LOADING_WORLD,
+    "initializing": SimulationStates.LOADING_WORLD,
+    "running": SimulationStates.PLAYING,
+    "paused": SimulationStates.PLAYING,  # in a step
+}
 _VECTORS = {"position": "xyz", "orientation": "xyzw", "linear_velocity": "xyz", "angular_velocity": "xyz"}
 """What a body of a world has as outputs (`fmu_mesh.instances.world_variables`), in world axes."""
 
@@ -104,14 +110,11 @@ class SimulationServices:
     @contextmanager
     def served_by(self, node: RmwZenoh, namespace: str) -> Iterator[None]:
         """Offer the services of ``node`` within the context."""
-        with ServiceThreads("simulation", SIMULATION_THREADS) as threads:
+        with ServiceThreads("simulation", SIMULATION_THREADS) as threads, closing(self):
             for kind in SIMULATION_SERVICES:
                 answer = threads.service(partial(self.answer, kind))
                 node.serve(absolute(service_name(kind), namespace), f"simulation_interfaces/srv/{kind}", answer)
-            try:
-                yield
-            finally:
-                self.close()
+            yield
 
     def close(self) -> None:
         """Requests that wait for the mesh do not wait any more."""
@@ -148,18 +151,10 @@ class SimulationServices:
 
     def _state(self) -> SimulationStates:
         status = self._client.status()
-        match status.state:
-            case "starting" | "initializing":
-                return SimulationStates.LOADING_WORLD
-            case "running":
-                return SimulationStates.PLAYING
-            case "paused" if self._stepping.locked():
-                return SimulationStates.PLAYING
-            case "paused" if self._is_stopped and status.point == 0:  # another program may have let it run since
-                return SimulationStates.STOPPED
-            case "paused":
-                return SimulationStates.PAUSED
-        return SimulationStates.QUITTING
+        if status.state != "paused" or self._stepping.locked():
+            return _STATES.get(status.state, SimulationStates.QUITTING)
+        was_stopped = self._is_stopped and status.point == 0  # another program may have let it run since
+        return SimulationStates.STOPPED if was_stopped else SimulationStates.PAUSED
 
     def _set_state(self, request: Message) -> Message:
         target, now = request["state"]["state"], self._state()
