@@ -123,9 +123,11 @@ class SimulationServices:
     def answer(self, kind: str, request: Message) -> Message:
         """The response to a request of a service; a failure is its result. On any thread."""
         response = self.codecs[kind][1].empty()
-        code, text = ResultCode.OK, ""
+        code, text = ResultCode.OPERATION_FAILED, "the gateway to ROS ends"
         try:
-            response.update(self._answers[kind](request))
+            if not self._closed.is_set():
+                response.update(self._answers[kind](request))
+                code, text = ResultCode.OK, ""
         except _Refusal as refusal:
             code, text = refusal.code, str(refusal)
         except (FmuMeshError, zenoh.ZError) as error:  # Zenoh: the session is closed

@@ -86,6 +86,8 @@ class SimulationServer:
         return answer
 
     async def _answer(self, kind: str, request: Message) -> Message:
+        if self._closed:  # it came before the end of the services
+            return self._services.answer(kind, request)
         executor = self._node.executor
         future = ros_module("rclpy.task").Future(executor=executor)
         future.add_done_callback(lambda _done: None)
@@ -111,7 +113,7 @@ class SimulationServer:
                 goal.publish_feedback(action.Feedback(completed_steps=done, remaining_steps=steps - done))
         if done == steps:
             goal.succeed()
-        elif outcome["result"] == ResultCode.OK:
+        elif goal.is_cancel_requested:
             outcome = {"result": ResultCode.OPERATION_FAILED, "error_message": f"cancelled after {done} steps"}
             goal.canceled()
         else:
