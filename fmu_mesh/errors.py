@@ -19,7 +19,8 @@ FmuMeshError                     1   an internal error
 │   └── ProtocolBroken               a registered peer sent what the protocol forbids, such as a grant beyond the window
 ├── MessageRefused               1   a received message is malformed; it is counted, and the run goes on
 ├── Interrupted                130   a person or the parent process asked to end
-│   └── KeyboardInterrupted          Ctrl-C in a program; also a KeyboardInterrupt
+│   ├── KeyboardInterrupted          Ctrl-C in a program; also a KeyboardInterrupt
+│   └── RunReset                     a reset has ended the run, and the next one begins in the same processes
 └── TerminationRequested         0   an FMU asked to end the simulation: an orderly end, no failure
 ```
 
@@ -56,6 +57,7 @@ __all__ = [
     "NotFinite",
     "NotInOneProcess",
     "ProtocolBroken",
+    "RunReset",
     "StepFailed",
     "TerminationRequested",
     "UnknownName",
@@ -336,6 +338,10 @@ class Interrupted(FmuMeshError):
 
 class KeyboardInterrupted(Interrupted, KeyboardInterrupt):
     """Ctrl-C, or "interrupt kernel" in a notebook, has ended a run; names the last point."""
+
+
+class RunReset(Interrupted):
+    """A command has reset the mesh: this run ends at `point`, and the same processes begin the next one."""
 
 
 class TerminationRequested(FmuMeshError):

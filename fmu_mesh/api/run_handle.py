@@ -14,16 +14,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from ..config.call_options import checked, takes
+from ..config.plain_values import plain
 from ..errors import CallRefused, ConfigurationError, FmuMeshError, MeshLost, from_report
 from ..installing import importing
 from ..pictures.notebook_progress import ShownProgress, awaited, progress_of
 from ..ros.bags.play_options import PlayOptions
-from ..run.options import StartOptions
+from ..run.options import ResetOptions, StartOptions
 from ..text import shown
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
-from ..wire.client.waiting import replay, wait_for, wait_for_start
+from ..wire.client.waiting import begun_again, replay, wait_for, wait_for_start
 from ..wire.views import (
+    GOING_ON,
     Command,
     CommandAnswer,
     InstanceInfo,
@@ -370,6 +372,40 @@ class Run:
         """Go on after a pause."""
         return self._steered().command(Command("resume"))
 
+    @takes(ResetOptions)
+    def reset(self, options: ResetOptions) -> CommandAnswer:
+        """Begin again at point 0, in the same processes; returns when the mesh is there.
+
+        The run so far ends: its result is complete, is one of `results`, and the next one has its name with a number,
+        such as `rows-2.csv`. The instances are made anew, with the start values of the configuration and those that are
+        given here. Values that were `set` are gone, and so is the progress of the scenario. A mesh that was paused, or
+        was in a `step`, is paused at point 0; one that was running goes on.
+
+        Example:
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
+            ...     answer = run.step(10)
+            ...     run.reset(start_values={"pendulum.a": 0.5}).point
+            ...     answer, last = run.resume(), run.wait()
+            0
+            >>> [len(result.times) for result in run.results], len(last.times), float(last["pendulum.a"][0])
+            ([11], 51, 0.5)
+
+        Args:
+            options: see `ResetOptions`.
+
+        Raises:
+            ConfigurationError: a start value is wrong, or changes the size of an array. Nothing has changed.
+            DeadlineExceeded: the mesh does not begin in time.
+            FmuMeshError: an instance could not be made anew, and the run has failed.
+        """
+        return begun_again(self._steered(), Command("reset", start_values=plain(dict(options.start_values or {}))))
+
+    @property
+    def results(self) -> tuple[Result, ...]:
+        """The results of the runs that a `reset` has ended, in order; `wait` returns that of the last one."""
+        return tuple(self._own.results) if self._own is not None else ()
+
     def interrupt(self) -> None:
         """End a run that was started here, so that `wait` raises `Interrupted`; a second call waits for no process.
 
@@ -538,6 +574,8 @@ def _follow(client: MeshClient, future: Future[Result]) -> None:
         file, last = client.info().result_file, None
         with client.statuses(_FOREVER_S) as statuses:
             for status in statuses:
+                if last is not None and status.resets != last.resets and status.state in GOING_ON:
+                    file = client.info().result_file
                 last = status
         if last is not None and last.error is not None:
             future.set_exception(from_report(last.error))

@@ -16,6 +16,7 @@ import sys
 import threading
 from concurrent.futures import Future
 from contextlib import ExitStack
+from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING
 
@@ -33,12 +34,12 @@ from ..errors import (
 from ..printing import paragraph
 from ..results.arrays_file import bytes_of_a_row
 from ..results.formats import read_result
-from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status
+from ..run.events import Event, Log, OutputLine, Reachable, Restarted, Status, WasReset
 from ..run.launcher import Launcher
 from ..run.options import StartOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
-from ..run.run_plan import RunPlan
+from ..run.run_plan import RunPlan, numbered
 from ..simtime import ENDLESS
 from ..wire.client.mesh_client import MeshClient
 from ..wire.keys import Keys
@@ -68,6 +69,7 @@ class RunThread:
         self.plan = plan
         self.future: Future[Result] = Future()  # gets the result, or the error with which the run ended
         self.status: MeshStatus | None = None  # the last one
+        self.results: list[Result] = []  # of the runs that a reset has ended
         self.reached = threading.Event()  # `endpoints` are known, or the run is over
         self.endpoints: tuple[str, ...] = ()  # of Zenoh; empty in this process
         self._settings = settings
@@ -190,7 +192,7 @@ class RunThread:
             try:
                 return self._result(self._run_once(plan))
             except FmuMeshError as error:
-                if type(error) is not MeshLost or plan.restarts == most or self._failure is not None:
+                if type(error) is not MeshLost or plan.restarts == most or self._failure is not None or self.results:
                     return self._ended_early(error)
                 plan = replace(plan, restarts=plan.restarts + 1)
                 self._take(Restarted(error.report(), plan.restarts, most))
@@ -227,6 +229,8 @@ class RunThread:
             case Status(status):
                 self.status = status
                 self._watch_memory()
+            case WasReset(outcome):
+                self.results.append(self._read(outcome))
         on_event, on_progress = self._settings.on_event, self._settings.on_progress
         if on_event is None:
             _log(event)
@@ -245,7 +249,8 @@ class RunThread:
             self._runner.interrupt()
 
     def _watch_memory(self) -> None:
-        file, limit = self._memory, self._settings.memory_limit
+        limit = self._settings.memory_limit
+        file = numbered(self._memory, len(self.results)) if self._memory is not None else None
         if file is None or not file.exists():
             return
         size = file.stat().st_size
@@ -261,14 +266,17 @@ class RunThread:
             rate = outcome.point / outcome.seconds if outcome.seconds > 0.0 else 0.0
             ended = outcome.point, grid.last_point, outcome.time, rate, rate * grid.step_size
             self.status = MeshStatus(self.plan.mesh, outcome.state, *ended, progress, outcome.error)
-        if self._memory is None or outcome is None:
+        return self._read(outcome)
+
+    def _read(self, outcome: Outcome | None) -> Result:
+        if self._memory is None or outcome is None or outcome.file is None:
             return result_of(self.plan, outcome)
         types = types_of(self.plan.plan.system) or {}
         return Result(
             self.plan.mesh,
             outcome=replace(outcome, file=None, files=()),
             system=self.plan.plan.system,
-            columns=read_result(self._memory, types),
+            columns=read_result(Path(outcome.file), types),
         )
 
 

@@ -56,6 +56,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
     "pause": ("mesh", "steering", "pause a mesh at a point"),
     "resume": ("mesh", "steering", "resume a paused mesh"),
     "step": ("mesh", "steering", "run a mesh for some points and pause it again"),
+    "reset": ("mesh", "steering", "begin again at the first point, in the same processes"),
     "stop": ("mesh", "steering", "end the run of a mesh"),
     "rerun": ("run", "running", "run again what a result file has recorded"),
     "play": ("mesh", "steering", "play a recorded bag into the inputs of a mesh"),

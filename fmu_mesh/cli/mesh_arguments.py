@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final, get_args
 
 from ..ros.bags.play_options import PlayOptions
+from ..run.options import ResetOptions
 from ..wire.views import MeshState
 from .arguments import (
     QUIET,
@@ -110,6 +111,7 @@ PARSERS: Parsers = {
     ),
     **dict.fromkeys(("pause", "resume", "stop"), _COMMAND),
     "step": (*_COMMAND, argument("points", "N", "points (1)", nargs="?")),
+    "reset": (*_COMMAND, options("start_values", of=ResetOptions)),
     "wait": (
         *reaching(_PATIENCE_S),
         json_switch("JSON, as `status` prints it"),

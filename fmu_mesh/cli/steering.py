@@ -1,4 +1,4 @@
-"""`pause`, `resume`, `step`, `stop`, `wait`, `logs` and `play`: a running mesh is steered, waited for and heard."""
+"""`pause`, `resume`, `step`, `reset`, `stop`, `wait`, `logs`, `play`: a running mesh is steered and heard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import ConfigurationError, Interrupted
 from ..ros.bags.play_options import PlayOptions
+from ..run.options import ResetOptions
 from ..text import did_you_mean, listed
+from ..wire.views import CommandAnswer
 from .arguments import Runs, whole
 from .mesh_arguments import LEVELS
 from .output.json_output import print_json
@@ -32,7 +34,13 @@ def _command(arguments: argparse.Namespace) -> int:
     if number < 1:
         raise ConfigurationError(f"N: '{points}' is not a whole number of 1 or more")
     with attach(name, connect=arguments.connect, timeout=arguments.timeout) as run:
-        answer = run.step(number) if arguments.command == "step" else _COMMANDS[arguments.command](run)
+        match arguments.command:
+            case "step":
+                answer: CommandAnswer | None = run.step(number)
+            case "reset":
+                answer = run.reset(**given_options(arguments, ResetOptions))
+            case other:
+                answer = _COMMANDS[other](run)
     assert answer is not None  # that of a mesh that was found
     if arguments.json:
         print_json(answer)
@@ -107,5 +115,5 @@ RUNS: Runs = {
     "wait": _wait,
     "logs": _logs,
     "play": _play,
-    **dict.fromkeys(("pause", "resume", "step", "stop"), _command),
+    **dict.fromkeys(("pause", "resume", "step", "reset", "stop"), _command),
 }

@@ -223,7 +223,8 @@ class MeshFollower:
             before, catalogue = self._view, _catalogue_of(info.mesh, infos)
             self._stop_sampling()  # or that of the run before would add values to the curves of this one
             with self._lock:
-                if before.info is None or before.info.run != info.run:
+                same = before.status is None or before.status.resets == run.status.resets
+                if before.info is None or before.info.run != info.run or not same:
                     self._curves.clear()
                     self._log.clear()
                     before = MeshView(self._key, run=before.run + 1)
@@ -241,7 +242,8 @@ class MeshFollower:
                 run.wait(0.0)  # from now on the handle knows how the run ends
             try:
                 while not (ended.is_set() or self._closing.is_set()):
-                    self._look(run)
+                    if not self._look(run):
+                        return
                     ended.wait(_STATUS_S)
             finally:
                 if not self._closing.is_set():
@@ -263,16 +265,20 @@ class MeshFollower:
             self._sampler.join()
             self._next_run.clear()
 
-    def _look(self, run: Run) -> None:
+    def _look(self, run: Run) -> bool:
+        """Look at all states; False: the mesh was reset, so that it is to be followed anew."""
         try:
             status, instances = run.all_status()
         except FmuMeshError as error:
             self._change(trouble=str(error))
-            return
+            return True
         before = self._view
+        if before.status is not None and before.status.resets != status.resets:
+            return False
         # Rates are those of about a second: in a shorter time an instance may take no step at all.
         old = before.instances if _is_a_second(before.before, before.instances) else before.before
         self._change(status=status, instances=instances, before=old, trouble=None)
+        return True
 
     def _change(self, **fields: object) -> None:
         with self._lock:

@@ -24,6 +24,9 @@ does not share this memory gets grants and reports its progress by messages.
 #     lost node first checks the router, and names it.
 #   - Two masters of one mesh are started. The later one sees the token of the other and ends; of two at the same time,
 #     both may end. Nobody disturbs the run of another: all keys of a run have its id.
+#   - A reset ends a run as a failure does, but for the next one the same nodes register again: all that belongs to one
+#     run is made anew, and nothing of the old one can reach the new one (ADR 75). Meanwhile this thread runs nothing of
+#     what was posted: a node that registers early would meet the old run.
 #   - A reader of the last samples (a gateway to ROS) gets them through this process, so the master waits for it after
 #     the end of the nodes.
 
@@ -33,10 +36,11 @@ import logging
 import math
 import os
 import socket
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 
 import msgspec
 import zenoh
+from msgspec.structs import replace
 
 from .. import __version__
 from ..awake import AwakeClock
@@ -47,20 +51,22 @@ from ..errors import (
     MeshLost,
     MessageRefused,
     NotFinite,
+    RunReset,
     TerminationRequested,
 )
 from ..rings.host_memory import HostMemory, can_share
 from ..system.memory_map import STREAMS
 from ..system.plan import MASTER, RECORDER, Plan
 from ..system.round_trip import round_trip_cost
+from ..variables.value_types import PlainValue
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys
 from ..wire.meeting import Meeting
-from ..wire.messages import FINISH, PROGRESS, NodeReport, decode_json, sealed
+from ..wire.messages import FINISH, PROGRESS, NewStart, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
 from ..wire.router_link import RouterLink
 from ..wire.runtime import this_host
-from ..wire.session import tokens
+from ..wire.session import tokens, undeclare_all
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
@@ -68,12 +74,12 @@ from ..wire.ways import Ways
 from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
 from .master_streams import MasterStreams
 from .members import Followers, Members
-from .mesh_server import STATUS_S, Events, MasterServer
+from .mesh_server import STATUS_S, Events, MasterServer, MasterSettings
 from .pacing import GrantWatch, Pacer, RunClock
 from .registrations import spoken
 from .resting import Resting
 
-__all__ = ["Master", "MasterSettings"]
+__all__ = ["Master"]
 
 log = logging.getLogger(__name__)
 
@@ -84,33 +90,20 @@ _LAST_WORDS_S = 1.0
 """For how long a run that fails waits until its nodes have left: what they said before comes in this time."""
 
 
-class MasterSettings(msgspec.Struct, frozen=True):
-    """How a master runs its mesh, besides the plan.
-
-    Attributes:
-        endpoints: where tools can reach this process, for `mesh/info`.
-        config_file: name of the configuration file, for `mesh/info`.
-        launch: the launcher that started this process; None if it was started manually.
-        profile: whether nodes measure their time, and the master what limits the grant.
-        paused: whether the run begins paused at its first point.
-    """
-
-    endpoints: tuple[str, ...] = ()
-    config_file: str = ""
-    launch: str | None = None
-    profile: bool = False
-    paused: bool = False
+Replan = Callable[[Mapping[str, PlainValue], int], Plan]
 
 
 class Master:
-    """The master of one run.
+    """The master of one mesh: of one run, and of those that follow a reset.
 
     Args:
         session: the session of this process; the caller closes it.
+        replan: returns the plan of the first run with other start values, after this number of resets.
         router: the link to the router that connects the nodes, if there is one.
         meeting: where it meets nodes for row streams; the caller closes it.
 
-    Call `claim`, then `run` once, from the main thread, then `wait_for_followers` if it went well, then `close`.
+    Call `claim`, then `run`, from the main thread; as long as it raises `RunReset`, `begin_again` and `run` again; then
+    `wait_for_followers` if it went well, then `close`.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one run and its surroundings
@@ -119,36 +112,48 @@ class Master:
         session: zenoh.Session,
         events: Events,
         settings: MasterSettings,
+        replan: Replan,
         router: RouterLink | None = None,
         meeting: Meeting | None = None,
     ) -> None:
-        config = plan.system.config
         self._session = session
         self._settings = settings
-        self._keys = Keys(config.zenoh.key_prefix, config.mesh)
-        self._run_keys = RunKeys.new(self._keys)
+        self._keys = Keys(plan.system.config.zenoh.key_prefix, plan.system.config.mesh)
         self._router = router or RouterLink(session)
+        self._first_plan = plan
+        self._replan = replan
+        self._resets, self._start = 0, NewStart(0, plan.digest, {})
         self._states = MasterStates(plan, paused=settings.paused)
-        self._pacer = Pacer(plan, config.simulation.real_time_factor)
+        self._memory = self._made_memory()
+        self._inbox = Inbox(self._memory)
+        self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
+        self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
+        self._token: zenoh.LivelinessToken | None = None
+        self._prepare(meeting)
+        self._first_keys = self._run_keys
+
+    def _made_memory(self) -> HostMemory:
+        memory_of = HostMemory.create if self._shares else HostMemory.private
+        return memory_of(next(iter(self._states.plan.nodes.values())).memory, MASTER)
+
+    def _prepare(self, meeting: Meeting | None) -> None:
+        """Make all that belongs to one run, but its states and its memory."""
+        session, plan, settings = self._session, self._states.plan, self._settings
+        self._run_keys = keys = RunKeys.new(self._keys)
+        self._pacer = Pacer(plan, plan.system.config.simulation.real_time_factor)
         self._clock = RunClock()
         self._awake = AwakeClock()
         self._watch = GrantWatch() if settings.profile else None
-        memory_of = HostMemory.create if self._shares else HostMemory.private
-        self._memory = memory_of(next(iter(plan.nodes.values())).memory, MASTER)
         self._meeting = meeting
         self.streams = None
         if meeting is not None:
             self.streams = MasterStreams(plan, self._memory.participant(STREAMS), meeting, self._fail_later)
-        self._inbox = Inbox(self._memory)
-        self._inbox.open(session, self._run_keys, MASTER, {self._run_keys.progress(node): node for node in plan.nodes})
-        self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
+        self._inbox.open(session, keys, MASTER, {keys.progress(node): node for node in plan.nodes})
         offer = self._memory.offer if self._shares else None
-        registrations = self._states.registrations
-        self._members = Members(registrations, session, self._run_keys, offer, settings.launch, meeting)
-        self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
-        self._resting = Resting(config.mesh, self._states, self._answer)
+        self._members = Members(self._states.registrations, session, keys, offer, settings.launch, meeting)
+        self._resting = Resting(self._keys.mesh, self._states, self._answer)
         self._published: tuple[MeshState, bool] = ("starting", False)
-        self._tokens = ExitStack()
+        self._run_token = session.liveliness().declare_token(keys.master)
 
     def memory_for(self, participant: str) -> HostMemory | None:
         """The memory of this process for a participant in it; None if it neither shares any nor has row streams."""
@@ -165,26 +170,30 @@ class Master:
             ConfigurationError: another process that this session can reach is the master; it is not affected.
         """
         self._router.wait()
-        liveliness, keys, own = self._session.liveliness(), self._run_keys, self._run_keys.master
-        self._tokens.callback(liveliness.declare_token(own).undeclare)
-        if [key for key in tokens(self._session, self._keys.run("*").master) if key != own]:
-            self._tokens.close()
+        if [key for key in tokens(self._session, self._keys.run("*").master) if key != self._run_keys.master]:
+            self._run_token.undeclare()
             raise ConfigurationError(
                 f"mesh '{self._keys.mesh}' is already running where this master connects",
                 hint="Stop it first, or give this mesh another name or another `zenoh.key_prefix`.",
             )
         server = self._server
-        server.serve(self._keys.register, self._members.register)
-        server.serve(keys.ready("*"), self._members.ready)
-        server.serve(keys.report("*"), self._take_report)
+        self._serve_nodes()
+        server.watch(self._first_keys.follower("*"), self._followers.changed)
+        server.serve(self._keys.register, lambda query: self._members.register(query))  # noqa: PLW0108  of the newest run
         server.show("info", self._info)
         server.show("status", self.last_status)
         server.show("plan", lambda: self._states.plan.nodes)
         server.serve(self._keys.mesh_key("command"), self._command)
-        server.watch(keys.node("*"), self._members.token_changed)
-        server.watch(keys.follower("*"), self._followers.changed)
         server.hand_on_logs()
-        self._tokens.callback(liveliness.declare_token(self._keys.master).undeclare)
+        self._token = self._session.liveliness().declare_token(self._keys.master)
+
+    def _serve_nodes(self) -> None:
+        """Serve the keys of this run, and no longer those of the one before."""
+        server, keys = self._server, self._run_keys
+        server.forget_run()
+        server.serve(keys.ready("*"), self._members.ready, of_run=True)
+        server.serve(keys.report("*"), self._take_report, of_run=True)
+        server.watch(keys.node("*"), self._members.token_changed, of_run=True)
 
     def run(self) -> None:
         """Run the mesh to its last point.
@@ -200,13 +209,33 @@ class Master:
                     self._turn(min(pause_s, STATUS_S, states.deadlines.heartbeat))
         finally:
             self._clock.stop()
-            self._server.publish_status(at_once=True)
-            if states.failure is not None:
-                # The log lines that nodes had said before they were told to end.
-                self._inbox.wait_until(lambda: self._members.have_left, _LAST_WORDS_S)
-            self._tokens.close()
+            if not isinstance(states.failure, RunReset):
+                self._server.publish_status(at_once=True)
+                if states.failure is not None:
+                    # The log lines that nodes had said before they were told to end.
+                    self._inbox.wait_until(lambda: self._members.have_left, _LAST_WORDS_S)
+                undeclare_all([own for own in (self._run_token, self._token) if own is not None])
         if states.failure is not None:
             raise states.failure
+
+    def begin_again(self, plan: Plan, meeting: Meeting | None) -> None:
+        """After `run` has raised `RunReset`, and the recorder has ended: be the master of the next run.
+
+        Then call `run` again. Those who use the mesh, and do not belong to the run, notice only that its points begin
+        again.
+
+        Args:
+            plan: the last one that ``replan`` has returned.
+            meeting: a new one.
+        """
+        self._run_token.undeclare()
+        self._close_run()
+        self._resets += 1
+        self._states = MasterStates(plan, paused=self._states.hold is not None)
+        self._memory = self._made_memory()
+        self._inbox.move_to(self._memory, self._memory)
+        self._prepare(meeting)
+        self._serve_nodes()
 
     def wait_for_followers(self) -> None:
         """Wait, because this process routes messages, until all followers have the last sample."""
@@ -216,6 +245,9 @@ class Master:
     def close(self) -> None:
         """Undeclare everything."""
         self._server.close()
+        self._close_run()
+
+    def _close_run(self) -> None:
         self._members.close()
         if self.streams is not None:
             self.streams.close()
@@ -301,6 +333,8 @@ class Master:
                 if kind == FINISH:
                     self._memory.finish.raise_to(point + 1)
                 self._members.send(kind, point)
+            case EndAll(RunReset()):
+                self._members.begin_again(self._start)
             case EndAll(error):
                 self._members.abort(error)
 
@@ -348,11 +382,18 @@ class Master:
             command = decode_json(data, Command)
         except MessageRefused as error:
             raise MessageRefused(f"not a command: {error}") from error
-        states = self._states
+        states, resets = self._states, self._resets
+        try:
+            if states.takes_commands and command.command == "reset":
+                self._start, resets = self._new_start(command), resets + 1
+        except ConfigurationError as error:  # nothing has changed
+            query.reply_err(str(error))
+            query.drop()
+            return
         if states.takes_commands:
             claimed = self._memory.withdraw_grant() if states.granting.sharing else 0
-            answer = states.command(command, claimed)
-            if command.wait and answer.hold is not None:
+            answer = replace(states.command(command, claimed), resets=resets)
+            if command.wait and answer.hold is not None and command.command != "reset":
                 self._resting.add(query, answer, self._awake() + command.wait)
             else:
                 self._answer(query, answer)
@@ -365,6 +406,17 @@ class Master:
         with self._inbox.refusals.guard(key):  # the client may be gone
             query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
             query.drop()
+
+    def _new_start(self, command: Command) -> NewStart:
+        """What the nodes need for a reset.
+
+        Raises:
+            ConfigurationError: the mesh cannot begin again with these start values.
+        """
+        plan, resets = self._replan(command.start_values, self._resets + 1), self._resets + 1
+        before = {item.name: item.start_values for node in self._first_plan.nodes.values() for item in node.instances}
+        after = {item.name: item.start_values for node in plan.nodes.values() for item in node.instances}
+        return NewStart(resets, plan.digest, {name: own for name, own in after.items() if own != before[name]})
 
     # --- views
 
@@ -401,7 +453,7 @@ class Master:
         return MeshInfo(
             mesh=config.mesh,
             version=__version__,
-            run=self._run_keys.run,
+            run=self._first_keys.run,
             config=self._settings.config_file,
             start_time=grid.start_time,
             stop_time=grid.stop_time,
@@ -440,4 +492,5 @@ class Master:
             overruns=self._pacer.overruns,
             refused=self._inbox.refusals.count,
             cut=self.streams.cut if self.streams is not None else {},
+            resets=self._resets,
         )

@@ -46,6 +46,7 @@ from ..errors import (
     MeshLost,
     NotFinite,
     ProtocolBroken,
+    RunReset,
     TerminationRequested,
     from_report,
 )
@@ -226,7 +227,7 @@ class MasterStates:
         self._end_of(node, error.at(point, self.plan.grid.time(point)))
 
     def command(self, command: Command, claimed: int) -> CommandAnswer:
-        """Handle pause, resume, step N and stop, which only change the grant.
+        """Handle pause, resume, step N and stop, which only change the grant, and reset, which ends the run.
 
         Only while it `takes_commands`. No node of this host passes ``claimed`` until the grant is raised again.
         """
@@ -242,12 +243,17 @@ class MasterStates:
                 self.state, self.hold = "paused", (point if before is None else before) + max(1, command.points)
             case "stop":
                 self._stop(point)
+            case "reset":
+                self.hold, slowest = before, granting.slowest
+                text = f"reset by a command at point {slowest}"
+                self.fail(RunReset(text, point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
             self._actions.append(FollowClock(granting.reached, command.paced))
         self._moved_at = self._slowest_moved_at = None
         if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
             self._sent_at = -math.inf
-        return CommandAnswer(command.command, self.state, granting.slowest, self.hold)
+        where = (granting.slowest, self.hold) if command.command != "reset" else (0, None if before is None else 0)
+        return CommandAnswer(command.command, self.state, *where)
 
     def fail(self, error: FmuMeshError) -> None:
         """The run has to end; the first reason counts."""

@@ -20,7 +20,7 @@ from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.meeting import Meeting
 from ..wire.membership import Admission, NodeReady, Registration, Welcome
-from ..wire.messages import ABORT, HEADER, decode_json, encode_json
+from ..wire.messages import ABORT, HEADER, RESET, NewStart, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.router_link import RouterLink
 from ..wire.runtime import is_alive, is_stopped
@@ -40,7 +40,8 @@ class Members:
     """The processes of the nodes of one run.
 
     Call sequence: `register`, `ready` and `token_changed` for messages that arrive; `welcome` when all are ready; then
-    `send`, and `lost` now and then. `abort` may be called at any time, `close` at the end.
+    `send`, and `lost` now and then. `abort` and `begin_again` may be called at any time, `close` at the
+    end.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one run and how it is reached
@@ -155,6 +156,11 @@ class Members:
         for query in self._waiting.values():
             query.reply_err(str(error))
             query.drop()
+
+    def begin_again(self, start: NewStart) -> None:
+        """Tell the nodes that the run ends, and that they register again for the next one."""
+        for publisher in self._grants:
+            publisher.put(encode_json(RESET, start))
 
     def close(self) -> None:
         """Undeclare all publishers."""

@@ -23,7 +23,7 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine, MeshStatus
 
-__all__ = ["STATUS_S", "Events", "MasterServer"]
+__all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
 
 STATUS_S = 0.1
 """Time in s between two publications of the status."""
@@ -46,6 +46,24 @@ class Events(Protocol):
         ...
 
 
+class MasterSettings(msgspec.Struct, frozen=True):
+    """How a master runs its mesh, besides the plan.
+
+    Attributes:
+        endpoints: where tools can reach this process, for `mesh/info`.
+        config_file: name of the configuration file, for `mesh/info`.
+        launch: the launcher that started this process; None if it was started manually.
+        profile: whether nodes measure their time, and the master what limits the grant.
+        paused: whether the run begins paused at its first point.
+    """
+
+    endpoints: tuple[str, ...] = ()
+    config_file: str = ""
+    launch: str | None = None
+    profile: bool = False
+    paused: bool = False
+
+
 class MasterServer:
     """Serves the queries of one run."""
 
@@ -66,6 +84,7 @@ class MasterServer:
         self._instances = frozenset(instances)
         self._status_published = 0.0
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
+        self._of_run: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._log_lines = 0
         self._newest_lines: deque[msgspec.Raw] = deque()
         self._newest_bytes = 0
@@ -73,10 +92,13 @@ class MasterServer:
         self._log_publisher = declare(keys.mesh_key("log"), congestion_control=drop)
         self._status_publisher = declare(keys.mesh_key("status"), congestion_control=drop)
 
-    def serve(self, key: str, answer: Callable[[zenoh.Query], None]) -> None:
-        """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason."""
+    def serve(self, key: str, answer: Callable[[zenoh.Query], None], *, of_run: bool = False) -> None:
+        """From now on ``answer`` handles the queries of a key; if it refuses one, the reply is the reason.
+
+        A key ``of_run`` is served until `forget_run`.
+        """
         take = self._inbox.refusals.answering(answer, self._inbox.post)
-        self._entities.append(self._session.declare_queryable(key, take))
+        (self._of_run if of_run else self._entities).append(self._session.declare_queryable(key, take))
 
     def show(self, what: Literal["info", "status", "plan", "log"], view: Callable[[], object]) -> None:
         """From now on queries of a key of the mesh are answered with a view."""
@@ -88,14 +110,19 @@ class MasterServer:
 
         self.serve(key, reply)
 
-    def watch(self, tokens: str, changed: Callable[[zenoh.Sample], None]) -> None:
-        """From now on ``changed`` gets every change of these liveliness tokens."""
+    def watch(self, tokens: str, changed: Callable[[zenoh.Sample], None], *, of_run: bool = False) -> None:
+        """From now on ``changed`` gets every change of these liveliness tokens; ``of_run`` as in `serve`."""
         post = self._inbox.post
-        self._entities.append(
+        (self._of_run if of_run else self._entities).append(
             self._session.liveliness().declare_subscriber(
                 tokens, lambda sample: post(lambda: changed(sample)), history=True
             )
         )
+
+    def forget_run(self) -> None:
+        """The run has ended, and another one follows: its keys are not served any more."""
+        undeclare_all(self._of_run)
+        self._of_run.clear()
 
     def hand_on_logs(self) -> None:
         """From now on the log messages of all instances go to `Events.log` and into one log, which is published."""
@@ -138,4 +165,4 @@ class MasterServer:
 
     def close(self) -> None:
         """Undeclare everything."""
-        undeclare_all(self._entities, [self._status_publisher, self._log_publisher])
+        undeclare_all(self._entities, self._of_run, [self._status_publisher, self._log_publisher])

@@ -30,6 +30,7 @@ from ..errors import (
     MessageRefused,
     NotFinite,
     ProtocolBroken,
+    RunReset,
     StepFailed,
     TerminationRequested,
     from_report,
@@ -50,7 +51,9 @@ from ..wire.messages import (
     HEADER,
     INITIAL,
     PROGRESS,
+    RESET,
     SET,
+    NewStart,
     NodeReport,
     SetValue,
     decode_json,
@@ -114,6 +117,7 @@ class Node:
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
+        new_start: how its process begins again, if a reset has ended the run: with new instances, and a new node.
 
     Call `run` once, from the main thread.
     """
@@ -137,6 +141,7 @@ class Node:
         self._finish_at: float = math.inf
         self._token_went = False
         self.failure_is_known = False
+        self.new_start: NewStart | None = None
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
         self._progress_sent = self._lazy_covered = -1
@@ -183,10 +188,11 @@ class Node:
         except FmuMeshError as error:
             located = self._located(error)
             aborted = isinstance(error, _Aborted)
+            self.new_start = error.new_start if isinstance(error, _Aborted) else None
             if aborted or not self._membership.lost_master:  # its token may be gone before its last message arrives
                 self._send_last_rows()
             if aborted:  # after the rows: the master ends when it has the log lines, or a second later
-                self.server.say_everything(heard=True)
+                self.server.say_everything(heard=self.new_start is None)
             self.failure_is_known = aborted or self._report_failure(located)
             raise located from error
         finally:
@@ -457,6 +463,8 @@ class Node:
             self._finish_at = point
         elif kind == ABORT:
             raise _Aborted(from_report(decode_json(data[HEADER.size :], ErrorReport)))
+        elif kind == RESET:
+            raise _Aborted(RunReset("the mesh is reset"), decode_json(data[HEADER.size :], NewStart))
         else:
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
@@ -563,8 +571,9 @@ class Node:
 
 
 class _Aborted(FmuMeshError):
-    """The master ended the run; contains the reason."""
+    """The master ended the run; contains the reason, and how this node begins again, if it does."""
 
-    def __init__(self, cause: FmuMeshError) -> None:
+    def __init__(self, cause: FmuMeshError, new_start: NewStart | None = None) -> None:
         super().__init__(cause.message)
         self.cause = cause
+        self.new_start = new_start

@@ -40,7 +40,7 @@ import numpy as np
 import zenoh
 from msgspec import to_builtins
 
-from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken
+from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, RunReset
 from ..results.growth import GrowthWatch, ReadColumn
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
@@ -60,6 +60,7 @@ from ..wire.messages import (
     INITIAL,
     LAST,
     PROGRESS,
+    RESET,
     SET,
     NodeReport,
     SetValue,
@@ -162,6 +163,8 @@ class Recorder:
         try:
             try:
                 self._write_rows()
+                if isinstance(error, RunReset):
+                    self._files.note({"ended_by": error.message})
             finally:
                 self._files.close()
         except ConfigurationError:
@@ -276,7 +279,11 @@ class Recorder:
         kind = message[1]
         if kind == FINISH:
             self._finish_at = message[4]
-        elif kind not in (GRANT, ABORT):  # why the run ends early comes from the master of this process: `__exit__`
+        elif kind not in (
+            GRANT,
+            ABORT,
+            RESET,
+        ):  # why the run ends early comes from the master of this process: `__exit__`
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
     def _complete(self) -> int:

@@ -154,8 +154,9 @@ class _RecordFile:
         self._is_open = True
         self._next = 0
         self._columns: Sequence[ReadColumn] = ()
-        # Opening is slow, so not with the first row.
-        self._note = os.open(note, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600) if note is not None else None
+        # Opening is slow, so not with the first row. After a reset, the note of the run before is there.
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+        self._note = os.open(note, flags, 0o600) if note is not None else None
         self._noted: Kept | None = None
 
     def begin(self, grid: TimeGrid, record: RecordPlan, columns: Sequence[ReadColumn]) -> None:

@@ -5,6 +5,7 @@ Row ``n`` is in slot ``n & mask``. This module owns the memory; it knows neither
 
 from __future__ import annotations
 
+import mmap
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -16,6 +17,8 @@ from ..system.layout import Layout, Place, row_offsets
 from ..variables.value_types import DTYPES, Value, VariableType, flattened, is_text, nested, zero
 
 __all__ = ["Ring", "Rows"]
+
+_LARGE_BYTES = 1 << 20
 
 Rows = tuple[NDArray[Any], ...]
 """Consecutive rows: one array of shape (rows, elements) for each part of a layout."""
@@ -52,7 +55,10 @@ class Ring:
         *self.offsets, self.stride = row_offsets(layout)
         self._types = tuple(part.type for part in layout.parts)
         self._places: dict[str, Place] = {}
-        flat = np.frombuffer(memory, np.uint8) if memory is not None else np.zeros(rows * self.stride, np.uint8)
+        size = rows * self.stride
+        if memory is None and size >= _LARGE_BYTES:  # malloc would keep what was freed, and clear it for the next ring
+            memory = memoryview(mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS))
+        flat = np.frombuffer(memory, np.uint8) if memory is not None else np.zeros(size, np.uint8)
         self.address = int(flat.ctypes.data)
         self._flat = flat
         self.stamps = self._array(np.dtype(np.int64), 0, 1)[:, 0]

@@ -21,7 +21,18 @@ from ..instances.contract import LogMessage
 from ..wire.views import LogLine, MeshStatus
 from .outcome import Outcome
 
-__all__ = ["Event", "EventWriter", "Log", "OutputLine", "Reachable", "Restarted", "Status", "decode_event", "log_line"]
+__all__ = [
+    "Event",
+    "EventWriter",
+    "Log",
+    "OutputLine",
+    "Reachable",
+    "Restarted",
+    "Status",
+    "WasReset",
+    "decode_event",
+    "log_line",
+]
 
 
 _MOST_WAITING = 10_000
@@ -60,7 +71,14 @@ class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
     most: int
 
 
-Event = Reachable | Status | Log | OutputLine | Restarted | Outcome
+class WasReset(msgspec.Struct, frozen=True, tag="reset"):
+    """A command has reset the mesh, for the ``number``-th time: ``outcome`` is that of the run before."""
+
+    outcome: Outcome
+    number: int
+
+
+Event = Reachable | Status | Log | OutputLine | Restarted | WasReset | Outcome
 
 _decoder: msgspec.json.Decoder[Event] = msgspec.json.Decoder(Event)
 

@@ -40,7 +40,7 @@ from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import MeshNote, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
 from .child import Child, Process
-from .events import Event, OutputLine, Reachable, decode_event
+from .events import Event, OutputLine, Reachable, WasReset, decode_event
 from .fork_server import ForkServer, executed, fork_server
 from .launcher_states import (
     GATEWAY,
@@ -55,7 +55,7 @@ from .launcher_states import (
     Start,
 )
 from .one_process import is_other_python
-from .outcome import Outcome, outcome_at
+from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
 
 __all__ = ["Launcher"]
@@ -74,7 +74,7 @@ class Launcher:
 
     def __init__(self, run: RunPlan, on_event: Callable[[Event], None]) -> None:
         self.outcome: Outcome | None = None
-        self._run = replace(run, run=run_name())
+        self._run = self._first = replace(run, run=run_name())  # the newest, and the first one
         self._on_event = on_event
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._server: ForkServer | None = None
@@ -182,6 +182,8 @@ class Launcher:
             write_note(self._folder, MeshNote(self._run.mesh, prefix, event.endpoints, os.getpid(), file))
         elif isinstance(event, Outcome):
             self._files = event.files
+        elif isinstance(event, WasReset):
+            self._run = self._first.after_resets(event.number)
         self._states.reported(event, self._clock())
         self._on_event(event)
 
@@ -217,10 +219,9 @@ class Launcher:
             assert outcome is not None
             self.outcome = replace(outcome, warnings=tuple(map(self._states.with_how, outcome.warnings)))
             return self.outcome
-        counted = zip(plan.system.records, files, strict=False)
-        last = max((record.point_of(rows - 1) for record, (_, rows) in counted if rows), default=0)
+        last = last_recorded(plan, files)
         if type(error) in (Interrupted, MeshLost) and last > (error.point or 0):
-            error.at(last, plan.grid.time(last))  # the last progress is older than the last row
+            error.at(last, plan.grid.time(last))
         seconds, warnings = (outcome.seconds, outcome.warnings) if outcome is not None else (0.0, ())
         self.outcome = outcome_at(plan, error.point or 0, files, error, seconds=seconds, warnings=warnings)
         raise error.with_hint(what_is_kept(files))

@@ -95,6 +95,12 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
             raise CallRefused('`output` and `record="memory"` exclude each other', hint="Leave one of them out.")
 
 
+class ResetOptions(CallOptions, frozen=True, kw_only=True):
+    """What `Run.reset` takes."""
+
+    start_values: StartValues = None
+
+
 class StartOptions(CallOptions, frozen=True, kw_only=True):
     """What `Run.start` takes."""
 

@@ -11,7 +11,7 @@ from ..errors import ErrorReport, FmuMeshError
 from ..system.plan import Plan
 from ..wire.time_profile import MeshProfile
 
-__all__ = ["Outcome", "outcome_at"]
+__all__ = ["Outcome", "last_recorded", "outcome_at"]
 
 
 class Outcome(msgspec.Struct, frozen=True, tag="end"):
@@ -44,6 +44,12 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     signal: str | None = None
     files: tuple[tuple[str, int], ...] = ()
     warnings: tuple[str, ...] = ()
+
+
+def last_recorded(plan: Plan, files: Sequence[tuple[str, int]]) -> int:
+    """The last point with a row in one of the files, which may be after the last progress; 0 if there is none."""
+    counted = zip(plan.system.records, files, strict=False)
+    return max((record.point_of(rows - 1) for record, (_, rows) in counted if rows), default=0)
 
 
 def outcome_at(  # noqa: PLR0913  each is a field of its own

@@ -27,16 +27,18 @@ from ..results.formats import check_record, warn_of_endings
 from ..system.plan import make_plan
 from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
+from ..system.run_metadata import configuration_of
 from ..system.scenario import Scenario
 from ..system.system import build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
+from ..variables.value_types import PlainValue
 from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "planned"]
+__all__ = ["KnownModels", "planned", "planned_reset"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -62,6 +64,21 @@ class KnownModels:
     def __init__(self, *, keeps_code: bool = False) -> None:
         self._keeps_code = keeps_code
         self._models: dict[tuple[str, str, bytes], tuple[str, object]] = {}
+
+    @classmethod
+    def of(cls, run: RunPlan) -> KnownModels:
+        """Those of a run: none of its models is read again as long as its files stay as they are.
+
+        But those whose instances may have other sizes than their model are.
+        """
+        known, config = cls(keeps_code=True), run.loaded.config
+        for name, own in run.plan.system.instances.items():
+            if not own.description.with_causality("structuralParameter"):
+                section = placed(config.instances[name])
+                path = run.loaded.resolve(section.path) if section.path else Path()
+                model = "description", os.path.realpath(path), msgspec.json.encode((section, config.limits))
+                known._models[model] = run.contents[name], own.description
+        return known
 
     def describe(
         self,
@@ -166,6 +183,36 @@ def planned(
     )
     obstacles.raise_any(run)
     return run
+
+
+def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: int, known: KnownModels) -> RunPlan:
+    """The plan of a run from its first point again, by the same processes, after so many resets.
+
+    Args:
+        run: the first run.
+        start_values: the start values that differ from those of the first run, by `instance.variable`.
+        resets: number of resets, this one included.
+        known: its models.
+
+    Raises:
+        ConfigurationError: a start value is wrong, or more would change than values; carries all findings.
+    """
+    plain = PlainConfig(configuration_of(run.loaded), run.loaded.file)
+    again = planned(plain, PlanOptions(start_values=dict(start_values), allow_code=True), known=known)
+    if _without_start_values(again) != _without_start_values(run):
+        text = f"mesh '{run.mesh}' cannot be reset: it would have other sizes, or a file of it has changed"
+        raise ConfigurationError(text, hint="Start it again.")
+    return replace(run, loaded=again.loaded, plan=again.plan).after_resets(resets)
+
+
+def _without_start_values(run: RunPlan) -> object:
+    """What must stay as it is in a reset, because processes and their links have it."""
+    return run.contents, {
+        name: replace(
+            node, digest="", records=(), instances=tuple(replace(own, start_values={}) for own in node.instances)
+        )
+        for name, node in run.plan.nodes.items()
+    }
 
 
 def _scenario(

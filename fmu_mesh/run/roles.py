@@ -5,39 +5,47 @@ The same functions serve the processes that `launch` starts and those that a per
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 from setproctitle import setproctitle
 
-from ..errors import ConfigurationError, FmuError, FmuMeshError, StepFailed
+from ..errors import ConfigurationError, FmuError, FmuMeshError, RunReset, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
-from ..master.master import Master, MasterSettings
+from ..master.master import Master
+from ..master.mesh_server import MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..results.growth import GrowthWatch
 from ..results.record_files import open_results
-from ..system.plan import MASTER, RECORDER
+from ..results.recording import ResultFile
+from ..system.plan import MASTER, RECORDER, Plan
+from ..variables.value_types import PlainValue
 from ..wire.keys import Keys
-from ..wire.meeting import meeting_of
+from ..wire.meeting import Meeting, meeting_of
+from ..wire.messages import NewStart
 from ..wire.router_link import RouterLink
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
-from ..wire.session import close_session, is_socket, open_session, own_endpoints
+from ..wire.session import Wiring, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
-from .events import Event, EventWriter, Log, Reachable, Status, log_line
+from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
 from .one_process import is_other_python
-from .outcome import Outcome, outcome_at
+from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
-from .run_plan import MANUAL, NodeRun, RunPlan, opening_in, read_node, read_run
+from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
 from .wiring import patient, wiring
+
+if TYPE_CHECKING:  # most runs are never reset
+    from .preparing import KnownModels
 
 __all__ = ["job_of", "run_master", "run_node"]
 
@@ -104,8 +112,8 @@ class _NodeProcess:
     """A node, its instances, and what happens if one of them does not return from a call."""
 
     def __init__(self, run: NodeRun, process: RunProcess) -> None:
-        self._run = run
-        self._plan = run.plan
+        self._run = self._first = run  # the newest, and the first one
+        self._meeting: Meeting | None = None
         self._process = process
         self._instances: list[Instance] = []
         self._guarded: list[Guarded] = []
@@ -113,7 +121,8 @@ class _NodeProcess:
 
     def run(self) -> None:
         """Run the node."""
-        plan, run, process = self._plan, self._run, self._process
+        run, process = self._first, self._process
+        plan = run.plan
         process.cleans_up(self._remove_files)
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
         publishes = f"{Keys(plan.key_prefix, plan.mesh).root}/**"
@@ -124,26 +133,54 @@ class _NodeProcess:
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
         router = RouterLink(session, run.zenoh.connect)
-        meeting = meeting_of(plan.node, process.folder, own, run.zenoh.rows_address) if plan.row_streams else None
-        if meeting is not None:
-            process.stack.callback(meeting.close)
-        self._node = node = Node(
-            plan,
-            session,
-            self._open,
-            on_hang=self._take_hang,
-            router=router,
-            launch=process.launch,
-            meeting=meeting,
+        process.interruption.goes_to(self._interrupt)
+        process.stack.callback(lambda: self._meeting.close() if self._meeting is not None else None)
+        while True:
+            plan, at = self._run.plan, (process.folder, own, run.zenoh.rows_address)
+            self._meeting = meeting_of(plan.node, *at) if plan.row_streams else None
+            self._node = node = Node(
+                plan,
+                session,
+                self._open,
+                on_hang=self._take_hang,
+                router=router,
+                launch=process.launch,
+                meeting=self._meeting,
+            )
+            gc.collect()  # the memory of the run before a reset is in circles of objects
+            if process.interruption.reason is not None:
+                self._interrupt(process.interruption.reason)
+            try:
+                node.run()
+            except FmuMeshError as error:
+                if node.new_start is not None:
+                    self._begin_again(node.new_start)
+                    continue
+                # If there is a launcher, one process shows what happened, and the others only end.
+                if process.is_child and node.failure_is_known:
+                    error.already_reported()
+                raise
+            return
+
+    def _interrupt(self, reason: str) -> None:
+        """From any thread."""
+        if self._node is not None:
+            self._node.interrupt(reason)
+
+    def _begin_again(self, start: NewStart) -> None:
+        """The mesh is reset: free all instances, and take the start values for the next ones."""
+        self._close_instances()
+        self._guarded, self._instances = [], []
+        if self._meeting is not None:
+            self._meeting.close()
+        instances = tuple(
+            replace(item, start_values=start.start_values.get(item.name, item.start_values))
+            for item in self._first.plan.instances
         )
-        process.interruption.goes_to(node.interrupt)
-        try:
-            node.run()
-        except FmuMeshError as error:
-            # If there is a launcher, one process shows what happened, and the others only end.
-            if process.is_child and node.failure_is_known:
-                error.already_reported()
-            raise
+        plan, showing = self._first.plan, self._first.showing
+        if showing.video is not None:
+            showing = replace(showing, video=numbered(showing.video, start.resets))
+        self._run = replace(self._first, showing=showing, plan=replace(plan, digest=start.digest, instances=instances))
 
     def _open(self, name: str) -> Guarded:
         opening = _opening(self._run, name, self._process.folder, self._log)
@@ -153,12 +190,12 @@ class _NodeProcess:
             self._instances.append(instance)
             return instance
 
-        self._guarded.append(Guarded(name, instantiate, self._watch, self._plan.timeouts))
+        self._guarded.append(Guarded(name, instantiate, self._watch, self._run.plan.timeouts))
         return self._guarded[-1]
 
     def _log(self, message: LogMessage) -> None:
         if self._node is not None:
-            self._node.server.log_message(log_line(message, self._plan.instance(message.instance).step_points))
+            self._node.server.log_message(log_line(message, self._run.plan.instance(message.instance).step_points))
             if message.status in ("error", "fatal"):  # the FMU may end the process next
                 self._node.server.say_everything(heard=True)
 
@@ -200,8 +237,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
-            session = open_session(own)
-            process.stack.callback(close_session, session)
+            runs = _MasterRuns(run, process, own)
+            session = runs.session
             ends = own_endpoints(session, own) if zenoh.mode == "peer" else ()
             ends = ends or tuple(config.zenoh.connect)  # a client is reached through its router
             settings = MasterSettings(
@@ -211,11 +248,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 profile=run.profile,
                 paused=run.paused,
             )
-            meeting = meeting_of(MASTER, process.folder, own, zenoh.rows_address) if zenoh.row_streams else None
-            if meeting is not None:
-                process.stack.callback(meeting.close)
             router = RouterLink(session, config.zenoh.connect)
-            master = Master(plan, session, _Emitter(emit), settings, router, meeting)
+            master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())
             process.stack.callback(master.close)
             master.claim()
         except FmuMeshError as error:  # before the first point, such as at a port that is in use
@@ -226,29 +260,22 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             write_note(process.folder, MeshNote(config.mesh, config.zenoh.key_prefix, endpoints, os.getpid(), file))
         emit(Reachable(endpoints))
         process.interruption.goes_to(master.interrupt)
-        recorder = failure = None
-        try:
-            if RECORDER in plan.nodes:
-                results = open_results(run.loaded, plan.system, digest=plan.digest, contents=run.contents)
-                recorder = Recorder(
-                    plan.nodes[RECORDER],
-                    session,
-                    results,
-                    lambda: master.wanted,
-                    growth=GrowthWatch(plan),
-                    notes=process.folder if process.is_child else None,
-                    launch=process.launch,
-                    router=RouterLink(session, config.zenoh.connect),
-                    memory=master.memory_for(RECORDER),
-                    mirror_of=master.streams.mirror if master.streams is not None else lambda _link: None,
-                )
-                if master.streams is not None:
-                    master.streams.tell_last(recorder.note_last)
-            with recorder or nullcontext():
-                master.run()
-        except FmuMeshError as error:
-            failure = error
-        outcome = _outcome_of(run, master, recorder, failure, process.interruption.signal)
+        while True:
+            recorder = failure = None
+            gc.collect()  # the memory of the run before a reset is in circles of objects
+            try:
+                if RECORDER in run.plan.nodes:
+                    recorder = runs.recorder(master)
+                with recorder or nullcontext():
+                    master.run()
+            except FmuMeshError as error:
+                failure = error
+            outcome = _outcome_of(run, master, recorder, failure, process.interruption.signal)
+            if not isinstance(failure, RunReset):
+                break
+            run, resets = runs.run, runs.resets
+            emit(WasReset(outcome, resets))
+            master.begin_again(run.plan, runs.met())
         emit(outcome)
         if failure is not None:
             raise failure
@@ -256,16 +283,98 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         return outcome
 
 
+class _MasterRuns:
+    """The runs of a master, which follow each other where the mesh is reset.
+
+    Attributes:
+        session: of this process.
+        run: the plan of the newest.
+        resets: how often the mesh was reset.
+    """
+
+    def __init__(self, run: RunPlan, process: RunProcess, wiring: Wiring) -> None:
+        self.session = open_session(wiring)
+        process.stack.callback(close_session, self.session)
+        self.run = self._first = run
+        self.resets = 0
+        self._process = process
+        self._wiring = wiring
+        self._files: Sequence[ResultFile] | None = None
+        self._meeting: Meeting | None = None
+        self._known: KnownModels | None = None
+        process.stack.callback(self._close)
+
+    def _close(self) -> None:
+        if self._meeting is not None:
+            self._meeting.close()
+        for file in self._files or ():  # a reset that came too late
+            file.close()
+
+    def replanned(self, start_values: Mapping[str, PlainValue], resets: int) -> Plan:
+        """Plan the next run, and open its files: what is wrong is found before the mesh is reset.
+
+        Raises:
+            ConfigurationError: it cannot be run.
+        """
+        from .preparing import KnownModels, planned_reset  # noqa: PLC0415  most runs are never reset
+
+        self._known = self._known or KnownModels.of(self._first)
+        run = planned_reset(self._first, start_values, resets, self._known)
+        self._files = _opened_results(run)
+        self.run, self.resets = run, resets
+        return run.plan
+
+    def met(self) -> Meeting | None:
+        """A new meeting of the master for row streams; that of the run before is closed."""
+        zenoh = self._first.zenoh(self._first.loaded.config.zenoh.listen)
+        if self._meeting is not None:
+            self._meeting.close()
+        at = self._process.folder, self._wiring, zenoh.rows_address
+        self._meeting = meeting_of(MASTER, *at) if zenoh.row_streams else None
+        return self._meeting
+
+    def recorder(self, master: Master) -> Recorder:
+        """The recorder of the newest run.
+
+        Raises:
+            ConfigurationError: a result file cannot be written.
+        """
+        plan, process, streams = self.run.plan, self._process, master.streams
+        files, self._files = self._files or _opened_results(self.run), None
+        recorder = Recorder(
+            plan.nodes[RECORDER],
+            self.session,
+            files,
+            lambda: master.wanted,
+            growth=GrowthWatch(plan),
+            notes=process.folder if process.is_child else None,
+            launch=process.launch,
+            router=RouterLink(self.session, self.run.loaded.config.zenoh.connect),
+            memory=master.memory_for(RECORDER),
+            mirror_of=streams.mirror if streams is not None else lambda _link: None,
+        )
+        if streams is not None:
+            streams.tell_last(recorder.note_last)
+        return recorder
+
+
+def _opened_results(run: RunPlan) -> Sequence[ResultFile]:
+    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents)
+
+
 def _outcome_of(
     run: RunPlan, master: Master, recorder: Recorder | None, error: FmuMeshError | None, signal: str | None
 ) -> Outcome:
     files, warnings = (recorder.files, recorder.warnings) if recorder is not None else ((), ())
+    point, ended_by = master.last_status().point, master.ended_by if error is None else None
+    if isinstance(error, RunReset):
+        point, error, ended_by = max(point, last_recorded(run.plan, files)), None, error
     outcome = outcome_at(
         run.plan,
-        master.last_status().point,
+        point,
         files,
         error,
-        master.ended_by if error is None else None,
+        ended_by,
         seconds=master.seconds,
         warnings=(*warnings, *master.warnings),
     )

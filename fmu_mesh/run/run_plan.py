@@ -25,7 +25,7 @@ from ..text import counted, did_you_mean, listed
 from ..variables.model_description import ModelDescription
 from .limits import ring_problem
 
-__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "opening_in", "read_node", "read_run"]
+__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "numbered", "opening_in", "read_node", "read_run"]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
@@ -156,6 +156,15 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             },
         )
 
+    def after_resets(self, resets: int) -> RunPlan:
+        """The plan of the run after so many resets: `rows.csv` is followed by `rows-2.csv`."""
+        system, nodes = self.plan.system, dict(self.plan.nodes)
+        records = tuple(replace(record, file=str(numbered(Path(record.file), resets))) for record in system.records)
+        if RECORDER in nodes:
+            nodes[RECORDER] = replace(nodes[RECORDER], records=records)
+        plan = replace(self.plan, system=replace(system, records=records), nodes=nodes)
+        return replace(self, plan=plan)
+
     def write(self, folder: Path) -> Path:
         """Write the plan into a private folder, for the other processes of the run; returns the file.
 
@@ -176,6 +185,18 @@ class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     nodes: dict[str, msgspec.Raw]
     run: msgspec.Raw
+
+
+def numbered(file: Path, resets: int) -> Path:
+    """The name of a file after so many resets; a device keeps its name.
+
+    Example:
+        >>> str(numbered(Path("rows.csv"), 1))
+        'rows-2.csv'
+    """
+    if resets == 0 or (file.exists() and not file.is_file()):
+        return file
+    return file.with_name(f"{file.stem}-{resets + 1}{file.suffix}")
 
 
 def opening_in(

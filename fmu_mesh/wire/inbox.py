@@ -96,7 +96,10 @@ class Inbox:
         """From now on the participant ``name`` receives messages; ``senders`` are the allowed ones by their keys.
 
         There is room for those that are ``on_way`` at most while nobody reads them, and for some that are not allowed.
+        After `close`, it may be opened for another run: nothing of the one before arrives any more.
         """
+        self._arrived.clear()
+        self.is_direct = self._sleeps = False
         self._senders, self._own_key, self._token = senders, keys.wake(name), os.urandom(_WAKE_BYTES)
         local = zenoh.Locality.SESSION_LOCAL
         self._send_wake = partial(session.put, self._own_key, self._token, allowed_destination=local)

@@ -2,8 +2,9 @@
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
 four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), in an ABORT an `ErrorReport` as
-JSON, in a SET a `SetValue` as JSON, for the recorder. LAST says that no more rows of a link come, because the run has
-ended early. Every decoder checks sizes before it reads anything, and raises only `MessageRefused`.
+JSON, in a SET a `SetValue` as JSON, for the recorder, in a RESET a `NewStart` as JSON. LAST says that no more rows of a
+link come, because the run has ended early. Every decoder checks sizes before it reads anything, and raises only
+`MessageRefused`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ __all__ = [
     "LAST",
     "MAX_MESSAGE_SIZE",
     "PROGRESS",
+    "RESET",
     "SET",
+    "NewStart",
     "NodeReport",
     "SetValue",
     "decode_json",
@@ -49,6 +52,8 @@ LAST: Final = 8
 SET: Final = 9
 ALIVE: Final = 10
 """Only in a row stream: its sender lives."""
+
+RESET: Final = 11
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
@@ -90,13 +95,27 @@ class SetValue(msgspec.Struct, frozen=True):
     who: str
 
 
+class NewStart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a node needs to begin again at the first point, beside its plan.
+
+    Attributes:
+        resets: how often the mesh was reset.
+        digest: that of the plan with these start values.
+        start_values: all of them, of each instance that has others than in the first run.
+    """
+
+    resets: int
+    digest: str
+    start_values: dict[str, dict[str, PlainValue]]
+
+
 def sealed(secret: str) -> str:
     """What tells nobody a secret, and shows who knows it."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-def encode_json(kind: int, content: ErrorReport | SetValue, point: int = 0) -> bytes:
-    """An ABORT or SET message."""
+def encode_json(kind: int, content: ErrorReport | NewStart | SetValue, point: int = 0) -> bytes:
+    """An ABORT, RESET or SET message."""
     return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
 
 

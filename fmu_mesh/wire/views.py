@@ -186,7 +186,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/info`.
 
     Attributes:
-        run: the id of the run, which all its internal keys contain.
+        run: the id of the run, which its internal keys contain; after a reset, of the first run.
         result_file: the first result file; None if nothing is recorded.
         shared_memory: the processes that exchange values, grants and progress through the memory of the master's host.
             Empty until all nodes are ready.
@@ -230,6 +230,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
         real_time_factor: simulated over wall-clock time since the first point.
         overruns: points by which the run fell behind the wall clock beyond `catch_up`.
         refused: messages that the master refused: malformed ones, and those of unknown senders.
+        resets: how often the mesh was reset.
         cut: the nodes whose row streams to the master are cut, and for how long in s. Who is cut from another node says
             so in the `activity` of its instances.
     """
@@ -246,6 +247,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     overruns: int = 0
     refused: int = 0
     cut: dict[str, float] = {}
+    resets: int = 0
 
 
 class RosTopicView(msgspec.Struct, frozen=True):
@@ -284,12 +286,14 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         points: for `step` only.
         paced: for `step` and `resume`: whether the real-time factor limits what follows.
         wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests.
+        start_values: for `reset` only; by `instance.variable`, as in a configuration file.
     """
 
-    command: Literal["pause", "resume", "step", "stop"]
+    command: Literal["pause", "resume", "step", "stop", "reset"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
     paced: bool = True
     wait: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+    start_values: dict[str, PlainValue] = {}
 
 
 class CommandAnswer(msgspec.Struct, frozen=True):
@@ -298,6 +302,7 @@ class CommandAnswer(msgspec.Struct, frozen=True):
     Attributes:
         point: the last point that every instance has reached.
         hold: the point at which all of them will pause; None if the mesh continues to run.
+        resets: how often the mesh was reset, once it has done what it was told.
         error: why an answer that has waited comes before they have.
     """
 
@@ -305,4 +310,5 @@ class CommandAnswer(msgspec.Struct, frozen=True):
     state: MeshState
     point: int
     hold: int | None = None
+    resets: int = 0
     error: ErrorReport | None = None

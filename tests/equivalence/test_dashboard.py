@@ -278,6 +278,20 @@ def rows_of_first(file: Path) -> float:
     return float(file.read_text().splitlines()[1].split(",")[1])
 
 
+def test_a_mesh_that_was_reset_is_another_run_on_the_page(place: Place) -> None:
+    config = write_config(place.folder, stop_time=60.0, simulation=PACED)
+    mesh = place.start("launch", config, "--no-progress")
+    place.note()
+    dashboard = Dashboard(place)
+    assert _reached(dashboard)
+
+    assert place.run("reset", "pair", "--set", "pendulum.a=0.25").wait() == 0
+    wait_until(lambda: _reached(dashboard, run=2), "the curve of the next run")
+
+    mesh.signal(signal.SIGINT)
+    mesh.wait()
+
+
 def test_the_result_is_same_bytes_with_a_dashboard_that_reads_all_time(place: Place) -> None:
     config = write_config(place.folder, stop_time=20.0)
     place.run("launch", config, "--no-progress", "--output", place.folder / "alone.csv")

@@ -191,6 +191,21 @@ def test_the_clock_stands_in_a_pause_and_goes_on_by_steps(place: Place, ros: Ros
     mesh.wait()
 
 
+def test_after_a_reset_the_clock_jumps_back_and_every_sample_comes_again(place: Place, ros: Ros) -> None:
+    with resting(place, ros, configured(place, ros, factor=3)) as (mesh, _, session):
+        assert commanded(session, "reset")
+        wait_until(lambda: commanded(session, "resume"), "the first point again")
+        assert mesh.wait() == 0, mesh.errors
+
+    before, rows = rows_of(place.folder / "lab.csv"), rows_of(place.folder / "lab-2.csv")
+    assert (len(before), len(rows)) == (151, 301)
+    ros.wait_for([*before, *rows])
+    assert ros.floats("angle") == [row[1] for row in [*before, *rows]]
+    ticks = [round(tick, 9) for tick in ros.ticks()]
+    assert [tick for tick, _ in groupby(ticks)] == [round(row[0], 9) for row in [*before, *rows]]
+    place.assert_nothing_left()
+
+
 def test_gateway_that_dies_ends_run_with_its_name_and_what_was_recorded(place: Place, ros: Ros) -> None:
     mesh = place.start("launch", configured(place, ros, factor=1, stop_time=60.0), "--no-progress")
     wait_until(lambda: len(ros.floats("angle")) > 20, "samples")

@@ -16,6 +16,7 @@ def steered() -> fmu_mesh.Result:
         point: int = run.status.point
         print(point, run.get("gain.y"))
         _ = run.step(10)
+        _ = run.reset(start_values={"gain.k": 1.5})
         _ = run.resume()
         run.stop()
         return run.wait(timeout=10.0)

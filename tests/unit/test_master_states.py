@@ -12,6 +12,7 @@ from fmu_mesh.errors import (
     MessageRefused,
     NotFinite,
     ProtocolBroken,
+    RunReset,
     StepFailed,
     TerminationRequested,
 )
@@ -336,6 +337,24 @@ def test_a_stop_without_a_stop_time_is_a_normal_end(endless: Plan) -> None:
     run.at(11)
     assert run.decide() == [SendToAll(FINISH, 11)]
     assert isinstance(run.states.ended_by, TerminationRequested)
+
+
+@pytest.mark.parametrize(("paused", "hold"), [(False, None), (True, 0)])
+def test_a_reset_ends_the_run_and_the_next_begins_as_paused(plan: Plan, paused: bool, hold: int | None) -> None:  # noqa: FBT001  pytest gives it
+    run = running(plan, paused=paused)
+    run.at(0)
+
+    assert run.command("reset", claimed=0) == ("paused" if paused else "running", hold)
+    run.fails_with(RunReset, "reset by a command at point 0")
+    assert (run.states.hold is not None) is paused
+
+
+def test_a_failure_before_a_reset_is_the_reason_of_the_end(plan: Plan) -> None:
+    run = running(plan)
+    run.states.report(NodeReport("delay", 3, StepFailed("no", instance="delay", point=3).report()))
+    run.command("reset", claimed=5)
+
+    run.fails_with(StepFailed, "no")
 
 
 def test_an_fmu_that_ends_the_simulation_ends_it_for_all(plan: Plan) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import DeadlineExceeded
-from fmu_mesh.master.master import Master, MasterSettings
+from fmu_mesh.master.master import Master
+from fmu_mesh.master.mesh_server import MasterSettings
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.wire.session import Wiring, open_session
 from fmu_mesh.wire.views import LogLine, MeshStatus
@@ -34,7 +35,7 @@ def test_master_sleeps_while_no_node_has_come(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(HostMemory, "sleep", noted)
     with open_session(Wiring()) as session:
-        master = Master(plan, session, Silent(), MasterSettings())
+        master = Master(plan, session, Silent(), MasterSettings(), lambda *_: plan)
         master.claim()
         with pytest.raises(DeadlineExceeded, match="pendulum"):
             master.run()

@@ -12,7 +12,7 @@ from ...api.result import summary_of
 from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
 from ...printing import paragraph, printable
-from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status
+from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status, WasReset
 from ...run.outcome import Outcome
 from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
@@ -92,6 +92,9 @@ class Display:
             case Restarted(error, number, most):
                 again = f"The run starts again from its first point (restart {number} of {most})."
                 say(str(from_report(error).instead_of_hint(again)))
+            case WasReset(outcome, number) if not self._quiet:
+                files = "".join(f"; result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files)
+                self._print(f"reset {number} at point {outcome.point}{files}")
             case Outcome():
                 self._end(event)
 

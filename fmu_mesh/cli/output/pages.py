@@ -62,6 +62,7 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             ("time", seconds(status.time)),
             ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),
             ("overruns", str(status.overruns or "")),
+            ("resets", str(status.resets or "")),
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
             *(("ROS", view.activity) for view in ros),
             *(("ROS", f"{other} publishes /clock, too") for view in ros for other in view.other_clocks),

@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ...errors import ErrorReport, FmuMeshError
-from ...run.events import Event, Restarted
+from ...run.events import Event, Restarted, WasReset
 from ...run.outcome import Outcome
 from ...run.overriding import memory_of
 from ...run.run_plan import RunPlan
@@ -45,6 +45,7 @@ class RunReport(msgspec.Struct, frozen=True):
     rows: int = 0  # number of rows in the first result file
     file: str | None = None  # the first result file; None if nothing was recorded
     restarts: int = 0  # how often the run was started again
+    resets: int = 0  # how often it was reset: the rest is that of the last run
     error: Failure | None = None  # why it failed
     ended_by: ErrorReport | None = None  # what ended the simulation before its last point although nothing failed
     files: tuple[ReportedFile, ...] = ()  # all result files, each with its number of rows
@@ -60,7 +61,7 @@ class RunReporter:
         self._stack = ExitStack()
         self._run: RunPlan | None = None
         self._outcome: Outcome | None = None
-        self._restarts = 0
+        self._restarts = self._resets = 0
 
     def __enter__(self) -> Self:
         if self._wanted:
@@ -82,6 +83,8 @@ class RunReporter:
         match event:
             case Restarted(_, number, _):
                 self._restarts = number
+            case WasReset(_, number):
+                self._resets = number
             case Outcome():
                 self._outcome = event
 
@@ -98,6 +101,7 @@ class RunReporter:
             state="failed" if failure is not None else outcome.state,
             exit_code=failure.exit_code if failure is not None else 0,
             restarts=self._restarts,
+            resets=self._resets,
             error=failure,
             files=tuple(ReportedFile(*own) for own in outcome.files),
             **{name: getattr(outcome, name) for name in _AS_THE_OUTCOME},

@@ -14,6 +14,8 @@ ROS, so no node and no master ever waits for ROS.
 #   second session, which the mesh does not know.
 # * The mesh ends while samples are on their way. The token of a follower makes the master stay until they are carried;
 #   the loss of the master's token can overtake samples (`latecomers`), so it is no reason to stop at once.
+# * The mesh is reset: its points begin again, and `/clock` jumps back. A point before the one of the last sample tells
+#   it; each node has sent its last samples before the first new one of any (ADR 75).
 # * The token of the mesh comes back. It belongs to another run, whose points begin again: this gateway ends.
 #
 # A variable of a slower instance holds its value between two of its points. So everything up to a point has been
@@ -218,6 +220,8 @@ class Gateway:
         except MessageRefused as error:
             variable.warn(f"a value that is not understood: {error}")
             return
+        if stamp.point < variable.newest:
+            self._begin_again()
         for assembler, port, put in variable.outputs:
             try:
                 for message, time_s in assembler.add(port, stamp.point, stamp.time, value):
@@ -233,6 +237,13 @@ class Gateway:
             self._complete = min(other.holds_until for other in self._watched.values())
         if self._clock is not None:
             self._clock.advance(min(self._newest, self._complete))
+
+    def _begin_again(self) -> None:
+        self._complete = self._newest = -1
+        for variable in self._watched.values():
+            variable.begin_again()
+        if self._clock is not None:
+            self._clock.begin_again()
 
     # --- from ROS to the mesh
 
@@ -335,6 +346,17 @@ class _WatchedVariable(_WarnOnce):
         self._step_points = step_points
         self.holds_until = -1
 
+    @property
+    def newest(self) -> int:
+        """The point of the newest sample; negative before the first one."""
+        return self.holds_until - self._step_points + 1
+
+    def begin_again(self) -> None:
+        """The mesh was reset: forget the samples so far."""
+        self.holds_until = -1
+        for assembler, _, _ in self.outputs:
+            assembler.begin_again()
+
     def advance(self, point: int) -> None:
         """Note that the newest sample is that of ``point``."""
         self.holds_until = point + self._step_points - 1
@@ -357,6 +379,10 @@ class _ClockPublisher:
         if self._last is None:
             first = -(-point // self._stride) * self._stride
             self._next = first if self._next is None else min(first, self._next)
+
+    def begin_again(self) -> None:
+        """The points begin again."""
+        self._next = self._last = None
 
     def advance(self, point: int) -> None:
         """Publish every n-th point up to ``point``, up to which everything else has been published."""

@@ -24,6 +24,7 @@ from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import FmuMeshError
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Reading, Target
+from ...wire.client.waiting import begun_again
 from ...wire.keys import Keys
 from ...wire.views import Command, MeshState
 from ..messages.cdr import Codec, Message
@@ -44,9 +45,6 @@ __all__ = ["SIMULATION_THREADS", "SimulationServices"]
 
 SIMULATION_THREADS = 4
 """Requests that are answered at once: one step, and others meanwhile."""
-
-_RESET: Callable[[MeshClient], object] | None = None
-"""Resets a mesh and returns when it has begun again; None: this version of a mesh cannot be reset."""
 
 _ANSWER_S = 10.0
 _LONGEST_STEP_S = 3600.0
@@ -141,8 +139,6 @@ class SimulationServices:
 
     def _features(self, _request: Message) -> Message:
         features = {*SimulatorFeature}
-        if _RESET is None:
-            features.discard(SimulatorFeature.SIMULATION_RESET)
         if not self._action:
             features.discard(SimulatorFeature.STEP_SIMULATION_ACTION)
         about = f"mesh '{self._client.keys.mesh}' of fmu_mesh {__version__}"
@@ -169,7 +165,9 @@ class SimulationServices:
                 if now != SimulationStates.STOPPED:  # otherwise it rests at its first point
                     self._client.rest(Command("pause"))
             case SimulationStates.STOPPED:
-                self._begin_again(pause=now == SimulationStates.PLAYING)
+                if now == SimulationStates.PLAYING:
+                    self._client.rest(Command("pause"))
+                begun_again(self._client, Command("reset"))
             case SimulationStates.QUITTING:
                 self._client.command(Command("stop"))
             case _:
@@ -192,15 +190,8 @@ class SimulationServices:
         if request["scope"] and request["scope"] & _TIME_AND_STATE != _TIME_AND_STATE:
             text = "time and state are reset together: the scope has to be SCOPE_ALL, or SCOPE_TIME and SCOPE_STATE"
             raise _Refusal(ResultCode.FEATURE_UNSUPPORTED, text)
-        self._begin_again(pause=False)
+        begun_again(self._client, Command("reset"))
         return {}
-
-    def _begin_again(self, *, pause: bool) -> None:
-        if _RESET is None:
-            raise _Refusal(ResultCode.FEATURE_UNSUPPORTED, "this mesh cannot be reset")
-        if pause:
-            self._client.rest(Command("pause"))
-        _RESET(self._client)
 
     # --- the bodies of worlds
 

@@ -75,6 +75,12 @@ class Assembler:
                 stamp = next(head[1] for head in heads if head[0] == now)
                 yield self.make([head[2] for head in heads], stamp), stamp
 
+    def begin_again(self) -> None:
+        """Forget the values so far: the points begin again."""
+        self._last = -1
+        for waiting in self._waiting:
+            waiting.clear()
+
     def make(self, values: list[Any], time: float) -> bytes:
         """Make the message with these values, one per port, at ``time`` in s; arrays as lists, or flat in numpy.
 

@@ -8,13 +8,15 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Final
 
+from msgspec.structs import replace
+
 from ...errors import CallRefused, ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, from_report
 from ..messages import SetValue
-from ..views import Command, MeshState, MeshStatus
+from ..views import Command, CommandAnswer, MeshState, MeshStatus
 from .mesh_client import MeshClient
 from .readings import Target
 
-__all__ = ["go_on", "paused_at", "replay", "wait_for", "wait_for_start", "wait_until_at"]
+__all__ = ["begun_again", "go_on", "paused_at", "replay", "wait_for", "wait_for_start", "wait_until_at"]
 
 _START_S: Final = 120.0
 
@@ -35,6 +37,26 @@ _GOES_AND_RESTS: Final = 2
 """Running and paused have the same rank: a mesh can change from each of them to the other."""
 # How long an instance may stay at one point before it has come to the next value of a replay.
 _NEXT_VALUE_S: Final = 60.0
+
+
+def begun_again(client: MeshClient, command: Command) -> CommandAnswer:
+    """Reset a mesh; return when it is at its first point again, with its state then.
+
+    Raises:
+        ConfigurationError: it refused, and nothing has changed.
+        MeshLost: it ended meanwhile.
+        DeadlineExceeded: it has not begun in time.
+        FmuMeshError: it has failed meanwhile.
+    """
+    what = "begin again"
+    with client.statuses(_START_S) as statuses:
+        answer, last = client.command(command), None
+        for last in statuses:
+            if last.resets >= answer.resets and last.state not in ("starting", "initializing"):
+                if last.state == "failed":
+                    raise _ended(last, what)
+                return replace(answer, state=last.state, point=last.point)
+    raise _gone(client.keys.mesh, what) if last is None else _ended(last, what)
 
 
 def paused_at(client: MeshClient, command: Command) -> int:
