@@ -142,7 +142,6 @@ class Master:
         self._run_keys = keys = RunKeys.new(self._keys)
         self._pacer = Pacer(plan, plan.system.config.simulation.real_time_factor)
         self._clock = RunClock()
-        self._awake = AwakeClock()
         self._watch = GrantWatch() if settings.profile else None
         self._meeting = meeting
         self.streams = None
@@ -201,7 +200,8 @@ class Master:
         Raises:
             FmuMeshError: why the run ended early; all nodes have been informed.
         """
-        states, awake = self._states, self._awake
+        states, awake = self._states, AwakeClock()
+        self._awake = awake
         try:
             while not states.is_over:
                 pause_s = self._decide(awake())
