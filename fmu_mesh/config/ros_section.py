@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from fmu_mesh.config.base import POSITIVE, Base, Endpoint
 
-__all__ = ["RosConfig", "RosProfile", "RosTopicConfig", "RosTopicProfile"]
+__all__ = ["RosConfig", "RosProfile", "RosTopicConfig", "RosTopicProfile", "SimulationInterfacesConfig"]
 
 RosTopicProfile = Literal["ros2dds", "rmw_zenoh"]
 RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
@@ -57,6 +57,15 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
     ] = "reliable"
 
 
+class SimulationInterfacesConfig(Base, frozen=True, kw_only=True):
+    """The services of `simulation_interfaces`."""
+
+    paced: Annotated[
+        bool,
+        Meta(description="Whether steps follow `real_time_factor`; otherwise they are made as fast as possible."),
+    ] = True
+
+
 class RosConfig(Base, frozen=True, kw_only=True):
     """The gateway to ROS 2, which needs no ROS on this host."""
 
@@ -91,6 +100,12 @@ class RosConfig(Base, frozen=True, kw_only=True):
             extra_json_schema=POSITIVE,
         ),
     ] = 100.0
+    simulation_interfaces: Annotated[
+        bool | SimulationInterfacesConfig,
+        Meta(
+            description="Whether programs of ROS can pause, step and stop the mesh; not with ros2dds. True or options."
+        ),
+    ] = False
     messages: Annotated[
         dict[str, str],
         Meta(
@@ -98,3 +113,10 @@ class RosConfig(Base, frozen=True, kw_only=True):
             examples=[{"lab_msgs/msg/Wheel": "msg/Wheel.msg"}],
         ),
     ] = {}
+
+    @property
+    def interfaces(self) -> SimulationInterfacesConfig | None:
+        """The options of `simulation_interfaces`; None if they are off."""
+        if isinstance(self.simulation_interfaces, SimulationInterfacesConfig):
+            return self.simulation_interfaces
+        return SimulationInterfacesConfig() if self.simulation_interfaces else None

@@ -322,8 +322,8 @@ class Master:
                 self._open_streams(ways)
                 entries = TIME_LINE_ENTRIES // len(self._states.plan.nodes) if self._watch is not None else 0
                 self._members.welcome(entries, ways)
-            case FollowClock(point):
-                self._pacer.start(point)
+            case FollowClock(point, paced):
+                self._pacer.start(point, paced=paced)
             case RaiseGrant(point):
                 self._memory.grant.raise_to(point)
             case RaiseSent(point):

@@ -68,9 +68,10 @@ class AnswerAll(msgspec.Struct, frozen=True):
 
 
 class FollowClock(msgspec.Struct, frozen=True):
-    """The point is due now by the wall clock."""
+    """The point is due now by the wall clock, which does not limit the grant unless the run is ``paced``."""
 
     point: int
+    paced: bool = True
 
 
 class RaiseGrant(msgspec.Struct, frozen=True):
@@ -247,7 +248,7 @@ class MasterStates:
                 text = f"reset by a command at point {slowest}"
                 self.fail(RunReset(text, point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
-            self._actions.append(FollowClock(granting.reached))
+            self._actions.append(FollowClock(granting.reached, command.paced))
         self._moved_at = self._slowest_moved_at = None
         if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
             self._sent_at = -math.inf

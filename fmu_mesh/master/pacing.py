@@ -91,19 +91,20 @@ class Pacer:
         simulation = plan.system.config.simulation
         self.overruns = 0
         self._rate = real_time_factor / plan.grid.step_size
+        self._paced = True
         self._period = simulation.update_period
         self._catch_up = simulation.catch_up
         self._origin = 0
         self._started = 0.0
 
-    def start(self, point: int) -> None:
-        """Note that ``point`` is due now."""
-        self._origin = point
+    def start(self, point: int, *, paced: bool = True) -> None:
+        """Note that ``point`` is due now; or there is no limit from now on, if the run is not ``paced``."""
+        self._origin, self._paced = point, paced
         self._started = time.perf_counter()
 
     def limit(self, wanted: int, reached: int) -> tuple[int, float]:
         """The point that may be granted now, and the time until the next check in s; all are at ``reached``."""
-        if self._rate <= 0:
+        if self._rate <= 0 or not self._paced:
             return wanted, math.inf
         elapsed = time.perf_counter() - self._started
         elapsed -= self._give_up(self._origin + elapsed * self._rate - reached)

@@ -350,6 +350,11 @@ NOT_RUN = [
         "from fmu_mesh_ros.actions import Mesh, OnMeshReady",
         "`launch` is not on PyPI; tests/ros/test_package.py has these events",
     ),
+    (
+        "docs/ros-simulation.md",
+        "$ ros2 service call /get_simulation_state simulation_interfaces/srv/GetSimulationState",
+        "`ros2` is not on PyPI; tests/ros/test_simulation_interfaces.py calls these services",
+    ),
     ("docs/ros.md", "$ ros2 topic list", "`ros2` is not on PyPI; tests/ros/test_bridge.py looks with rclpy"),
     (
         "docs/ros.md",

@@ -9,7 +9,9 @@ topic has had `count` samples, more than a tenth of them different ones.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
+import re
 import struct
 import sys
 import threading
@@ -21,6 +23,8 @@ import zenoh
 
 from fmu_mesh.ros.gateway.rmw_zenoh import SERVICES
 from fmu_mesh.ros.messages.definitions import MessageTypes
+from fmu_mesh.ros.messages.ros_names import service_name
+from fmu_mesh.ros.messages.simulation_types import SIMULATION_SERVICES, define_simulation_types
 
 
 def say(**what: object) -> None:
@@ -223,5 +227,52 @@ def parameters(orders: dict[str, Any]) -> None:
         say(answer=get(*order["get"]) if "get" in order else set_(*order["set"]))
 
 
+def simulation(orders: dict[str, Any]) -> None:
+    """Call services of simulation_interfaces; ``types`` is the folder of what ROS's generator has built."""
+    from zenoh_ros2_sdk import ROS2ServiceClient  # noqa: PLC0415  only one of the two is used
+    from zenoh_ros2_sdk.session import ZenohSession  # noqa: PLC0415  likewise
+
+    types = MessageTypes("kilted")
+    define_simulation_types(types)
+    store = ZenohSession.get_instance("127.0.0.1", orders["port"])
+    own = [name for name in types.store.fielddefs if name.startswith("simulation_interfaces/msg/")]
+    for name in own:
+        store.register_message_type(types.definition(name), name)
+    names = "|".join(name.rpartition("/")[2] for name in own)
+
+    def definition(text: str) -> str:
+        text = re.sub(rf"^({names})\b", r"simulation_interfaces/\1", text, flags=re.MULTILINE)
+        return text or "uint8 structure_needs_at_least_one_member\n"
+
+    def client(kind: str) -> Any:  # noqa: ANN401 a client
+        file = Path(orders["types"]) / f"{kind}.json"
+        hashes = {entry["type_name"]: entry["hash_string"] for entry in json.loads(file.read_text())["type_hashes"]}
+        request, response = SIMULATION_SERVICES[kind]
+        return ROS2ServiceClient(
+            f"{orders['namespace']}/{service_name(kind)}",
+            f"simulation_interfaces/srv/{kind}",
+            request_definition=definition(request),
+            response_definition=definition(response),
+            domain_id=orders["domain"],
+            router_ip="127.0.0.1",
+            router_port=orders["port"],
+            type_hash=hashes[f"simulation_interfaces/srv/{kind}"],
+            timeout=30.0,
+        )
+
+    clients = {kind: client(kind) for kind in orders["services"]}
+    say(declared=True)
+    for line in sys.stdin:
+        kind, fields = json.loads(line)["order"]
+        if kind == "SetSimulationState":
+            fields = {"state": store.store.types["simulation_interfaces/msg/SimulationState"](fields["state"])}
+        elif not fields:
+            fields = {"structure_needs_at_least_one_member": 0}
+        answer = dataclasses.asdict(clients[kind].call(**fields))
+        print(json.dumps({"answer": answer}, default=lambda array: array.tolist()), flush=True)  # noqa: T201 (the answer)
+
+
 if __name__ == "__main__":
-    {"sdk": sdk, "pyzeros": pyzeros, "parameters": parameters}[sys.argv[1]](json.loads(sys.argv[2]))
+    {"sdk": sdk, "pyzeros": pyzeros, "parameters": parameters, "simulation": simulation}[sys.argv[1]](
+        json.loads(sys.argv[2])
+    )

@@ -42,6 +42,12 @@ def test_the_hash_of_a_service_equals_the_one_of_ros_itself() -> None:
     assert {entry["type_name"]: entry["hash_string"] for entry in _hashes(file)}[name] == types.type_hash(name)
 
 
+def test_message_without_fields_has_the_byte_that_ros_gives_it() -> None:
+    types = MessageTypes("jazzy", {"lab_msgs/msg/Nothing": "# nothing"})
+
+    assert types.fields("lab_msgs/msg/Nothing") == types.fields("std_msgs/msg/Empty") != ()
+
+
 def test_a_field_is_found_by_its_path() -> None:
     message = "geometry_msgs/msg/PoseWithCovarianceStamped"
 

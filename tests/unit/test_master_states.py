@@ -297,6 +297,15 @@ def test_a_step_of_a_running_mesh_pauses_it(plan: Plan) -> None:
     assert run.command("step", claimed=4, points=2) == ("paused", 6)
 
 
+def test_a_step_may_ignore_the_wall_clock_until_the_next_command(plan: Plan) -> None:
+    run = running(plan, paused=True)
+
+    run.states.command(Command("step", 5, paced=False), 0)
+    assert FollowClock(0, paced=False) in run.states.decide(run.now, LAST)
+    run.states.command(Command("resume"), 5)
+    assert FollowClock(0) in run.states.decide(run.now, LAST)
+
+
 def test_a_step_beyond_the_end_grants_the_last_point(plan: Plan) -> None:
     run = running(plan, paused=True)
     run.command("step", points=10 * LAST)

@@ -53,6 +53,7 @@ from ..messages.stamp import to_stamp
 from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from .profile import Profile, Put, Ros2Dds, ZenohProfile
 from .rmw_zenoh import ParameterServices, RmwZenoh
+from .simulation_services import SimulationServices
 
 __all__ = ["Gateway", "open_profiles"]
 
@@ -70,7 +71,7 @@ Event = Callable[[], None]
 def open_profiles(
     section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys
 ) -> Iterator[dict[str, ZenohProfile]]:
-    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the parameter services."""
+    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the services."""
     profiles: dict[str, ZenohProfile] = {}
     with ExitStack() as stack:
         for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
@@ -79,6 +80,9 @@ def open_profiles(
             stack.callback(profile.close)
             if isinstance(profile, RmwZenoh):
                 stack.enter_context(ParameterServices(plan, mesh, keys).served_by(profile))
+                if section.interfaces is not None:
+                    services = SimulationServices(section.interfaces, plan.types, mesh, keys)
+                    stack.enter_context(services.served_by(profile, plan.namespace))
         yield profiles
 
 

@@ -126,6 +126,8 @@ def _check_section(config: Config, section: RosConfig, findings: Findings) -> No
         findings.add("ros.namespace", f"'{section.namespace}'", "a name that starts with a slash")
     if section.clock_rate is not None and not (math.isfinite(section.clock_rate) and section.clock_rate > 0):
         findings.add("ros.clock_rate", f"{section.clock_rate:g}", "a rate > 0 in Hz, or null for no /clock")
+    if section.interfaces is not None and section.profile == "ros2dds":
+        findings.add("ros.simulation_interfaces", "with the profile ros2dds", "the profile rmw_zenoh or rclpy")
     if not section.connect and not section.listen:
         findings.add("ros.connect", "no endpoint", "where the bridge or the router is, or an endpoint in ros.listen")
     if config.simulation.start_time < 0:

@@ -8,17 +8,10 @@ the 16 bytes that identify its sender (rmw_zenoh, docs/design.md).
 Services of this node are how ROS reads and sets the parameters of all instances.
 """
 
-# Threads: Zenoh calls `answer` on a thread of its own, which only puts a job into a queue, because the mesh may answer
-# slowly and the callbacks of other topics must not wait for it. `parameters` does the jobs one by one (ADR 0030).
-
 from __future__ import annotations
 
 import itertools
-import logging
-import queue
-import re
 import struct
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -35,23 +28,19 @@ from ...wire.messages import decode_json
 from ...wire.session import Question, ask
 from ...wire.values import encode_origin, encode_value
 from ..messages.cdr import CdrError, Codec, Message
-from ..messages.ros_names import absolute, dds_type
+from ..messages.ros_names import absolute, dds_type, service_name
 from ..messages.stamp import nanoseconds
 from ..messages.topics import NodeParameter, Reliability, RosPlan
 from .profile import DEPTH, ZenohProfile
+from .service_threads import Service, ServiceThreads
 
-__all__ = ["SERVICES", "ParameterServices", "RmwZenoh", "Service", "decode_attachment"]
-
-log = logging.getLogger(__name__)
+__all__ = ["SERVICES", "ParameterServices", "RmwZenoh", "decode_attachment"]
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _SHORT_ATTACHMENT = struct.Struct("<qq16s")
 _GID_SIZE = 16
 _RELIABLE, _BEST_EFFORT, _VOLATILE, _KEEP_LAST = 1, 2, 2, 1
 _NO_HASH = "TypeHashNotSupported"
-
-Service = Callable[[Message, Callable[[Message], None]], None]
-"""Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
 
 SERVICES = {
     "GetParameters": ("string[] names\n", "rcl_interfaces/ParameterValue[] values\n"),
@@ -64,8 +53,6 @@ SERVICES = {
 
 _ANSWER_S = 2.0
 _WHO = "ros set_parameters"
-_ANSWERS_END_S = 2.0
-"""As long as the mesh may take for the answer that is under way, in s."""
 _NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING = range(5)
 _VALUE_FIELDS = {_BOOL: "bool_value", _INTEGER: "integer_value", _DOUBLE: "double_value", _STRING: "string_value"}
 
@@ -148,7 +135,7 @@ def _mangled(name: str) -> str:
 
 
 class ParameterServices:
-    """Answers for the parameters of one mesh, on its own thread, because the mesh may answer slowly.
+    """Answers for the parameters of one mesh.
 
     A parameter is named `<instance>.<variable>`. If the mesh refuses a value (a fixed parameter, a value out of range),
     the service answers with the same reason.
@@ -161,7 +148,6 @@ class ParameterServices:
         self._mesh = mesh
         self._keys = keys
         self._parameters = {parameter.name: parameter for parameter in plan.parameters}
-        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         for name, (request, response) in SERVICES.items():
             plan.types.define_service(f"rcl_interfaces/srv/{name}", request, response)
         self._no_value = Codec(plan.types, "rcl_interfaces/msg/ParameterValue").empty()
@@ -170,31 +156,12 @@ class ParameterServices:
     @contextmanager
     def served_by(self, node: RmwZenoh) -> Iterator[None]:
         """Offer the services of ``node`` within the context."""
-        thread = threading.Thread(target=self._run, name="parameters", daemon=True)
-        thread.start()
         answers = self._get, self._get_types, self._set, self._list, self._describe
-        for kind, answer in zip(SERVICES, answers, strict=True):
-            name = re.sub(r"\B([A-Z])", r"_\1", kind).lower()  # `get_parameters` is of the type GetParameters
-            full_name = absolute(f"{self._plan.node}/{name}", self._plan.namespace)
-            node.serve(full_name, f"rcl_interfaces/srv/{kind}", self._queued(answer))
-        try:
+        with ServiceThreads("parameters") as threads:
+            for kind, answer in zip(SERVICES, answers, strict=True):
+                full_name = absolute(f"{self._plan.node}/{service_name(kind)}", self._plan.namespace)
+                node.serve(full_name, f"rcl_interfaces/srv/{kind}", threads.service(answer))
             yield
-        finally:
-            self._jobs.put(None)
-            thread.join(_ANSWERS_END_S)
-
-    def _queued(self, answer: Callable[[Message], Message]) -> Service:
-        def service(request: Message, reply: Callable[[Message], None]) -> None:
-            self._jobs.put(lambda: reply(answer(request)))
-
-        return service
-
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                job()
-            except zenoh.ZError as error:  # the client is gone
-                log.info("answer_not_sent", extra={"error": str(error)})
 
     # --- the services
 

@@ -59,6 +59,9 @@ NUMBERS: Final = FLOATS | {"bool", *(f"{sign}int{bits}" for sign in ("", "u") fo
 
 Distribution = Literal["humble", "jazzy", "kilted", "lyrical"]
 
+_NO_FIELDS: Any = [("structure_needs_at_least_one_member", (1, ("uint8", 0)))]
+"""What ROS gives a message without fields, on the wire, too."""
+
 _MESSAGE_NAME = re.compile(r"[a-z][a-z0-9_]*/(?:msg|srv)/[A-Z][A-Za-z0-9_]*")
 _INDEX = re.compile(r"[0-9]{1,9}")
 _PART = re.compile(r"""(?:^|\.)([^.\[\]]+)|\[(\w+)=(["']?)(.+?)\3\]|\[([^\]]*)\]""")
@@ -253,7 +256,8 @@ class MessageTypes(FieldTypes):
             defined = get_types_from_msg(text, name)
         except TypesysError as error:
             raise ConfigurationError(f"the definition of '{name}' is not understood: {error}") from error
-        for own, fields in defined.items():
+        for own, (constants, known) in defined.items():
+            fields = (constants, known or _NO_FIELDS)
             if self.store.fielddefs.setdefault(own, fields) != fields:
                 raise ConfigurationError(f"'{own}' is defined already, with other fields")
 

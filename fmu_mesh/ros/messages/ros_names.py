@@ -11,7 +11,16 @@ from collections.abc import Iterable
 
 import msgspec
 
-__all__ = ["NameProblem", "absolute", "collision", "dds_type", "name_problems", "ros_name", "topic_problem"]
+__all__ = [
+    "NameProblem",
+    "absolute",
+    "collision",
+    "dds_type",
+    "name_problems",
+    "ros_name",
+    "service_name",
+    "topic_problem",
+]
 
 _NO_NAME_CHARACTER = re.compile(r"[^A-Za-z0-9_]")
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -83,3 +92,8 @@ def dds_type(message: str) -> str:
     """The name of a ROS type in DDS: `std_msgs/msg/Float64` is `std_msgs::msg::dds_::Float64_`."""
     package, kind, name = message.split("/")
     return f"{package}::{kind}::dds_::{name}_"
+
+
+def service_name(kind: str) -> str:
+    """The usual name of a service of this type: `get_parameters` for GetParameters."""
+    return re.sub(r"\B([A-Z])", r"_\1", kind).lower()

@@ -20,6 +20,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
+from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
@@ -28,8 +29,10 @@ from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.profile import DEPTH, Profile, Put, Take
+from ..gateway.simulation_services import SimulationServices
 from ..messages.topics import RosPlan, Topic
 from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, watch_clock
+from .simulation_server import SimulationServer
 
 __all__ = ["GatewayNode", "RclpyProfile"]
 
@@ -85,6 +88,7 @@ class GatewayNode:
         self._configured = ExitStack()
         self._client: MeshClient | None = None
         self._plan: RosPlan | None = None
+        self._interfaces: SimulationInterfacesConfig | None = None
         self._targets: dict[str, Target] = {}
         self._run = ""
         self._active = ExitStack()
@@ -109,6 +113,7 @@ class GatewayNode:
             assert plan is not None  # there is a section, or a finding
             self._declare_parameters(client, plan, stack)
             self._client, self._plan, self._run = client, plan, info.run
+            self._interfaces = loaded.config.ros.interfaces if loaded.config.ros is not None else None
             self._configured = stack.pop_all()
         self._log.info(f"gateway of mesh '{loaded.config.mesh}' with {len(plan.topics)} topics")
 
@@ -135,6 +140,11 @@ class GatewayNode:
             gateway = Gateway(plan, client.session, client.keys, grid_of(info), profiles)
             stack.callback(gateway.close)
             gateway.open(_TIMEOUT_S)
+            if self._interfaces is not None:
+                services = SimulationServices(self._interfaces, plan.types, client.session, client.keys, action=True)
+                server = SimulationServer(self._node, services, plan.namespace)
+                stack.callback(server.close)
+                server.open()
             thread = threading.Thread(target=gateway.run, name="gateway", daemon=True)
             thread.start()
             stack.callback(thread.join, _TIMEOUT_S)
