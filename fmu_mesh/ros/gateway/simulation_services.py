@@ -10,7 +10,6 @@ come: here as queries of Zenoh, in `fmu_mesh.ros.node.simulation_server` through
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -22,6 +21,7 @@ import zenoh
 from ... import __version__
 from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import FmuMeshError
+from ...text import EXPRESSION, matched
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Reading, Target
 from ...wire.client.waiting import begun_again
@@ -200,12 +200,13 @@ class SimulationServices:
         if filters["categories"] or filters["tags"]["tags"] or filters["bounds"]["type"]:
             text = "bodies have no categories, tags and bounds: only the filter by name can be used"
             raise _Refusal(ResultCode.FEATURE_UNSUPPORTED, text)
+        bodies, wanted = self._bodies(), filters["filter"]
         try:
-            fits = re.compile(filters["filter"]).search
-        except (re.error, OverflowError, RecursionError) as error:
-            text = f"the filter '{filters['filter']}' is no regular expression: {error}"
+            found = matched(f"{EXPRESSION}.*(?:{wanted}).*", bodies) if wanted else bodies
+        except ValueError as error:
+            text = f"the filter '{wanted}' is no regular expression: {error}"
             raise _Refusal(ResultCode.OPERATION_FAILED, text) from error
-        return {"entities": [name for name in self._bodies() if fits(name)]}
+        return {"entities": [name for name in bodies if name in found]}
 
     def _get_entity(self, request: Message) -> Message:
         readings = self._at_one_point(self._body(request["entity"]))
