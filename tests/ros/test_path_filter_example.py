@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,6 +57,8 @@ def test_two_independent_readers_find_the_same_messages(folder: Path) -> None:
     assert decoded["/velDesFil"][-1][1].header.frame_id == "base_link"
     with AnyReader([bag]) as reader:
         wanted = [own for own in reader.connections if own.topic in {"/enginedata", "/velDesFil"}]
-        found = [(own.topic, reader.deserialize(data, own.msgtype)) for own, _, data in reader.messages(wanted)]
+        found: list[tuple[str, Any]] = [
+            (own.topic, reader.deserialize(data, own.msgtype)) for own, _, data in reader.messages(wanted)
+        ]
     assert [own.current_left for topic, own in found if topic == "/enginedata"] == [own.current_left for own in engine]
     assert [own.twist.linear.x for topic, own in found if topic == "/velDesFil"] == velocities

@@ -182,7 +182,7 @@ def test_single_components_are_given_beside_vectors(tmp_path: Path) -> None:
             {"joint_states": "gain"},
             "'gain', which has no joint; expected an instance with variables `<joint>.position`",
         ),
-        ({"joint_states": "world.sholder"}, "one of shoulder, slide]er. Did you mean 'shoulder'?"),
+        ({"joint_states": "world.shouldr"}, "one of shoulder, slide]er. Did you mean 'shoulder'?"),
         ({"joint_states": "world", "tf": "world"}, "both `joint_states` and `tf`; expected one of them"),
         ({"tf": "world", "variable": "gain.y"}, "both `tf` and `variable`; expected one of them"),
         ({"twist": "cubes"}, "the 2 bodies of 'cubes'; expected one of cubes.cube, cubes.free_cube"),
