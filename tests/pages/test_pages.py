@@ -404,5 +404,10 @@ NOT_RUN = [
         "export PYTHONPATH=$PWD/examples/gazebo",
         "there is no package of gz-sim here; tests/equivalence/test_gazebo_example.py runs mesh_actuator.py",
     ),
+    (
+        "examples/ros/path_filter/README.md",
+        "$ ros2 launch examples/ros/path_filter/path_filter.launch.py",
+        "launch_ros is not on PyPI; tests/ros/test_launch_files.py starts what this file names",
+    ),
 ]
 """All blocks that are not run: page, beginning, reason."""
