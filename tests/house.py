@@ -379,6 +379,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "ssp/xml_reading.py: parser.StartElementHandler": "expat takes its handlers in no other way",
         "ros/node/entry.py: timer.daemon": "a Timer has no parameter for it",
         "ros/node/node_topics.py: message.header.stamp": _ROS,
+        "ros/node/node_topics.py: message.header.frame_id": _ROS,
         "ros/node/node_topics.py: setattr(owner)": _ROS,
     },
     "private_names_of_others": {

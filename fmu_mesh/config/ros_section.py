@@ -23,6 +23,8 @@ __all__ = [
 
 RosTopicProfile = Literal["ros2dds", "rmw_zenoh"]
 RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
+_Names = str | list[str] | None
+_Parts = str | dict[str, str] | None
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
 
@@ -88,6 +90,29 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
             examples=[{"twist.linear.x": "path_filter.v"}],
         ),
     ] = {}
+    joint_states: Annotated[
+        _Names,
+        Meta(description="JointState on /joint_states: an instance with joints, or `instance.joint`, or a list."),
+    ] = None
+    tf: Annotated[
+        _Names,
+        Meta(description="TFMessage on /tf, world to body: an instance with bodies, `instance.body`, or a list."),
+    ] = None
+    odometry: Annotated[
+        _Parts, Meta(description="Odometry on /odom: `instance.vector` by part, or body: `instance.body` for the pose.")
+    ] = None
+    imu: Annotated[
+        _Parts,
+        Meta(description="Imu on /imu: `instance.vector` by part, or body: `instance.body` for the orientation."),
+    ] = None
+    wrench: Annotated[
+        _Parts,
+        Meta(description="WrenchStamped on /wrench: `instance.vector` by part, or the `instance.body` it acts on."),
+    ] = None
+    twist: Annotated[
+        _Parts,
+        Meta(description="TwistStamped on /twist: `instance.vector` by part, or the `instance.body` that moves."),
+    ] = None
     constants: Annotated[
         dict[str, str | float | int | bool | ConstantFile],
         Meta(

@@ -75,3 +75,24 @@ def test_two_fmus_are_switched_together_and_the_delay_misses_nothing(
         assert "transport_delay" in {reader.node_name for reader in readers}
         assert parameter(ros, "/example/damped_pendulum", "l").double_value == 25.0
         assert parameter(ros, "/example/transport_delay", "d").double_value == 2.33
+
+
+def test_path_filter_of_the_chapter_is_between_its_topics(
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from geometry_msgs.msg import TwistStamped  # noqa: PLC0415 only where ROS is installed
+
+    description = described(FILES / "path_filter/path_filter.launch.py", monkeypatch)
+    peer = ros.peer()
+    publisher = peer.create_publisher(TwistStamped, "/velDes", 10)
+    subscription, filtered = ros.collect(peer, TwistStamped, "/velDesFil")
+
+    with Launch(ros, tmp_path, description):  # it starts by itself, maybe before anybody sees its transitions
+        ros.matched(publisher, subscription)
+        message = TwistStamped()
+        message.twist.linear.x = 0.5
+        publisher.publish(message)
+        ros.until(lambda: filtered and filtered[-1].twist.linear.x > 0.0, "a filtered velocity")
+
+        assert filtered[-1].header.frame_id == "base_link"
+        assert parameter(ros, "/path_filter", "slopeSpeed").double_value == 4.0

@@ -28,6 +28,7 @@ from ..messages.definitions import MessageTypes, is_message_name
 from ..messages.fitting import TopicEntry, check_topic, default_type
 from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
 from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
+from .shapes import expanded
 
 __all__ = ["Resolver", "descriptions_of", "message_types", "resolve"]
 
@@ -214,7 +215,9 @@ class Resolver:
             if isinstance(entry, str):
                 yield TopicEntry(RosTopicConfig(variable=entry), path, path)
             else:
-                yield TopicEntry(entry, path, f"{path}.variable")
+                topic = TopicEntry(entry, path, f"{path}.variable")
+                made = expanded(topic, self._config.instances, self._descriptions, self._findings)
+                yield from [made] if made is not None else []
 
     # --- topics
 
@@ -281,7 +284,7 @@ class Resolver:
             key = "topic" if item.topic is None else "type"
             self._findings.add(f"{entry.path}.{key}", f"no `{key}`", f"a {key}: no variable gives one to this message")
             return
-        found = [self._port(own, field, f"{entry.path}.fields.{field}") for field, own in item.fields.items()]
+        found = [self._port(own, field, entry.place(field)) for field, own in item.fields.items()]
         ports = [port for port in found if port is not None]
         directions: dict[Direction, str] = {}
         for port in ports:

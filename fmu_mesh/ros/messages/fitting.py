@@ -50,11 +50,19 @@ _PLAIN: Mapping[str, type | tuple[type, ...]] = {
 
 
 class TopicEntry(msgspec.Struct, frozen=True):
-    """One entry of `ros.topics`, with its path in the file and the path of its variable."""
+    """One entry of `ros.topics`, with its path in the file and the path of its variable.
+
+    ``shape`` is the path of the ready shape that its fields come from, if the file does not have them.
+    """
 
     item: RosTopicConfig
     path: str
     variable_path: str
+    shape: str | None = None
+
+    def place(self, field: str) -> str:
+        """The path in the file that findings about a field name."""
+        return self.shape or f"{self.path}.fields.{field}"
 
 
 def default_type(variable_type: VariableType, *, array: bool = False) -> str | None:
@@ -142,7 +150,7 @@ def _why_not_carried(topic: Topic, types: MessageTypes) -> str | None:
 
 def _check_port(entry: TopicEntry, topic: Topic, port: Port, types: MessageTypes, findings: Findings) -> None:
     message, written = topic.message, bool(entry.item.fields)
-    place = f"{entry.path}.fields.{port.path}" if written else f"{entry.path}.type"
+    place = entry.place(port.path) if written else f"{entry.path}.type"
     try:
         kind = types.field(message, port.path)
     except UnknownType as error:

@@ -42,7 +42,7 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "max_steps": (1000, "How many steps one update may take to catch up."),
     "stamped": (False, "Whether every number has a second topic NAME_stamped (geometry_msgs/msg/PointStamped)."),
     "names": ([""], "Other ROS names of variables, each as 'VARIABLE: NAME'."),
-    "messages": ([""], "Fields of messages, each as 'TOPIC: {type: TYPE, fields: {PATH: VARIABLE}}'."),
+    "messages": ([""], "Fields of messages, each as 'TOPIC: {type: TYPE, fields: {PATH: VARIABLE}, frame_id: NAME}'."),
     "publish_clock": (False, "Whether this node is the source of simulated time: it starts at 0 and goes to /clock."),
     "real_time_factor": (1.0, "With publish_clock: simulated over wall-clock time."),
     "config": ("", "Configuration of a running mesh, instead of an FMU: the node is its gateway."),

@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from ...config.findings import Findings
 from ...config.yaml_text import Plain, read
@@ -57,6 +58,7 @@ class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     type: str
     fields: dict[str, str]
+    frame_id: str = ""
 
 
 def own_names(entries: Iterable[str]) -> dict[str, str]:
@@ -80,9 +82,9 @@ def topics_of(
     """The topics of an FMU: one per input and output, as in `fmi_adapter`, and those of ``messages``.
 
     A variable that no message of `std_msgs` carries (Binary, an array of Boolean or String) has no topic of its own,
-    nor has one in an entry `TOPIC: {type: PACKAGE/msg/TYPE, fields: {PATH: VARIABLE}}` of ``messages``. The ``names``
-    are ROS names by variable, for those whose usual name cannot be used. If they are ``stamped``, all numeric inputs
-    and outputs have a second topic `NAME_stamped` whose messages have a header.
+    nor has one in an entry `TOPIC: {type: PACKAGE/msg/TYPE, fields: {PATH: VARIABLE}, frame_id: FRAME}` of
+    ``messages``. The ``names`` are ROS names by variable, for those whose usual name cannot be used. If they are
+    ``stamped``, all numeric inputs and outputs have a second topic `NAME_stamped` whose messages have a header.
 
     Raises:
         ConfigurationError: names everything that is wrong.
@@ -108,12 +110,12 @@ def topics_of(
 def fill(topic: Topic, message: Any, values: Mapping[str, Value], time: int) -> None:  # noqa: ANN401 a ROS message
     """Set the fields of a message to the values of their variables, and the stamp of its headers to ``time`` in ns.
 
-    Sequences are made as long as the paths need them.
+    Headers get the frame of the topic. Sequences are made as long as the paths need them.
     """
-    _set_stamp(message, time)
+    _set_header(message, time, topic.frame_id)
     given = [(port.path, values[port.variable.name], port.variable.shape) for port in topic.ports]
     for path, value, shape in (*given, *((path, value, ()) for path, value in topic.constants)):
-        owner, last = _place(message, path, lambda element: _set_stamp(element, time))
+        owner, last = _place(message, path, lambda element: _set_header(element, time, topic.frame_id))
         if isinstance(last, int):
             owner[last] = value
         elif shape:
@@ -185,6 +187,7 @@ def _mapped(entry: str, ends: Mapping[str, Variable], problems: list[str]) -> To
     if len(problems) > before:
         return None
     topic = _topic(name, mapping.type, {path: ends[variable] for path, variable in mapping.fields.items()})
+    topic = replace(topic, frame_id=mapping.frame_id)
     if topic.direction == "in":
         return topic
     topic = by_index(topic, RosTypes())
@@ -248,9 +251,10 @@ def _lengthen(owner: Any, name: str, length: int) -> None:  # noqa: ANN401 a ROS
         elements.extend(make() for _ in range(length - len(elements)))
 
 
-def _set_stamp(message: Any, time: int) -> None:  # noqa: ANN401 a ROS message
+def _set_header(message: Any, time: int, frame_id: str) -> None:  # noqa: ANN401 a ROS message
     if hasattr(message, "header"):
         message.header.stamp = time_message(time)
+        message.header.frame_id = message.header.frame_id or frame_id  # a variable may have given it
 
 
 class FmuTopics:
