@@ -229,6 +229,10 @@ def _places(data: dict[str, Any]) -> Iterator[tuple[Any, str]]:
     messages = ros.get("messages") if isinstance(ros, dict) else None
     for name in messages if isinstance(messages, dict) else ():
         yield messages, name
+    topics = ros.get("topics") if isinstance(ros, dict) else None
+    for topic in topics if isinstance(topics, list) else ():
+        for constant in (topic.get("constants") or {}).values() if isinstance(topic, dict) else ():
+            yield constant, "file"
 
 
 def _is_relative(path: object) -> TypeGuard[str]:

@@ -13,6 +13,8 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from msgspec.structs import replace
+
 from ..config.call_options import checked, takes
 from ..config.plain_values import plain
 from ..errors import CallRefused, ConfigurationError, FmuMeshError, MeshLost, from_report
@@ -186,8 +188,10 @@ class Run:
 
         if self._own is None:
             client = self._client()
-            infos = [client.instance_info(name) for name in client.info().instances]
-            return graph_of_infos(self.name, infos).with_status(client.all_status()[1])
+            mesh = client.info()
+            infos = [client.instance_info(name) for name in mesh.instances]
+            graph = replace(graph_of_infos(self.name, infos), topics=mesh.topics)
+            return graph.with_status(client.all_status()[1])
         graph = graph_of_plan(self._own.plan.plan)
         if self._own.in_process or self._own.future.done():
             return graph

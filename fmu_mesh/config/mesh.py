@@ -15,15 +15,17 @@ from msgspec import Meta
 
 from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
 from fmu_mesh.config.instance_sections import InstanceSection, PhysicsSection
-from fmu_mesh.config.ros_section import RosConfig, RosProfile, RosTopicConfig
+from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
 from fmu_mesh.config.scenario_section import ScenarioConfig
 
 __all__ = [
     "MAX_WINDOW",
     "Config",
     "ConnectionConfig",
+    "ConstantFile",
     "InitializationConfig",
     "LimitsConfig",
+    "Qos",
     "RecordConfig",
     "RosConfig",
     "RosProfile",

@@ -8,13 +8,61 @@ import msgspec
 from msgspec import Meta
 
 from fmu_mesh.config.base import POSITIVE, Base, Endpoint
+from fmu_mesh.text import listed
 
-__all__ = ["RosConfig", "RosProfile", "RosTopicConfig", "RosTopicProfile", "SimulationInterfacesConfig"]
+__all__ = [
+    "ConstantFile",
+    "MeshTopic",
+    "Qos",
+    "RosConfig",
+    "RosProfile",
+    "RosTopicConfig",
+    "RosTopicProfile",
+    "SimulationInterfacesConfig",
+]
 
 RosTopicProfile = Literal["ros2dds", "rmw_zenoh"]
 RosProfile = Literal["ros2dds", "rmw_zenoh", "rclpy"]
 _Names = str | list[str] | None
 _Parts = str | dict[str, str] | None
+Reliability = Literal["reliable", "best_effort"]
+Durability = Literal["volatile", "transient_local"]
+
+
+class Qos(msgspec.Struct, frozen=True):
+    """Quality of service of a topic in ROS, as words `str`; ``deadline`` is in s of the wall clock."""
+
+    reliability: Reliability = "reliable"
+    durability: Durability = "volatile"
+    # How many samples a DDS writer keeps at most for a reader that has not acknowledged them.
+    depth: int = 1000
+    deadline: float | None = None
+
+    def __str__(self) -> str:
+        deadline = f", deadline {self.deadline:g} s" if self.deadline is not None else ""
+        return f"{self.reliability}, {self.durability}, depth {self.depth}{deadline}"
+
+
+class MeshTopic(msgspec.Struct, frozen=True):
+    """A topic in ROS that a mesh publishes (out) or subscribes to (in), and its variables as `instance.variable`."""
+
+    topic: str
+    direction: Literal["in", "out"]
+    type: str
+    qos: Qos
+    sources: tuple[str, ...]
+
+    @property
+    def cells(self) -> list[str]:
+        """A row of a table of topics."""
+        way = "publishes" if self.direction == "out" else "subscribes to"
+        return [f"{way} {self.topic}", self.type, str(self.qos), listed(self.sources)]
+
+
+class ConstantFile(Base, frozen=True, kw_only=True):
+    """A constant text that a file contains."""
+
+    file: Annotated[str, Meta(description="Path of the file, relative to this file.", examples=["arm.urdf"])]
 
 
 class RosTopicConfig(Base, frozen=True, kw_only=True):
@@ -66,9 +114,10 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
         Meta(description="TwistStamped on /twist: `instance.vector` by part, or the `instance.body` that moves."),
     ] = None
     constants: Annotated[
-        dict[str, str | float | int | bool],
+        dict[str, str | float | int | bool | ConstantFile],
         Meta(
-            description="Values that are the same in every published message, by field, such as the name of a frame.",
+            description="Values that are the same in every published message, by field, such as the name of a frame. A "
+            "topic without variables is published once, at the start.",
             examples=[{"transforms[0].child_frame_id": "base_link"}],
         ),
     ] = {}
@@ -77,9 +126,28 @@ class RosTopicConfig(Base, frozen=True, kw_only=True):
     )
     frame_id: Annotated[str, Meta(description="frame_id of every header in the message.")] = ""
     reliability: Annotated[
-        Literal["reliable", "best_effort"],
+        Reliability,
         Meta(description="Reliability in ROS; a best-effort publisher needs a best-effort subscription here."),
     ] = "reliable"
+    durability: Annotated[
+        Durability | None,
+        Meta(
+            description="transient_local: who subscribes later gets the last samples if it asks for them; default: "
+            "volatile, but transient_local for a topic without variables."
+        ),
+    ] = None
+    depth: Annotated[
+        Annotated[int, Meta(ge=1, le=100_000)] | None,
+        Meta(description="History depth; default: 1000, but 1 for a topic without variables."),
+    ] = None
+    deadline: Annotated[
+        float | None,
+        Meta(
+            description="Longest time from message to message, by the wall clock: offered if the topic is published, "
+            "requested if it is subscribed. Missed ones are counted, and a warning names the first.",
+            extra_json_schema=POSITIVE,
+        ),
+    ] = None
 
 
 class SimulationInterfacesConfig(Base, frozen=True, kw_only=True):

@@ -473,6 +473,7 @@ class Master:
             shared_memory=(*shared, MASTER) if {*shared} - {RECORDER} else (),
             row_streams=self._states.granting.ways.streams,
             host_id=this_host(),
+            topics=plan.system.topics,
         )
 
     def last_status(self) -> MeshStatus:

@@ -40,6 +40,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Timeouts", _timeouts(plan)),
         ("Initialization", _initialization(plan)),
         ("Recorded", _recorded(plan)),
+        ("Topics in ROS", table([own.cells for own in plan.system.topics], indent=2)),
         ("Warnings", _warnings(plan)),
     ]
     return titled(sections)

@@ -6,6 +6,7 @@ import msgspec
 
 from ..config.loading import LoadedConfig
 from ..config.mesh import SimulationConfig
+from ..config.ros_section import MeshTopic
 from ..errors import Finding
 from ..rings.library import why_no_library
 from ..system.input_timeouts import InputTimeout
@@ -93,6 +94,7 @@ class PlanView(msgspec.Struct, frozen=True):
         result_file: the first result file; None if nothing is recorded.
         records: all result files.
         scenario: what the scenario sets, by `instance.variable`.
+        topics: those in ROS.
         warnings: findings that do not prevent a run.
         library: why the library of C is not used; None if it is.
     """
@@ -113,6 +115,7 @@ class PlanView(msgspec.Struct, frozen=True):
     scenario: list[PlannedSchedule]
     warnings: tuple[Finding, ...]
     library: str | None
+    topics: tuple[MeshTopic, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.instances), 'instance')}, {counted(len(self.connections), 'connection')}"
@@ -190,4 +193,5 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
         ],
         warnings=system.warnings,
         library=why_no_library(),
+        topics=system.topics,
     )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import replace
 
+from ..config.ros_section import MeshTopic
 from ..printing import page
 from ..system.graph import strongly_connected, topological_order
 from ..system.value_map import map_text
@@ -60,12 +61,14 @@ class SystemGraph(msgspec.Struct, frozen=True):
         nodes: the instances, in the order in which they step.
         edges: the connections, those from one instance to another with the same delay together.
         cycles: the instances of each cycle.
+        topics: those in ROS; a picture has none of them.
     """
 
     mesh: str
     nodes: tuple[GraphNode, ...]
     edges: tuple[GraphEdge, ...]
     cycles: tuple[tuple[str, ...], ...] = ()
+    topics: tuple[MeshTopic, ...] = ()
 
     @property
     def title(self) -> str:
@@ -136,6 +139,9 @@ class SystemGraph(msgspec.Struct, frozen=True):
         lines += [""] if self.cycles else []
         for cycle in self.cycles:
             lines += wrapped([shortened(name, _NAME) for name in cycle], _COLUMNS, "cycle  ")
+        lines += [""] if self.topics else []
+        for topic in self.topics:
+            lines += wrapped(topic.cells, _COLUMNS, "ROS  ")
         return page(line.rstrip() for line in lines)
 
     def __repr__(self) -> str:
@@ -180,7 +186,7 @@ def graph_of_plan(plan: Plan) -> SystemGraph:
         )
         for c in plan.connections
     ]
-    return graph_of(plan.system.config.mesh, nodes, connections)
+    return replace(graph_of(plan.system.config.mesh, nodes, connections), topics=plan.system.topics)
 
 
 def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:

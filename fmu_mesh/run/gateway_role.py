@@ -52,7 +52,7 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
         link = RosLink(section, ros, mesh, keys, profiles, clock=ros_plan.clock_points is not None, as_peer=as_peer)
         stack.callback(link.close)
         gateway = Gateway(ros_plan, mesh, keys, run.plan.grid, profiles)
-        link.open(gateway.ignored)
+        link.open(gateway.ignored, gateway.deadlines)
         stack.callback(gateway.close)
         process.interruption.goes_to(lambda _reason: gateway.end())
         gateway.open(patience_s)

@@ -18,6 +18,7 @@ from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig, PlainConfig, read_scenario
 from ..config.mesh import LimitsConfig
+from ..config.ros_section import MeshTopic
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
 from ..instances.contract import Showing
@@ -153,11 +154,12 @@ def planned(
     known = known or KnownModels()
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
-    warnings = loaded.findings()
+    warnings, topics = loaded.findings(), tuple[MeshTopic, ...]()
     if loaded.config.ros is not None:
         from ..ros.gateway.mapping import resolve  # noqa: PLC0415 most configurations have no such section
 
-        resolve(loaded, descriptions, findings, warnings)
+        ros = resolve(loaded, descriptions, findings, warnings)
+        topics = ros.listed if ros is not None else ()
     scenario = _scenario(loaded, descriptions, findings)
     sections = located
 
@@ -171,7 +173,7 @@ def planned(
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
     warn_of_point_loops(plan, warnings)
-    plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings)))
+    plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings), topics=topics))
     run = RunPlan(
         loaded,
         plan,

@@ -19,6 +19,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
+from fmu_mesh.config.ros_section import MeshTopic
 from fmu_mesh.errors import Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import Connection, Variables, resolve_connections, unit_warnings
@@ -71,6 +72,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         records: the result files; empty if nothing is recorded.
         warnings: findings that do not prevent a run, such as connections between different units.
         scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
+        topics: those in ROS.
     """
 
     config: Config
@@ -80,6 +82,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     records: tuple[RecordPlan, ...] = ()
     warnings: tuple[Finding, ...] = ()
     scenario_files: dict[str, str] = {}
+    topics: tuple[MeshTopic, ...] = ()
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:

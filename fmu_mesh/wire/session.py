@@ -107,6 +107,7 @@ class Wiring(msgspec.Struct, frozen=True):
             Grants limit the messages on the way, so only a process that is stopped blocks. Nodes wait for each other;
             the master closes the link of a tool that is stopped.
         waits: whether opening the session waits, half a second at most, for the processes that it connects to.
+        timestamps: whether samples have timestamps; Zenoh keeps samples for who subscribes later only with them.
         publishes: key expression of many publishers that are declared and undeclared without a message on a link.
     """
 
@@ -120,6 +121,7 @@ class Wiring(msgspec.Struct, frozen=True):
     lease_s: float = LEASE_S
     stuck_s: float = _STUCK_S
     publishes: str | None = None
+    timestamps: bool = False
 
     @property
     def asks_itself(self) -> bool:
@@ -215,6 +217,8 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
         "adminspace/enabled": wiring.asks_itself,
         "aggregation/publishers": [wiring.publishes] if wiring.publishes is not None else [],
     }
+    if wiring.timestamps:
+        settings["timestamping/enabled"] = True
     if wiring.asks_itself and json.loads(config.get_json("access_control/enabled")) is not True:
         settings["access_control"] = _ADMIN_SPACE_IS_OURS
     for key, value in settings.items():

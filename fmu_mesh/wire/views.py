@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from ..config.ros_section import MeshTopic
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
 from ..text import counted
@@ -191,6 +192,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
         shared_memory: the processes that exchange values, grants and progress through the memory of the master's host.
             Empty until all nodes are ready.
         row_streams: the pairs of processes that do it by a row stream; all others do it through Zenoh.
+        topics: those in ROS.
         host_id: of the master's host; ``host`` is a name, which two hosts can have.
     """
 
@@ -214,6 +216,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     row_streams: tuple[tuple[str, str], ...] = ()
     result_files: tuple[str, ...] = ()
     host_id: str = ""
+    topics: tuple[MeshTopic, ...] = ()
 
     @property
     def is_here(self) -> bool:
@@ -268,6 +271,7 @@ class RosView(msgspec.Struct, frozen=True):
         other_clocks: other publishers of `/clock`, as text.
         topics: all of them; what is published reaches a subscriber if it is matched.
         ignored: by topic, how many elements of messages had keys that no variable has.
+        missed: by topic, how often its deadline was missed.
     """
 
     profile: str
@@ -277,6 +281,7 @@ class RosView(msgspec.Struct, frozen=True):
     other_clocks: tuple[str, ...] = ()
     topics: tuple[RosTopicView, ...] = ()
     ignored: dict[str, int] = {}
+    missed: dict[str, int] = {}
 
 
 class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

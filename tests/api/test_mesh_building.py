@@ -108,7 +108,8 @@ def test_an_instance_is_added_once_and_says_what_it_is(keys: dict[str, Any], mes
 def test_a_mesh_that_is_saved_in_another_folder_has_the_same_files(folder: Path) -> None:
     (folder / "other").mkdir()
     mesh = built()
-    mesh.configure(scenario="values.yaml", zenoh={"config": "zenoh.json5"}, ros={"messages": {"a/msg/B": "B.msg"}})
+    ros = {"messages": {"a/msg/B": "B.msg"}, "topics": [{"topic": "/x", "constants": {"data": {"file": "x.urdf"}}}]}
+    mesh.configure(scenario="values.yaml", zenoh={"config": "zenoh.json5"}, ros=ros)
     mesh.record("pendulum.a", file="a.csv")
     mesh.record("pendulum.a", file="/dev/null", also=True)
 
@@ -119,6 +120,7 @@ def test_a_mesh_that_is_saved_in_another_folder_has_the_same_files(folder: Path)
     assert [own["file"] for own in after["record"]] == ["../a.csv", "/dev/null"]
     assert (after["scenario"], after["zenoh"]["config"]) == ("../values.yaml", "../zenoh.json5")
     assert after["ros"]["messages"] == {"a/msg/B": "../B.msg"}
+    assert after["ros"]["topics"][0]["constants"] == {"data": {"file": "../x.urdf"}}
     for name, instance in after["instances"].items():
         there, here = folder / "other" / instance["fmu"], folder / before["instances"][name]["fmu"]
         assert there.resolve() == here.resolve()

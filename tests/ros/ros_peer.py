@@ -185,10 +185,11 @@ class Ros:
         node: Any,  # noqa: ANN401 types of rclpy
         kind: Any,  # noqa: ANN401 as above
         topic: str,
+        quality: Any = 5000,  # noqa: ANN401 as above
     ) -> tuple[Any, list[Any]]:
-        """A subscription, and a list that fills with what comes."""
+        """A subscription, and a list that fills with what comes; ``quality`` is a profile or a depth."""
         messages: list[Any] = []
-        return node.create_subscription(kind, topic, messages.append, 5000), messages
+        return node.create_subscription(kind, topic, messages.append, quality), messages
 
 
 def _matches(end: Any) -> bool:  # noqa: ANN401 types of rclpy

@@ -78,6 +78,7 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
                 if view.connected
                 and (names := [own.topic for own in view.topics if (own.direction, own.matched) == which])
             ),
+            *(("ROS", f"the deadline of {topic} was missed {n} times") for v in ros for topic, n in v.missed.items()),
             ("error", status.error.message if status.error is not None else ""),
         ]
     )
@@ -132,6 +133,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("endpoints", ", ".join(info.endpoints)),
             ("shared memory", ", ".join(map(_part, info.shared_memory)) or "not used"),
             ("row streams", ", ".join(f"{_part(one)} with {_part(other)}" for one, other in info.row_streams)),
+            *(("ROS", "  ".join(own.cells)) for own in info.topics),
             ("master", f"process {info.pid} on {info.host}, fmu_mesh {info.version}"),
         ]
     )

@@ -165,7 +165,7 @@ def topics_for(
     bag.add_types(types)
     # Each choice is a section of its own: a field may go to several variables.
     sections = [replace(section, topics=[_entry(choice, there)]) for choice in choices] or [section]
-    found = [one for own in sections for one in Resolver(loaded.config, own, descriptions, types, findings).topics()]
+    found = [one for own in sections for one in Resolver(loaded, own, descriptions, types, findings).topics()]
     if choices and len(findings):
         problems = "; ".join(f"{finding.found}, where {finding.expected} is possible" for finding in findings)
         raise ConfigurationError(f"`topics=...`: {problems}.")

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ...config.findings import Findings
-from ...config.mesh import RosConfig
+from ...config.mesh import Qos, RosConfig, RosTopicConfig
 from ...files import Kept, open_alone
 from ...installing import importing
 from ...results.recording import Columns, Recording, Tail
@@ -27,6 +27,7 @@ from ..gateway.mapping import Resolver, message_types
 from ..messages.assembling import Assembler
 from ..messages.cdr import Codec
 from ..messages.definitions import CLOCK, MessageTypes
+from ..messages.fitting import TopicEntry, check_topic
 from ..messages.stamp import nanoseconds, to_stamp
 from ..messages.topics import CLOCK_TOPIC, RosPlan, Topic
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns
@@ -35,13 +36,13 @@ __all__ = ["McapFile"]
 
 _BUFFER_BYTES = 1 << 16
 _QOS = (
-    "- history: keep_last\n  depth: 10\n  reliability: reliable\n  durability: volatile\n"
+    "- history: keep_last\n  depth: {0.depth}\n  reliability: {0.reliability}\n  durability: {0.durability}\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  liveliness: automatic\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  avoid_ros_namespace_conventions: false"
 )
-"""The quality of service that a player offers, as rosbag2 writes it: reliable and volatile."""
+"""The quality of service that a player offers, as rosbag2 writes it; of a bag, no player needs a deadline."""
 
 
 class McapFile:
@@ -73,13 +74,13 @@ class McapFile:
         self._schemas: dict[str, int] = {}
         layout = _layout(recording, plan)
         self._topics = [
-            _RecordedTopic(topic, columns, index, self._channel(topic.name, topic.message), types)
+            _RecordedTopic(topic, columns, index, self._channel(topic), types)
             for topic, columns in zip(plan.topics, layout.topics, strict=False)
         ]
         self._clock_ticks = layout.topics[-1] if plan.clock_points is not None else None
         if self._clock_ticks is not None:
             self._clock = Codec(types, CLOCK)
-            self._clock_channel = self._channel(CLOCK_TOPIC, CLOCK)
+            self._clock_channel = self._channel(Topic(CLOCK_TOPIC, CLOCK, "out", (), qos=Qos(depth=10)))
         self._about = {
             "metadata": msgspec.json.encode(recording.metadata).decode(),
             "recording": msgspec.json.encode(layout).decode(),
@@ -177,12 +178,13 @@ class McapFile:
     def _add(self, channel: int, stamp: int, data: bytes, point: int) -> None:
         self._mcap.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=point & 0xFFFFFFFF)
 
-    def _channel(self, topic: str, message: str) -> int:
+    def _channel(self, topic: Topic) -> int:
+        message = topic.message
         if message not in self._schemas:
             definition = self._types.definition(message).encode()
             self._schemas[message] = self._mcap.register_schema(message, "ros2msg", definition)
-        metadata = {"offered_qos_profiles": _QOS, "topic_type_hash": self._types.type_hash(message)}
-        channel: int = self._mcap.register_channel(topic, "cdr", self._schemas[message], metadata)
+        metadata = {"offered_qos_profiles": _QOS.format(topic.qos), "topic_type_hash": self._types.type_hash(message)}
+        channel: int = self._mcap.register_channel(topic.name, "cdr", self._schemas[message], metadata)
         return channel
 
 
@@ -240,8 +242,9 @@ def _layout(recording: Recording, plan: RosPlan) -> RecordedMcap:
 def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
     """The topics that hold the recorded variables; None if a finding makes it impossible to go on.
 
-    A topic of the `ros` section is recorded as it is if all of its variables are recorded. Every other recorded
-    variable has a topic of its own, with the name and the type that the section gives it by default.
+    A topic of the `ros` section is recorded as it is if all of its variables are recorded; a subscribed
+    one has what its inputs had at each point, and one without variables has a message in the first row. Every other
+    recorded variable has a topic of its own, with the name and the type that the section gives it by default.
     """
     loaded, descriptions = recording.loaded, recording.descriptions
     section = loaded.config.ros or RosConfig()
@@ -251,12 +254,13 @@ def _topics(recording: Recording, findings: Findings) -> RosPlan | None:
     recorded = _whole(recording, findings)
     wanted = set(recorded)
     # The findings about the section itself are reported where the section is checked.
-    plan = Resolver(loaded.config, section, descriptions, types, Findings(str(loaded.file))).plan()
-    configured = tuple(topic for topic in plan.topics if _variables(topic) <= wanted) if loaded.config.ros else ()
+    plan = Resolver(loaded, section, descriptions, types, Findings(str(loaded.file))).plan()
+    published = (_published_topic(topic, types) for topic in plan.topics if _variables(topic) <= wanted)
+    configured = tuple(topic for topic in published if topic is not None) if loaded.config.ros else ()
     covered = {variable for topic in configured for variable in _variables(topic)}
     rest = replace(section, topics=[f"{i}.{v}" for i, v in recorded if (i, v) not in covered])
     own = Findings(str(loaded.file))
-    others = Resolver(loaded.config, rest, _published(descriptions, wanted), types, own).plan().topics
+    others = Resolver(loaded, rest, _published(descriptions, wanted), types, own).plan().topics
     section_file = loaded.config.records[recording.place].file
     for finding in own:
         findings.add(f"{recording.place}.file", f"in '{section_file}': {finding.found}", finding.expected)
@@ -300,8 +304,18 @@ def _whole(recording: Recording, findings: Findings) -> list[tuple[str, str]]:
 
 
 def _variables(topic: Topic) -> set[tuple[str, str]]:
-    """(instance, variable) of what a topic publishes; what no recording has, if it is subscribed."""
-    return {(port.instance, port.variable.name) for port in topic.ports} if topic.direction == "out" else {("", "")}
+    """(instance, variable) of what a topic carries."""
+    return {(port.instance, port.variable.name) for port in topic.ports}
+
+
+def _published_topic(topic: Topic, types: MessageTypes) -> Topic | None:
+    """A topic as a bag publishes it; None if its messages cannot hold all values that the inputs may have."""
+    if topic.direction == "out":
+        return topic
+    problems = Findings("")
+    entry = TopicEntry(RosTopicConfig(), "", "")
+    published = check_topic(entry, replace(topic, direction="out"), types, problems, [])
+    return None if problems else published
 
 
 def _writer_class() -> Any:  # noqa: ANN401 a class of an optional dependency

@@ -32,7 +32,8 @@ class TopicColumns(msgspec.Struct, frozen=True):
     """The columns of one topic.
 
     Attributes:
-        steps: it has a message in every row with the first point after a multiple of one of these.
+        steps: it has a message in every row with the first point after a multiple of one of these; if there are none,
+            in the first row.
         fields: the columns that each field has, by its path; of an array those of all elements.
     """
 
@@ -42,7 +43,7 @@ class TopicColumns(msgspec.Struct, frozen=True):
 
     def is_due(self, before: int, point: int) -> bool:
         """Whether it has a message in the row of ``point``, which follows that of the point ``before``, or -1."""
-        return any(point // step > before // step for step in self.steps)
+        return any(point // step > before // step for step in self.steps) if self.steps else before < 0
 
 
 class RecordedMcap(msgspec.Struct, frozen=True):

@@ -51,7 +51,8 @@ from ..messages.cdr import CdrError, Codec
 from ..messages.definitions import CLOCK
 from ..messages.stamp import to_stamp
 from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
-from .profile import Profile, Put, Ros2Dds, ZenohProfile
+from .deadline import Deadline
+from .profile import Profile, Put, Ros2Dds, Take, ZenohProfile
 from .rmw_zenoh import ParameterServices, RmwZenoh
 from .simulation_services import SimulationServices
 
@@ -95,12 +96,14 @@ class Gateway:
 
     Attributes:
         ignored: by topic, how many elements of messages had keys that no variable has.
+        deadlines: of the topics that have one.
     """
 
     def __init__(
         self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: Mapping[str, Profile]
     ) -> None:
         self.ignored: dict[str, int] = {}
+        self.deadlines: list[Deadline] = []
         self._plan = plan
         self._mesh = mesh
         self._keys = keys
@@ -114,6 +117,9 @@ class Gateway:
         self._mesh_ended = False
         self._entities: list[zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._publishers: dict[str, zenoh.Publisher] = {}
+        # What ROS keeps for late subscribers comes at once, and would be lost before the nodes of the mesh are there:
+        # these are subscribed with the first sample of the mesh.
+        self._awaited: list[tuple[Topic, Take]] = []
         # The variables by their keys, the last point at which the newest samples of all of them hold, and the newest.
         self._watched: dict[str, _WatchedVariable] = {}
         self._complete = self._newest = -1
@@ -130,7 +136,8 @@ class Gateway:
                 self._open_output(topic)
             else:
                 self._open_input(topic)
-        if not self._watched and self._plan.time_source is not None and self._plan.clock_points:
+        shows_time = self._plan.clock_points or self._awaited
+        if not self._watched and self._plan.time_source is not None and shows_time:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
             first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
@@ -138,6 +145,8 @@ class Gateway:
             self._clock = _ClockPublisher(put, self._plan, self._grid)
         for key, variable in self._watched.items():
             self._take_values(key, variable)
+        if not self._watched:  # nothing shows when they are there
+            self._subscribe_awaited()
         self._entities.append(
             self._mesh.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         )
@@ -153,8 +162,10 @@ class Gateway:
                 self._report_left_out()
                 if self._clock is not None:
                     self._clock.repeat()
+            # A message that waits in the queue has met its deadline.
+            waits = min([due - now, *(own.left(now) for own in self.deadlines)]) if self._events.empty() else 0
             try:
-                event = self._events.get(timeout=due - now if due > now else 0)
+                event = self._events.get(timeout=max(waits, 0))
             except queue.Empty:
                 continue
             self._handle(event)
@@ -170,6 +181,8 @@ class Gateway:
     def close(self) -> None:
         """Undeclare everything that was declared on the session of the mesh."""
         self._report_left_out()
+        for own in self.deadlines:
+            own.report()
         undeclare_all(self._entities, self._publishers.values())
 
     def _handle(self, event: Event) -> None:
@@ -194,6 +207,10 @@ class Gateway:
     def _open_output(self, topic: Topic) -> None:
         assembler = Assembler(topic, self._plan.types)
         put = self._profiles[topic.profile].publish(topic)
+        if not topic.ports:
+            put(assembler.make([], self._grid.start_time), self._grid.start_time)
+        if (deadline := self._deadline(topic)) is not None:
+            put = deadline.watched(put)
         for index, port in enumerate(topic.ports):
             self._watch(port).outputs.append((assembler, index, put))
 
@@ -222,6 +239,7 @@ class Gateway:
             return
         if stamp.point < variable.newest:
             self._begin_again()
+        self._subscribe_awaited()
         for assembler, port, put in variable.outputs:
             try:
                 for message, time_s in assembler.add(port, stamp.point, stamp.time, value):
@@ -256,10 +274,17 @@ class Gateway:
                 )
         subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types), keys)
 
+        deadline = self._deadline(topic)
+
         def take(data: bytes) -> None:
+            if deadline is not None:
+                self._post(partial(deadline.met, time.monotonic()))
             self._post(partial(self._take_message, subscribed, data))
 
-        self._profiles[topic.profile].subscribe(topic, take)
+        if topic.qos.durability == "volatile":
+            self._profiles[topic.profile].subscribe(topic, take)
+        else:
+            self._awaited.append((topic, take))
 
     def _take_message(self, subscribed: _SubscribedTopic, data: bytes) -> None:
         try:
@@ -278,7 +303,18 @@ class Gateway:
             if fields.warning:
                 subscribed.warn(fields.warning)
 
+    def _subscribe_awaited(self) -> None:
+        while self._awaited:
+            topic, take = self._awaited.pop()
+            self._profiles[topic.profile].subscribe(topic, take)
+
     # --- the queue
+
+    def _deadline(self, topic: Topic) -> Deadline | None:
+        if topic.qos.deadline is None:
+            return None
+        self.deadlines.append(Deadline(topic.name, topic.qos.deadline))
+        return self.deadlines[-1]
 
     def _post(self, event: Event) -> None:
         """On a thread of Zenoh or ROS: put an event into the queue, unless the queue is full."""

@@ -30,6 +30,7 @@ from ...wire.keys import Keys, escape, unescape
 from ...wire.session import Wiring, close_session, is_of_this_host, open_session, undeclare_all
 from ...wire.values import json_encoding
 from ...wire.views import RosView
+from .deadline import Deadline
 from .profile import ZenohProfile, topic_in
 
 __all__ = ["RosLink", "open_ros", "two_clocks"]
@@ -64,8 +65,8 @@ def open_ros(section: RosConfig, folder: Path) -> tuple[bool, zenoh.Session]:
     endpoints = tuple(section.connect)
     are_bridges = section.profile == "ros2dds" and len(endpoints) > 1
     if section.listen or are_bridges or all(map(is_of_this_host, endpoints)):
-        return True, open_session(Wiring(listen=tuple(section.listen), connect=endpoints, gossip=True))
-    client = Wiring(mode="client", connect=endpoints, patience_s=_OPEN_S)
+        return True, open_session(Wiring(listen=tuple(section.listen), connect=endpoints, gossip=True, timestamps=True))
+    client = Wiring(mode="client", connect=endpoints, patience_s=_OPEN_S, timestamps=True)
     try:
         return False, open_session(client)
     except FmuMeshError:  # nobody answers, which `RosLink` reports
@@ -122,14 +123,16 @@ class RosLink:
         self._view = self._seen(linked=False, clocks=())
         self._thread = threading.Thread(target=self._run, name="ros-link", daemon=True)
 
-    def open(self, ignored: Mapping[str, int]) -> None:
-        """Declare the token of this gateway, answer queries about the link and ``ignored``, and start to watch it."""
+    def open(self, ignored: Mapping[str, int], deadlines: Sequence[Deadline]) -> None:
+        """Declare the token of this gateway, answer queries about the link and these two, and start to watch it."""
         chunks = map(escape, (self._keys.mesh, socket.gethostname(), str(os.getpid())))
         token = f"@/{self._ros.zid()}/@fmu_mesh/{'/'.join(chunks)}"
         self._entities.append(self._ros.liveliness().declare_token(token))
         # Each gateway answers with its own key: a query returns only the last of several answers with one key.
         key = f"{self._keys.mesh_key('ros')}/{self._ros.zid()}"
-        self._entities.append(self._mesh.declare_queryable(key, lambda query: self._answer(key, query, ignored)))
+        self._entities.append(
+            self._mesh.declare_queryable(key, lambda query: self._answer(key, query, ignored, deadlines))
+        )
         self._thread.start()
 
     def close(self) -> None:
@@ -142,12 +145,13 @@ class RosLink:
         if self._client is not None:
             close_session(self._client)
 
-    def _answer(self, key: str, query: zenoh.Query, ignored: Mapping[str, int]) -> None:
+    def _answer(self, key: str, query: zenoh.Query, ignored: Mapping[str, int], deadlines: Sequence[Deadline]) -> None:
         with self._changed:
             tokens = sorted(self._tokens)
         others = [token for token in tokens if "/MP/" in token and f"/{self._ros.zid()}/" not in token]
         topics = tuple(topic for profile in self._profiles.values() for topic in profile.topics(others))
-        view = replace(self._view, topics=topics, ignored=dict(ignored))
+        missed = {own.topic: own.missed for own in deadlines if own.missed}
+        view = replace(self._view, topics=topics, ignored=dict(ignored), missed=missed)
         query.reply(key, msgspec.json.encode(view), encoding=json_encoding)
         query.drop()
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import msgspec
 from msgspec.structs import replace
 
 from ...config.findings import Findings
 from ...config.loading import LoadedConfig
-from ...config.mesh import Config, RosConfig, RosTopicConfig
+from ...config.mesh import Config, ConstantFile, Qos, RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
 from ...files import opened
 from ...system.couplings import driven_inputs
@@ -22,6 +23,7 @@ from ...text import listed, nearest, nearest_file
 from ...variables.model_description import Causality, ModelDescription, Variability, Variable
 from ...variables.value_types import FMI2_TYPES, VariableType
 from ...wire.views import InstanceInfo, VariableView
+from ..messages.cdr import MAX_MESSAGE_SIZE
 from ..messages.definitions import MessageTypes, is_message_name
 from ..messages.fitting import TopicEntry, check_topic, default_type
 from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
@@ -43,19 +45,29 @@ def message_types(loaded: LoadedConfig, section: RosConfig, findings: Findings) 
         if not is_message_name(name):
             findings.add(path, f"'{name}'", "the full name of a message type, such as lab_msgs/msg/Wheel")
             continue
-        place = loaded.resolve(file)
-        try:
-            with opened(place) as source:
-                custom[name] = source.read().decode()
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            findings.add(path, f"'{file}', which cannot be read ({reason})", "a .msg file", nearest_file(place))
+        if (text := _text_of(loaded.resolve(file), (path, file, "a .msg file"), findings)) is not None:
+            custom[name] = text
     try:
         return MessageTypes(section.distribution, custom)
     except ConfigurationError as error:
         expected = f"a Python that has it. {error.hint}" if error.hint else "definitions that are complete"
         findings.add("ros.messages" if custom else "ros", error.message, expected)
         return None
+
+
+def _text_of(place: Path, about: tuple[str, str, str], findings: Findings) -> str | None:
+    """The text of a file; ``about`` is its key and its value in the configuration, and what is expected there."""
+    key, file, expected = about
+    try:
+        with opened(place) as source:
+            data = source.read(MAX_MESSAGE_SIZE + 1)
+        if len(data) <= MAX_MESSAGE_SIZE:
+            return data.decode()
+        reason = f"it has more than {MAX_MESSAGE_SIZE} bytes"
+    except (OSError, UnicodeDecodeError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    findings.add(key, f"'{file}', which cannot be read ({reason})", expected, nearest_file(place))
+    return None
 
 
 def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings, warnings: Findings) -> RosPlan | None:
@@ -74,7 +86,7 @@ def resolve(loaded: LoadedConfig, descriptions: Descriptions, findings: Findings
     # Array sizes that are too large are reported with the start values that set them, so not here.
     instances, ignored = loaded.config.instances, loaded.findings()
     full = {name: sized(name, own, instances[name], ignored) for name, own in descriptions.items() if name in instances}
-    resolver = Resolver(loaded.config, section, full, types, findings)
+    resolver = Resolver(loaded, section, full, types, findings)
     if types is None:  # the names can be checked
         resolver.topics()
         return None
@@ -145,13 +157,14 @@ class Resolver:
 
     def __init__(
         self,
-        config: Config,
+        loaded: LoadedConfig,
         section: RosConfig,
         descriptions: Descriptions,
         types: MessageTypes | None,
         findings: Findings,
     ) -> None:
-        self._config = config
+        self._loaded = loaded
+        self._config = config = loaded.config
         self._section = section
         self._descriptions = descriptions
         self._types = types
@@ -210,9 +223,11 @@ class Resolver:
 
     def _topics(self, entry: TopicEntry) -> Iterator[Topic]:
         item = entry.item
-        if (item.variable is None) == (not item.fields):
+        if item.variable is None and not item.fields and item.constants:
+            yield from self._message_of_fields(entry)
+        elif (item.variable is None) == (not item.fields):
             found = "neither `variable` nor `fields`" if item.variable is None else "both `variable` and `fields`"
-            self._findings.add(entry.path, found, "one of them")
+            self._findings.add(entry.path, found, "one of them, or neither and `constants`")
         elif item.variable is None:
             yield from self._message_of_fields(entry)
         elif item.variable in self._config.instances:
@@ -267,7 +282,7 @@ class Resolver:
         item = entry.item
         if item.topic is None or item.type is None:
             key = "topic" if item.topic is None else "type"
-            self._findings.add(f"{entry.path}.{key}", f"no `{key}`", f"a {key}: several variables share this message")
+            self._findings.add(f"{entry.path}.{key}", f"no `{key}`", f"a {key}: no variable gives one to this message")
             return
         found = [self._port(own, field, entry.place(field)) for field, own in item.fields.items()]
         ports = [port for port in found if port is not None]
@@ -289,17 +304,37 @@ class Resolver:
         topic = Topic(
             name=full_name,
             message=message,
-            direction=ports[0].direction,
+            direction=ports[0].direction if ports else "out",
             ports=ports,
             profile=entry.item.profile or self._section.profile,
             frame_id=entry.item.frame_id,
-            reliability=entry.item.reliability,
-            constants=tuple(entry.item.constants.items()),
+            qos=self._qos(entry, is_constant=not ports),
+            constants=tuple(self._constants(entry)),
         )
-        if self._types is not None:
+        if self._types is not None and len(self._findings) == before:
             topic = check_topic(entry, topic, self._types, self._findings, self.warnings)
         if len(self._findings) == before:
             yield topic
+
+    def _qos(self, entry: TopicEntry, *, is_constant: bool) -> Qos:
+        item, path = entry.item, entry.path
+        if is_constant and item.durability == "volatile":
+            expected = "transient_local: it is published once, so who subscribes later would never get it"
+            self._findings.add(f"{path}.durability", "volatile for a topic without variables", expected)
+        if item.deadline is not None and (is_constant or not 0 < item.deadline < math.inf):
+            found = f"{item.deadline:g} for a topic that is published once" if is_constant else f"{item.deadline:g}"
+            self._findings.add(f"{path}.deadline", found, "no deadline" if is_constant else "a time > 0 in s")
+        durability = item.durability or ("transient_local" if is_constant else "volatile")
+        return Qos(item.reliability, durability, item.depth or (1 if is_constant else Qos().depth), item.deadline)
+
+    def _constants(self, entry: TopicEntry) -> Iterator[tuple[str, str | float | bool]]:
+        for field, value in entry.item.constants.items():
+            if not isinstance(value, ConstantFile):
+                yield field, value
+                continue
+            about = f"{entry.path}.constants.{field}.file", value.file, "a file of text"
+            if (text := _text_of(self._loaded.resolve(value.file), about, self._findings)) is not None:
+                yield field, text
 
     # --- variables
 
@@ -353,7 +388,7 @@ class Resolver:
     # --- the whole
 
     def _check_unique(self, topic: Topic, path: str) -> None:
-        owners = ", ".join(f"'{port.instance}.{port.variable.name}'" for port in topic.ports)
+        owners = ", ".join(f"'{port.instance}.{port.variable.name}'" for port in topic.ports) or f"constants ({path})"
         first = self._owners.setdefault((topic.name, topic.direction), owners)
         message, owner = self._messages.setdefault(topic.name, (topic.message, owners))
         if first is not owners:

@@ -12,13 +12,15 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Protocol
 
 import zenoh
+import zenoh.ext
 
+from ...config.mesh import Qos
 from ...wire.session import matches, undeclare_all
 from ...wire.views import RosTopicView
 from ..messages.definitions import MessageTypes
-from ..messages.topics import Reliability, Topic
+from ..messages.topics import Topic
 
-__all__ = ["DEPTH", "Profile", "Put", "Ros2Dds", "Take", "ZenohProfile", "topic_in"]
+__all__ = ["Profile", "Put", "Ros2Dds", "Take", "ZenohProfile", "topic_in"]
 
 Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
@@ -26,10 +28,7 @@ Put = Callable[[bytes, float], None]
 Take = Callable[[bytes], None]
 """Called with every message (CDR) that arrives, on a thread of Zenoh or ROS."""
 
-DEPTH = 1000
-"""History depth: how many samples a DDS writer keeps at most for a reader that has not acknowledged them."""
-_RELIABLE, _BEST_EFFORT = 1, 0
-_VOLATILE, _KEEP_LAST = 0, 0
+_RELIABILITY, _DURABILITY, _KEEP_LAST = {"reliable": 1, "best_effort": 0}, {"volatile": 0, "transient_local": 1}, 0
 
 
 class Profile(Protocol):
@@ -54,26 +53,46 @@ class ZenohProfile:
         self._tokens: list[zenoh.LivelinessToken] = []
         self._publishers: list[tuple[str, zenoh.Publisher]] = []
         self._subscribed: list[tuple[str, str]] = []
-        self._others: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+        self._others: list[
+            zenoh.Subscriber[None]
+            | zenoh.Queryable[None]
+            | zenoh.ext.AdvancedPublisher
+            | zenoh.ext.AdvancedSubscriber[None]
+        ] = []
 
     def publish(self, topic: Topic) -> Put:
         """Declare a publisher of ``topic``."""
         # Wait for slow subscribers of a reliable topic; only the gateway waits, because its session is its own.
-        control = zenoh.CongestionControl
-        publisher = self._session.declare_publisher(
-            self._key(topic.name, topic.message),
-            encoding=zenoh.Encoding.APPLICATION_CDR,
-            congestion_control=control.BLOCK if topic.reliability == "reliable" else control.DROP,
-        )
+        control, cdr = zenoh.CongestionControl, zenoh.Encoding.APPLICATION_CDR
+        blocks = control.BLOCK if topic.qos.reliability == "reliable" else control.DROP
+        key = self._key(topic.name, topic.message)
+        publisher = self._session.declare_publisher(key, encoding=cdr, congestion_control=blocks)
         self._publishers.append((topic.name, publisher))
-        attached = self._attached(self._announce("MP", topic.name, topic.message, topic.reliability))
-        return lambda data, time: publisher.put(data, attachment=attached(time))
+        put: Callable[..., None] = publisher.put
+        if topic.qos.durability == "transient_local":
+            # It cannot say whether somebody subscribes, so `publisher` stays for that.
+            cache = zenoh.ext.CacheConfig(topic.qos.depth)
+            keeper = zenoh.ext.declare_advanced_publisher(
+                self._session, key, encoding=cdr, congestion_control=blocks, cache=cache, publisher_detection=True
+            )
+            self._others.append(keeper)
+            put = keeper.put
+        attached = self._attached(self._announce("MP", topic.name, topic.message, topic.qos))
+        return lambda data, time: put(data, attachment=attached(time))
 
     def subscribe(self, topic: Topic, take: Take) -> None:
         """Declare a subscriber of ``topic``."""
         key = self._key(topic.name, topic.message)
-        self._others.append(self._session.declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
-        self._subscribed.append((topic.name, self._announce("MS", topic.name, topic.message, topic.reliability)))
+
+        def arrived(sample: zenoh.Sample) -> None:
+            take(sample.payload.to_bytes())
+
+        if topic.qos.durability == "transient_local":
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.qos.depth)
+            self._others.append(zenoh.ext.declare_advanced_subscriber(self._session, key, arrived, history=history))
+        else:
+            self._others.append(self._session.declare_subscriber(key, arrived))
+        self._subscribed.append((topic.name, self._announce("MS", topic.name, topic.message, topic.qos)))
 
     def close(self) -> None:
         """Undeclare everything, tokens first."""
@@ -91,13 +110,13 @@ class ZenohProfile:
         """The key of a topic or a service."""
         raise NotImplementedError
 
-    def _announce(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+    def _announce(self, kind: str, name: str, message: str, qos: Qos) -> str:
         """Declare the token of a publisher (MP), a subscriber (MS) or a server (SS), and return it."""
-        token = self._token(kind, name, message, reliability)
+        token = self._token(kind, name, message, qos)
         self._tokens.append(self._session.liveliness().declare_token(token))
         return token
 
-    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
+    def _token(self, kind: str, name: str, message: str, qos: Qos) -> str:
         """The token of a topic or a service."""
         raise NotImplementedError
 
@@ -118,9 +137,9 @@ class Ros2Dds(ZenohProfile):
     def _key(self, name: str, message: str) -> str:  # noqa: ARG002  the name says all
         return name.removeprefix("/")
 
-    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
-        qos = f":{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}"
+    def _token(self, kind: str, name: str, message: str, qos: Qos) -> str:
+        words = f":{_RELIABILITY[qos.reliability]}:{_DURABILITY[qos.durability]}:{_KEEP_LAST},{qos.depth}"
         if self._types.distribution != "humble":
-            qos += f":typehash={self._types.type_hash(message)};"
-        parts = (self._key(name, message).replace("/", "§"), message.replace("/", "§"), qos)
+            words += f":typehash={self._types.type_hash(message)};"
+        parts = (self._key(name, message).replace("/", "§"), message.replace("/", "§"), words)
         return f"@/{self._session.zid()}/@ros2_lv/{kind}/{'/'.join(parts)}"

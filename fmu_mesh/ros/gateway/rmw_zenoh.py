@@ -18,6 +18,7 @@ from typing import Any
 
 import zenoh
 
+from ...config.mesh import Qos
 from ...errors import FmuMeshError
 from ...installing import importing
 from ...system.start_values import why_not_settable
@@ -30,8 +31,8 @@ from ...wire.values import encode_origin, encode_value
 from ..messages.cdr import CdrError, Codec, Message
 from ..messages.ros_names import absolute, dds_type, service_name
 from ..messages.stamp import nanoseconds
-from ..messages.topics import NodeParameter, Reliability, RosPlan
-from .profile import DEPTH, ZenohProfile
+from ..messages.topics import NodeParameter, RosPlan
+from .profile import ZenohProfile
 from .service_threads import Service, ServiceThreads
 
 __all__ = ["SERVICES", "ParameterServices", "RmwZenoh", "decode_attachment"]
@@ -39,7 +40,7 @@ __all__ = ["SERVICES", "ParameterServices", "RmwZenoh", "decode_attachment"]
 _ATTACHMENT = struct.Struct("<qqB16s")
 _SHORT_ATTACHMENT = struct.Struct("<qq16s")
 _GID_SIZE = 16
-_RELIABLE, _BEST_EFFORT, _VOLATILE, _KEEP_LAST = 1, 2, 2, 1
+_RELIABILITY, _DURABILITY, _KEEP_LAST = {"reliable": 1, "best_effort": 2}, {"volatile": 2, "transient_local": 1}, 1
 _NO_HASH = "TypeHashNotSupported"
 
 SERVICES = {
@@ -91,14 +92,17 @@ class RmwZenoh(ZenohProfile):
             service(request, reply)
 
         self._others.append(self._session.declare_queryable(key, answer, complete=True))
-        self._announce("SS", name, kind, "reliable")
+        self._announce("SS", name, kind, Qos())
 
     def _key(self, name: str, message: str) -> str:
         return f"{self._domain}/{name.strip('/')}/{dds_type(message)}/{self._hash(message)}"
 
-    def _token(self, kind: str, name: str, message: str, reliability: Reliability) -> str:
-        qos = f"{_RELIABLE if reliability == 'reliable' else _BEST_EFFORT}:{_VOLATILE}:{_KEEP_LAST},{DEPTH}:,:,:,,"
-        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{qos}"
+    def _token(self, kind: str, name: str, message: str, qos: Qos) -> str:
+        deadline = "{},{}".format(*divmod(nanoseconds(qos.deadline), 10**9)) if qos.deadline is not None else ","
+        words = (
+            f"{_RELIABILITY[qos.reliability]}:{_DURABILITY[qos.durability]}:{_KEEP_LAST},{qos.depth}:{deadline}:,:,,"
+        )
+        own = f"{_mangled(name)}/{dds_type(message)}/{self._hash(message)}/{words}"
         return f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node}/{own}"
 
     def _attached(self, token: str) -> Callable[[float], bytes | None]:

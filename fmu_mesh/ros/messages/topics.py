@@ -11,9 +11,9 @@ from typing import Literal
 
 import msgspec
 
-from ...config.mesh import RosProfile
+from ...config.ros_section import MeshTopic, Qos, RosProfile
 from ...variables.model_description import ModelDescription, Variable
-from .definitions import MessageTypes
+from .definitions import CLOCK, MessageTypes
 
 __all__ = [
     "CLOCK_TOPIC",
@@ -22,7 +22,6 @@ __all__ = [
     "Kind",
     "NodeParameter",
     "Port",
-    "Reliability",
     "RosPlan",
     "Topic",
 ]
@@ -32,7 +31,6 @@ CLOCK_TOPIC = "/clock"
 Descriptions = Mapping[str, ModelDescription]
 Direction = Literal["out", "in"]
 Kind = Literal["out", "in", "local"]
-Reliability = Literal["reliable", "best_effort"]
 
 
 class Port(msgspec.Struct, frozen=True):
@@ -63,6 +61,7 @@ class Topic(msgspec.Struct, frozen=True):
     Attributes:
         name: absolute name; in a node that runs a single FMU it may be relative to the namespace of the node.
         direction: the mesh publishes `out` and subscribes to `in`.
+        ports: its variables; without one, it is published once.
         profile: how the topic looks on Zenoh.
         frame_id: of every header in the message.
         constants: (field, value) for fields that have the same value in every message.
@@ -74,7 +73,7 @@ class Topic(msgspec.Struct, frozen=True):
     ports: tuple[Port, ...]
     profile: RosProfile = "ros2dds"
     frame_id: str = ""
-    reliability: Reliability = "reliable"
+    qos: Qos = Qos()
     constants: tuple[tuple[str, str | float | bool], ...] = ()
 
 
@@ -101,3 +100,19 @@ class RosPlan(msgspec.Struct, frozen=True):
     namespace: str = "/"
     clock_points: int | None = None
     time_source: Port | None = None
+
+    @property
+    def listed(self) -> tuple[MeshTopic, ...]:
+        """What users are shown of the topics."""
+        shown = [
+            MeshTopic(
+                topic=topic.name,
+                direction=topic.direction,
+                type=topic.message,
+                qos=topic.qos,
+                sources=tuple(f"{port.instance}.{port.variable.name}" for port in topic.ports) or ("constants",),
+            )
+            for topic in self.topics
+        ]
+        clock = MeshTopic(CLOCK_TOPIC, "out", CLOCK, Qos(), ("simulation time",))
+        return (*shown, clock) if self.clock_points is not None else tuple(shown)

@@ -28,7 +28,7 @@ from ...wire.client.readings import Target
 from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
-from ..gateway.profile import DEPTH, Profile, Put, Take
+from ..gateway.profile import Profile, Put, Take
 from ..gateway.simulation_services import SimulationServices
 from ..messages.topics import RosPlan, Topic
 from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, watch_clock
@@ -100,8 +100,10 @@ class GatewayNode:
             FmuMeshError: something is wrong; everything that was done is undone.
         """
         loaded = running_configuration(Path(self._node.get_parameter("config").value))
-        if loaded.config.ros is None:
-            loaded = replace(loaded, config=replace(loaded.config, ros=RosConfig()))
+        section = loaded.config.ros or RosConfig()
+        if (namespace := self._node.get_namespace()) != "/":  # such as that of `__ns`
+            section = replace(section, namespace=namespace)
+        loaded = replace(loaded, config=replace(loaded.config, ros=section))
         endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
         with ExitStack() as stack:
             client = stack.enter_context(Meshes(endpoints, _TIMEOUT_S)).named(loaded.config.mesh)
@@ -210,5 +212,11 @@ class GatewayNode:
 
 
 def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
-    qos = ros_module("rclpy.qos")
-    return qos.QoSProfile(depth=DEPTH, reliability=qos.ReliabilityPolicy[topic.reliability.upper()])
+    qos, own = ros_module("rclpy.qos"), topic.qos
+    duration = ros_module("rclpy.duration").Duration
+    return qos.QoSProfile(
+        depth=own.depth,
+        reliability=qos.ReliabilityPolicy[own.reliability.upper()],
+        durability=qos.DurabilityPolicy[own.durability.upper()],
+        deadline=duration(seconds=own.deadline or 0.0),  # 0 is none
+    )

@@ -289,7 +289,10 @@ class FmuTopics:
             ConfigurationError: ROS has no such message type.
         """
         kind = message_class(topic.message)
-        overrides = ros_module("rclpy.qos_overriding_options").QoSOverridingOptions.with_default_policies()
+        policies = ros_module("rclpy.qos").QoSPolicyKind
+        names = ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY", "DEADLINE")
+        overriding = ros_module("rclpy.qos_overriding_options").QoSOverridingOptions
+        overrides = overriding([policies[name] for name in names])
         if topic.direction == "out":
             publisher = self._node.create_publisher(kind, topic.name, _DEPTH, qos_overriding_options=overrides)
             self._publishers.append((topic, publisher, kind))
