@@ -7,8 +7,6 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from fmu_mesh.variables.value_types import PlainValue
-
 __all__ = [
     "ENDPOINT_PATTERN",
     "KEY_PREFIX_PATTERN",
@@ -19,8 +17,6 @@ __all__ = [
     "Base",
     "DeadlineSeconds",
     "Endpoint",
-    "InputConfig",
-    "Inputs",
     "Name",
     "Sha256",
 ]
@@ -50,22 +46,3 @@ NOT_NEGATIVE = {"minimum": 0}
 
 class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of every section: frozen, without unknown fields. A subclass repeats `kw_only`, which is not inherited."""
-
-
-class TimeoutConfig(Base, frozen=True, kw_only=True):
-    """What an input does for which no value comes."""
-
-    after: Annotated[float, Meta(description="Simulation time in s without a value.", extra_json_schema=POSITIVE)]
-    then: Annotated[
-        PlainValue,
-        Meta(description="hold; start: its start value; stop: the run ends with exit code 0; or a value of its type."),
-    ]
-
-
-class InputConfig(Base, frozen=True, kw_only=True):
-    """An input that is not connected."""
-
-    timeout: Annotated[TimeoutConfig | None, Meta(description="What it does without a value; null: it holds.")] = None
-
-
-Inputs = Annotated[dict[str, InputConfig], Meta(description="Inputs that are not connected, by variable name.")]

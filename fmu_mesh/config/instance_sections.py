@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from fmu_mesh.config.base import POSITIVE, Base, InputConfig, Name
+from fmu_mesh.config.base import POSITIVE, Base, Name
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import PlainValue
@@ -31,6 +31,8 @@ __all__ = [
     "FluidDynamicsConfig",
     "Group",
     "Host",
+    "InputConfig",
+    "Inputs",
     "InstanceSection",
     "Kinds",
     "NotFinitePolicy",
@@ -71,6 +73,25 @@ Host = Annotated[str | None, Meta(description="Host the node is meant to run on;
 
 
 Section = TypeVar("Section", bound="InstanceSection")
+
+
+class TimeoutConfig(Base, frozen=True, kw_only=True):
+    """What an input does for which no value comes."""
+
+    after: Annotated[float, Meta(description="Simulation time in s without a value.", extra_json_schema=POSITIVE)]
+    then: Annotated[
+        PlainValue,
+        Meta(description="hold; start: its start value; stop: the run ends with exit code 0; or a value of its type."),
+    ]
+
+
+class InputConfig(Base, frozen=True, kw_only=True):
+    """An input that is not connected."""
+
+    timeout: Annotated[TimeoutConfig | None, Meta(description="What it does without a value; null: it holds.")] = None
+
+
+Inputs = Annotated[dict[str, InputConfig], Meta(description="Inputs that are not connected, by variable name.")]
 
 
 class InstanceSection:

@@ -15,8 +15,17 @@ from typing import Annotated, Literal, cast
 import msgspec
 from msgspec import Meta
 
-from ..config.base import Base, Inputs
-from ..config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
+from ..config.base import Base
+from ..config.instance_sections import (
+    KIND,
+    Group,
+    Host,
+    Inputs,
+    InstanceSection,
+    NotFinitePolicy,
+    StartValues,
+    StepSize,
+)
 from ..config.mesh import LimitsConfig
 from ..errors import StepFailed
 from ..rings.ring import Ring

@@ -13,9 +13,18 @@ from typing import Annotated, ClassVar, Literal, Self
 from msgspec import Meta
 from msgspec.structs import replace
 
-from ...config.base import POSITIVE, Base, Inputs, Sha256
+from ...config.base import POSITIVE, Base, Sha256
 from ...config.findings import Findings
-from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
+from ...config.instance_sections import (
+    KIND,
+    Group,
+    Host,
+    Inputs,
+    InstanceSection,
+    NotFinitePolicy,
+    StartValues,
+    StepSize,
+)
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...system.process_sharing import Claims

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from ...config.base import Base, Inputs
+from ...config.base import Base
 from ...config.instance_sections import (
     KIND,
     Actuators,
@@ -14,6 +14,7 @@ from ...config.instance_sections import (
     FluidDynamics,
     Group,
     Host,
+    Inputs,
     NotFinitePolicy,
     PhysicsSection,
     StartValues,

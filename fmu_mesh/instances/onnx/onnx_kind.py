@@ -14,8 +14,17 @@ import msgspec
 from msgspec import Meta
 
 from ... import files
-from ...config.base import Base, Inputs
-from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
+from ...config.base import Base
+from ...config.instance_sections import (
+    KIND,
+    Group,
+    Host,
+    Inputs,
+    InstanceSection,
+    NotFinitePolicy,
+    StartValues,
+    StepSize,
+)
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...variables.model_description import ModelDescription

@@ -10,8 +10,17 @@ from typing import Annotated, Literal, NamedTuple, Self
 from msgspec import Meta
 from msgspec.structs import replace
 
-from ...config.base import Base, Inputs
-from ...config.instance_sections import KIND, Group, Host, InstanceSection, NotFinitePolicy, StartValues, StepSize
+from ...config.base import Base
+from ...config.instance_sections import (
+    KIND,
+    Group,
+    Host,
+    Inputs,
+    InstanceSection,
+    NotFinitePolicy,
+    StartValues,
+    StepSize,
+)
 from ...variables.model_description import ModelDescription
 from ...variables.value_types import PlainValue
 
