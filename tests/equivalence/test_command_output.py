@@ -19,7 +19,7 @@ from tests.helpers import DEADLINE_S, FMUS, Launched, Place, row_count, wait_unt
 LOCAL = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed", "local"])
 PACED = {"real_time_factor": 1.0, "step_size": 0.01}
 FIELDS = {
-    "mesh", "state", "exit_code", "point", "time", "seconds", "rows", "file", "restarts", "error", "ended_by",
+    "mesh", "state", "exit_code", "point", "time", "seconds", "rows", "file", "restarts", "resets", "error", "ended_by",
     "files", "warnings",
 }  # fmt: skip
 
@@ -50,6 +50,7 @@ def test_a_launch_for_programs_prints_its_outcome_and_nothing_else(place: Place,
         "rows": 1001,
         "file": str(place.folder / "pair.csv"),
         "restarts": 0,
+        "resets": 0,
         "error": None,
         "ended_by": None,
         "files": [{"file": str(place.folder / "pair.csv"), "rows": 1001}],

@@ -123,7 +123,7 @@ def test_the_executable_gateway_has_the_names_that_the_user_gives(ros: Ros, pack
     from std_msgs.msg import Float64  # noqa: PLC0415 only where ROS is installed
 
     file = config(tmp_path, stop_time=60.0, real_time_factor=1)
-    subscription, angles = ros.collect(ros.peer(), Float64, "/pendulum/a")
+    subscription, angles = ros.collect(ros.peer(), Float64, "/lab/pendulum/a")
     executables = package / "lib/fmu_mesh_ros"
     names = ["--ros-args", "-r", "__ns:=/lab", "-r", "__node:=twin"]
     mesh = subprocess.Popen([executables / "mesh", file, "--no-progress"], cwd=tmp_path)
@@ -135,7 +135,7 @@ def test_the_executable_gateway_has_the_names_that_the_user_gives(ros: Ros, pack
 
         def named() -> bool:
             """ROS hears of a publisher before it knows whose that is."""
-            found = looking.get_publishers_info_by_topic("/pendulum/a")
+            found = looking.get_publishers_info_by_topic("/lab/pendulum/a")
             return [(own.node_namespace, own.node_name) for own in found] == [("/lab", "twin")]
 
         ros.until(named, "a publisher of /lab/twin, and no other one")
