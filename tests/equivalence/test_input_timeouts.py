@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 import fmu_mesh
+from tests.equivalence.test_scenarios import DISTRIBUTED, local_rows
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
-from tests.helpers import BY_STREAMS, BY_ZENOH, FMUS, Place, rows_of, wait_until, write_config
+from tests.helpers import FMUS, Place, rows_of, wait_until, write_config
 
 STEER = '''
 import fmu_mesh
@@ -75,23 +76,7 @@ def written(folder: Path, **sections: Any) -> Path:  # noqa: ANN401  as the file
     return write_config(folder, instances=instances, connections=connections, name="quiet", stop_time=0.3, **sections)
 
 
-def local_rows(config: Path) -> bytes:
-    output = config.with_name("local.csv")
-    fmu_mesh.load(config).run(processes=False, output=output)
-    return output.read_bytes()
-
-
-@pytest.mark.parametrize(
-    "sections",
-    [
-        {},
-        {"zenoh": BY_STREAMS},
-        {"zenoh": BY_ZENOH},
-        {"simulation": {"window": 1, "algorithm": "jacobi"}},
-        {"simulation": {"window": 7, "start_time": 0.0}},
-    ],
-    ids=["rings", "streams", "frames", "lockstep", "window of 7"],
-)
+@DISTRIBUTED
 def test_processes_give_the_floats_of_one_process(sections: Mapping[str, Any], place: Place) -> None:
     config = written(place.folder, **sections)
 

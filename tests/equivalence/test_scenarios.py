@@ -66,7 +66,7 @@ def local_rows(config: Path) -> bytes:
     return output.read_bytes()
 
 
-@pytest.mark.parametrize(
+DISTRIBUTED = pytest.mark.parametrize(
     "sections",
     [
         {},
@@ -77,6 +77,9 @@ def local_rows(config: Path) -> bytes:
     ],
     ids=["rings", "streams", "frames", "lockstep", "window of 7"],
 )
+
+
+@DISTRIBUTED
 def test_processes_give_the_floats_of_one_process(sections: Mapping[str, Any], place: Place) -> None:
     config = written(place.folder, **sections)
 
