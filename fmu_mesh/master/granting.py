@@ -1,14 +1,15 @@
 """What the nodes have reached, and what they are granted.
 
-The nodes of this host keep the windows among themselves, and the last point can be granted to them at once, because a
-grant can be taken back. A node that does not share this memory gets grants by a row stream or by messages, and tells
-its progress so, too: these grants reach about 50 ms ahead, and stay; those by messages contain the windows.
+The nodes of this host keep the windows among themselves, and what nobody has claimed can be taken back. Still the grant
+leads the slowest instance by no more than it steps in half a second: fast ones that are ahead of it cannot go back, and
+a pause has to wait until it is where they are. A node that does not share this memory gets grants by a row stream or by
+messages, and tells its progress so, too: these grants reach about 50 ms ahead, and stay; those by messages contain the
+windows.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from ..errors import DeadlineExceeded, ProtocolBroken
 from ..system.plan import MASTER, RECORDER, Plan
@@ -18,6 +19,8 @@ from .pacing import CLOCK, PAUSE, Reach
 from .registrations import spoken
 
 __all__ = ["Granting"]
+
+_LEAD_S = 0.5
 
 
 class Granting:
@@ -45,11 +48,11 @@ class Granting:
         self.messages = True
         self._keep_windows = True
         self._plan = plan
-        self._windows = [node.window for node in plan.nodes.values()]
         # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
         self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
         self._sent = 0
         self._reach = Reach()
+        self._lead = Reach(_LEAD_S)
         self._round_trip_s: float | None = None
 
     def go(self, ways: Ways) -> None:
@@ -88,6 +91,11 @@ class Granting:
     def _all_share(self) -> bool:
         return len(self.sharing) == len(self.progress)
 
+    @property
+    def _limits(self) -> Iterator[tuple[int, str]]:
+        """How far the window of each node lets the others go, and its name."""
+        return ((self.progress[name] + node.window, name) for name, node in self._plan.nodes.items())
+
     def holder(self, *, hold: int | None, paced: int) -> str | None:
         """What limits steps: a pause at ``hold``, the wall clock at ``paced``, or the window of a node; or nothing."""
         grant = self.reaches_all
@@ -95,8 +103,7 @@ class Granting:
             return None
         if grant in (hold, paced):
             return PAUSE if grant == hold else CLOCK
-        limits = map(operator.add, self.progress.values(), self._windows)
-        return min(zip(limits, self.progress, strict=True))[1]
+        return min(self._limits)[1]
 
     def instances_of(self, node: str) -> str | None:
         """The names of the instances of a node, for an error."""
@@ -127,6 +134,11 @@ class Granting:
         most = planned if self.last_point < planned and node != RECORDER else self.grant + self._most_ahead
         return -1 <= point <= most
 
+    def led(self, wanted: int, now: float) -> int:
+        """The point up to which all may be granted now, at most the ``wanted`` one; ``now`` is monotonic, in s."""
+        self._lead.points(self.reached, now)
+        return min(wanted, self._lead.granted)
+
     def raise_to(self, point: int) -> None:
         """Grant all points up to this one."""
         self.grant = point
@@ -140,7 +152,7 @@ class Granting:
         """The grant for nodes that cannot read it, and whether it has grown since the last call; ``now`` is in s."""
         if self._all_share:
             return 0, False
-        credit = min(map(operator.add, self.progress.values(), self._windows)) if self._keep_windows else self.grant
+        credit = min(self._limits)[0] if self._keep_windows else self.grant
         reached = self.reached
         owed = min(self.grant, credit, reached + self._reach.points(reached, now, self._round_trip_s))
         grown = owed > self._sent
@@ -152,7 +164,8 @@ class Granting:
 
         Nothing if the grant is below the ``wanted`` point and all have it: only the wall clock lets it grow.
         """
-        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted):
+        is_led = self.grant == self._lead.granted
+        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted and not is_led):
             return None
         nodes = [node for node in self.seen if node != RECORDER]
         if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:
@@ -161,7 +174,7 @@ class Granting:
         reached = self.progress[slowest]
         if reached >= self.reaches_all and reached >= 0:
             return None
-        goal = self.grant if self.reaches_all == self.grant else (reached + self.reaches_all) // 2
+        goal = self.grant if self.reaches_all == self.grant and not is_led else (reached + self.reaches_all) // 2
         return slowest, max(goal, reached + 1)
 
     def no_progress(self, silent_s: float, stopped: Sequence[str]) -> DeadlineExceeded:

@@ -344,7 +344,7 @@ class MasterStates:
                 self._enter("stopping", now)
                 self._send_finish(now)
             return
-        grant = min(self.wanted, paced)
+        grant = granting.led(min(self.wanted, paced), now)
         if grant > granting.grant:
             if granting.slowest >= granting.grant:  # they had nothing to do until now, because of the wall clock
                 self._moved_at = self._slowest_moved_at = now

@@ -15,7 +15,6 @@ CLOCK = "@clock"
 PAUSE = "@pause"
 """Name of what limits the grant while the mesh is paused."""
 
-_STEADY_S = 0.05
 _LATE = 4
 """After so many times of what a grant should take, fewer points are granted. TCP begins slowly, too."""
 _TICK_S = 1e-6
@@ -46,13 +45,18 @@ class RunClock:
 class Reach:
     """How many points a grant that cannot be taken back may be ahead of the slowest instance.
 
-    A pause takes effect at such a grant. So it reaches as far as the nodes come in 50 ms, and in the time that a grant
-    and the answer are on their way. It begins with one point, and is measured again each time the nodes have used it.
+    A pause takes effect at such a grant. So it reaches as far as the nodes come in ``steady_s``, and in the time that a
+    grant and the answer are on their way. It begins with one point, and is measured again each time the nodes have used
+    it.
+
+    Attributes:
+        granted: the farthest point that a grant has reached so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, steady_s: float = 0.05) -> None:
+        self._steady_s = steady_s
         self._points = self._fresh = 1
-        self._slowest = self._granted = self._mark = -1
+        self._slowest = self.granted = self._mark = -1
         self._since = 0.0
         self._shortest_s = math.inf
 
@@ -64,20 +68,20 @@ class Reach:
         elapsed_s = now - self._since
         if is_used := slowest >= self._mark:
             self._shortest_s = min(self._shortest_s, elapsed_s)
-        if is_used or elapsed_s >= _LATE * (_STEADY_S + (round_trip_s or 0.0)):
+        if is_used or elapsed_s >= _LATE * (self._steady_s + (round_trip_s or 0.0)):
             gone, on_way_s = slowest - self._slowest, self._shortest_s if round_trip_s is None else round_trip_s
             passing = gone / max(elapsed_s, _TICK_S)
             # Who has used a far grant soon had waited for it, and steps faster than points have come.
             stepping_s = max(elapsed_s - (round_trip_s or 0.0), _TICK_S)
-            waited = is_used and stepping_s < _STEADY_S / 2
+            waited = is_used and stepping_s < self._steady_s / 2
             speed = max(passing, self._fresh / stepping_s) if waited else passing
-            wanted = speed * _STEADY_S + passing * on_way_s
+            wanted = speed * self._steady_s + passing * on_way_s
             least = 1 if is_used else self._points // 2  # what is late may be on its way
             self._points = max(1, least, math.ceil(wanted))
             self._slowest, self._since = slowest, now
-            self._mark = max(self._granted + 1, slowest + self._points)  # nobody can be there before this round trip
-            self._fresh = self._mark - self._granted
-        self._granted = max(self._granted, slowest + self._points)
+            self._mark = max(self.granted + 1, slowest + self._points)  # nobody can be there before this round trip
+            self._fresh = self._mark - self.granted
+        self.granted = max(self.granted, slowest + self._points)
         return self._points
 
 

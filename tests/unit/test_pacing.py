@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.master import pacing
+from fmu_mesh.master.granting import Granting
 from fmu_mesh.master.pacing import Pacer, Reach
 from tests.helpers import write_config
 from tests.planning import prepare
@@ -124,3 +125,15 @@ def test_a_grant_that_is_used_late_is_halved() -> None:
     fast = [reach.points(round(1e6 * (now - 1000.0)), now, 0.0) for now in (1000.0, 1000.001, 1000.002)]
 
     assert [reach.points(2001, now, 0.0) for now in (1000.2, 1000.203)] == [fast[-1], fast[-1] // 2]
+
+
+def test_fast_instances_are_at_most_a_second_ahead_of_a_slow_one(tmp_path: Path) -> None:
+    granting = Granting(prepare(write_config(tmp_path, stop_time=1e6)))
+    ahead = []
+    for point in range(1000):  # 100 points/s; a pause takes effect where the fast ones are
+        granting.take((node, point) for node in granting.progress)
+        granting.raise_to(granting.led(1_000_000, 1000.0 + point / 100))
+        ahead.append(granting.grant - point)
+
+    assert ahead[0] <= 2
+    assert 50 <= min(ahead[100:]) <= max(ahead) <= 101
