@@ -152,7 +152,11 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     sources = {c.target: c.source.partition(".")[0] for c in config.connections}  # also those of wrong connections
     sources |= {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
     base = grid.step_size if grid is not None else 1.0
-    timeouts = {name: tuple(_timeouts(own, config, sources, base, collected)) for name, own in instances.items()}
+    timeouts = {
+        name: tuple(_timeouts(own, config, sources, base, collected))
+        for name, own in instances.items()
+        if config.instances[name].inputs
+    }
     timed = {(name, timeout.variable) for name, own in timeouts.items() for timeout in own}
     prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)
     _check_zenoh(loaded, collected)
@@ -175,7 +179,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
             scenario=tuple(
                 replace(one, every=(name, one.variable) in timed) for one in prescribed.schedules.get(name, ())
             ),
-            timeouts=timeouts[name],
+            timeouts=timeouts.get(name, ()),
         )
         for name, own in instances.items()
     }
