@@ -73,7 +73,7 @@ def without_scenario(config: Path) -> bytes:
 
 @pytest.mark.parametrize("way", [BY_STREAMS, BY_ZENOH], ids=["streams", "zenoh"])
 def test_pause_and_set_equal_a_scenario(place: Place, way: Mapping[str, bool]) -> None:
-    config = written_system("set", place.folder / "system", lasts_s=4.0, zenoh=way)
+    config = written_system("set", place.folder / "system", lasts_s=10.0, zenoh=way)
     expected = without_scenario(config)
 
     launched = place.start("launch", config, "--no-progress", "--paused")
@@ -86,7 +86,9 @@ def test_pause_and_set_equal_a_scenario(place: Place, way: Mapping[str, bool]) -
 @NEEDS_HOSTS
 def test_pause_and_set_over_two_hosts_equal_a_scenario(tmp_path: Path) -> None:
     with two_hosts(tmp_path) as (first, second):
-        configs = [written_system("set", host.folder / "own-clone" / "system", lasts_s=4.0) for host in (first, second)]
+        configs = [
+            written_system("set", host.folder / "own-clone" / "system", lasts_s=10.0) for host in (first, second)
+        ]
         expected, _ = map(without_scenario, configs)
 
         by_hand = started_apart(

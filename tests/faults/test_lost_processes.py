@@ -61,7 +61,7 @@ def started(
 
 def assert_is_what_one_process_calculates(place: Place, result: Path) -> None:
     """The rows that were kept are those of a run in one process that stops at the last of them, byte for byte."""
-    config, local, last = result.with_suffix(".yaml"), place.folder / "local.csv", len(rows_of(result)) - 1
+    config, local, last = result.with_suffix(".yaml"), place.folder / "local.csv", row_count(result) - 1
     options = ["--output", str(local), "--stop-time", str(last * 0.001), "--real-time-factor", "0"]
     assert main(["launch", str(config), "--local", "--no-progress", *options]) == 0
     assert result.read_bytes() == local.read_bytes()

@@ -130,7 +130,7 @@ def test_the_messages_that_once_ended_run_are_refused_and_it_goes_on(place: Plac
         ):
             for payload in (b"", b"\xff", b"{}", b"[" * 3000, b'{"node":"left"}'):
                 assert stranger.ask(key, payload), key
-        stranger.put(public.variable("free", "in", "u"), b"1.0", b'{"time":1e308}')
+        stranger.put(public.variable("free", "in", "u"), b"1.0", b'{"time":"soon"}')
         stranger.put(f"{public.root}/left/log", b'{"instance":"\xff"}')
         stranger.put(f"{public.root}/left/log", b"\xff" * 100)
         for key in (keys.frames("left", "right"), keys.frames("right", "@record"), keys.progress("left")):

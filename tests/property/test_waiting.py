@@ -10,6 +10,7 @@ deadlock.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -408,8 +409,12 @@ def test_in_every_order_of_events_all_sleepers_are_woken(name: str, machine: Mac
     assert not found.lost, found.lost
 
 
+_IN_LONG = pytest.mark.skipif("FMU_MESH_BURST_SECONDS" not in os.environ, reason="two minutes: .ci/long tsan runs it")
+_POLLING = [pytest.param(name, marks=[_IN_LONG] if name == "a burst and two sleepers" else []) for name in POLLING]
+
+
 @pytest.mark.parametrize("machine", Machine, ids=lambda machine: machine.name)
-@pytest.mark.parametrize("name", POLLING)
+@pytest.mark.parametrize("name", _POLLING)
 def test_who_polls_is_woken_by_a_pipe_in_every_order_of_events(name: str, machine: Machine) -> None:
     found = explore(name, machine, Protocol(polls=frozenset(POLLING[name])))
 
