@@ -125,7 +125,10 @@ class PageRun:
         file = self._folder / (block.detail if block.note == "file" else "configs/block.yaml")
         if block.note != "file":
             file.write_text(yaml.safe_dump(content), encoding="utf-8")
-        for words in ("check", "launch --local --no-progress --real-time-factor 0"):
+        launch = "launch --local --no-progress --real-time-factor 0"
+        if "real_time_factor" in content.get("simulation", {}):
+            launch += " --stop-time 2"  # a reader watches this run, and ends it
+        for words in ("check", launch):
             command = f"{self._exports}fmu-mesh {words} {file}"
             done = self._place.start_command(["bash", "-euo", "pipefail", "-c", command])
             assert done.wait() == 0, f"{block.place}\n{done.story()}"
@@ -354,6 +357,22 @@ NOT_RUN = [
         "docs/ros-simulation.md",
         "$ ros2 service call /get_simulation_state simulation_interfaces/srv/GetSimulationState",
         "`ros2` is not on PyPI; tests/ros/test_simulation_interfaces.py calls these services",
+    ),
+    (
+        "docs/ros-tutorial.md",
+        "sudo apt install python3-venv",
+        "it needs a ROS in /opt/ros; tests/ros/test_ros_tutorial.py runs the rest with rclpy from PyPI",
+    ),
+    ("docs/ros-tutorial.md", "source /opt/ros/jazzy/setup.bash", "as above"),
+    (
+        "docs/ros-tutorial.md",
+        "rviz2 -d examples/ros/arm.rviz --ros-args -p use_sim_time:=true",
+        "RViz is not on PyPI; tests/ros/test_ros_tutorial.py checks what it needs",
+    ),
+    (
+        "docs/ros-tutorial.md",
+        ('ros2 topic pub --once /joint_commands sensor_msgs/msg/JointState "{name: [joint2], position: [-0.5]}"'),
+        "`ros2` is not on PyPI; tests/ros/test_ros_tutorial.py sends this message",
     ),
     ("docs/ros.md", "$ ros2 topic list", "`ros2` is not on PyPI; tests/ros/test_bridge.py looks with rclpy"),
     (
