@@ -270,14 +270,14 @@ def test_placed_body_moves_alike_in_processes_program_and_rerun(tmp_path: Path) 
         "angular_velocity_z",
         "body_linear_velocity_x",
     ]
-    variables = [f"{'local:' if own.startswith('body') else ''}world.free_cube.{own}" for own in names]
+    variables = [f"world.free_cube.{own}" for own in names]
     config = write_config(
         tmp_path,
         name="placed",
         instances={"world": {"mujoco": str(CONFIGS / "worlds/fluid_body.xml"), "keyframe": "moving"}},
         connections=(),
         stop_time=0.2,
-        record={"file": "placed.csv", "variables": [*variables, "param:world.free_cube.pose"]},
+        record={"file": "placed.csv", "variables": [*variables, "world.free_cube.pose"]},
     )
     with fmu_mesh.load(config).start(paused=True) as run:
         run.step(50)

@@ -145,7 +145,7 @@ def test_other_fields_for_binary_are_refused(tmp_path: Path, message: str, field
 
 
 def test_recorded_images_and_clouds_are_what_others_read(tmp_path: Path) -> None:
-    variables = ["camera.image", "camera.points", "in:camera.mask"]
+    variables = ["camera.image", "camera.points", "camera.mask"]
     scenario = {"values": {"camera.mask": {"times": [0.0, 0.02], "values": ["AQID", "BAU="]}}}
     config = camera(tmp_path, stop_time=0.05, record={"file": "camera.mcap", "variables": variables}, scenario=scenario)
 

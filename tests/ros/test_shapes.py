@@ -255,7 +255,7 @@ def test_recorded_shapes_have_values_of_world_and_unit_quaternions(tmp_path: Pat
 
 def test_odometry_of_a_body_is_how_its_sensors_move(tmp_path: Path) -> None:
     pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
-    local = [f"local:world.base.body_{what}_velocity_{axis}" for what in ("linear", "angular") for axis in "xyz"]
+    local = [f"world.base.body_{what}_velocity_{axis}" for what in ("linear", "angular") for axis in "xyz"]
     topics: list[dict[str, Any]] = [{"odometry": "world.base"}, {"twist": "world.base"}]
     record = {"file": "robot.mcap", "variables": ["world.*", *local]}
     config = robot(tmp_path, *topics, record=record, stop_time=2.0)
