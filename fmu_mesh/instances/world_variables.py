@@ -5,18 +5,32 @@ So one configuration fits all of them. Where the value of a variable is stored i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
 from ..variables.model_description import Variable
 
-__all__ = ["Place", "WorldVariable", "body_variables", "joint_variables", "numbered", "world_input", "world_output"]
+__all__ = [
+    "STATE",
+    "Place",
+    "WorldVariable",
+    "body_state",
+    "body_variables",
+    "joint_variables",
+    "numbered",
+    "world_input",
+    "world_output",
+]
 
 Place = tuple[str, int]
 """Where a value is stored: the kind of value, and the place in the flat array of that kind."""
+
+STATE = 13
+"""The numbers of the state of a body: position, orientation (w first), linear and angular velocity, in world axes."""
 
 _OF_THE_STEP = (".acceleration", ".effort_applied", ".force")
 """Ends of the names of outputs that efforts and forces of the same step act on at once."""
@@ -89,6 +103,8 @@ def body_variables(
         "angular_velocity": ("xyz", "rad/s", "in world axes"),
         "wind": ("xyz", "m/s", f"velocity of the medium in {word} axes"),
         "relative_velocity": ("xyz", "m/s", f"velocity of the {word}'s origin against the medium in {word} axes"),
+        "body_linear_velocity": ("xyz", "m/s", f"of the {word}'s origin in {word} axes"),
+        "body_angular_velocity": ("xyz", "rad/s", f"in {word} axes"),
         "force": ("xyz", "N", f"acts at the {word}'s origin, in {word} axes"),
         "moment": ("xyz", "N.m", f"acts about the {word}'s origin, in {word} axes"),
     }
@@ -98,9 +114,26 @@ def body_variables(
             name, place = f"{body}.{what}_{letter}", (where, first + number)
             if what in ("force", "moment"):
                 yield world_input(name, place, unit, text)
-            else:
-                depends_on = wind if what in ("wind", "relative_velocity") else ()
-                yield world_output(name, place, unit, text, None, depends_on)
+                continue
+            depends_on = wind if what in ("wind", "relative_velocity") else ()
+            own = world_output(name, place, unit, text, None, depends_on)
+            is_local = what.startswith("body_")  # for odometry: neither recorded nor published unless it is named
+            yield replace(own, variable=replace(own.variable, causality="local")) if is_local else own
+
+
+def body_state(body: str, word: str, place: Place, start: Sequence[float]) -> Iterator[WorldVariable]:
+    """What sets a free body: its pose, its twist, or both at once; the place is that of the first of 13 numbers.
+
+    They are arrays, because one message sets all of its numbers at the same point.
+    """
+    twist = "linear and angular velocity in world axes"
+    pose = f"position (m) of the {word}'s origin in world axes, and orientation w, x, y, z"
+    rows = {"pose": (0, 7, pose), "twist": (7, STATE, twist), "state": (0, STATE, f"{pose}; {twist}")}
+    for what, (first, end, text) in rows.items():
+        own = world_output(f"{body}.{what}", (place[0], place[1] + first), None, text)
+        kind: dict[str, Any] = {"causality": "parameter", "variability": "tunable", "initial": "exact"}
+        sizes: dict[str, Any] = {"dimensions": (end - first,), "shape": (end - first,), "start": [*start[first:end]]}
+        yield replace(own, variable=replace(own.variable, **kind, **sizes, feedthrough=None))
 
 
 def numbered(variables: Iterable[WorldVariable]) -> tuple[WorldVariable, ...]:

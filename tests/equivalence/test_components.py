@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 import fmu_mesh
+from fmu_mesh.errors import StepFailed
 from tests.helpers import FMUS, Place, rows_of
 
 PARTS = '''\
@@ -351,6 +352,20 @@ def test_what_goes_wrong_in_a_component_is_told_with_its_line(place: Place, name
     assert launched.wait() == code, place.story()
     assert message in (launched.message if code else launched.errors), place.story()
     place.assert_nothing_left(10.0)
+
+
+@pytest.mark.parametrize("name", ["UInt8", "UInt64"])
+def test_list_of_whole_numbers_is_an_array_of_unsigned_ones(tmp_path: Path, name: str) -> None:
+    source, _ = fault(f"u = Input()\n{STEP}    self.y = [1, int(self.u)]", f"Output(type='{name}', shape=2)")
+    (tmp_path / "broken.py").write_text(f"from fmu_mesh import Input\n{source}", encoding="utf-8")
+
+    with fmu_mesh.load(written(tmp_path, {"c": {"python": "broken.py:C"}})).open() as system:
+        system.set("c.u", 255.0)
+        system.step()
+        assert system.get("c.y").tolist() == [1, 255]
+        system.set("c.u", -1.0)
+        with pytest.raises(StepFailed, match=rf"its value is \[1, -1\], expected an array of {name}"):
+            system.step()
 
 
 @pytest.mark.parametrize("options", [(), ("--local",)], ids=["processes", "local"])

@@ -63,7 +63,7 @@ class Driven:
         outputs: Sequence[str] = (),
         *,
         config: MujocoConfig | None = None,
-        start_values: Mapping[str, float] | None = None,
+        start_values: Mapping[str, float | list[float]] | None = None,
         step_size: float = 0.001,
         last_step: int = 1000,
         picture: Picture | None = None,

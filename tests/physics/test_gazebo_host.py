@@ -366,7 +366,8 @@ def test_the_effort_is_limited_as_the_file_says_unless_limits_are_disabled(
 @pytest.mark.usefixtures("fault")
 def test_velocity_against_the_wind_is_in_the_axes_of_the_link(tmp_path: Path) -> None:
     outputs = ["rod.position_z", "rod.orientation_w", "rod.angular_velocity_z"]
-    relative = [f"rod.relative_velocity_{axis}" for axis in "xyz"] + [f"rod.wind_{axis}" for axis in "xyz"]
+    vectors = ("relative_velocity", "wind", "body_linear_velocity", "body_angular_velocity")
+    relative = [f"rod.{what}_{axis}" for what in vectors for axis in "xyz"]
     driven = Driven(write_world(tmp_path, arm()), [], [*outputs, *relative], start_values={"wind_x": 2.0})
 
     values = driven.take()
@@ -375,7 +376,7 @@ def test_velocity_against_the_wind_is_in_the_axes_of_the_link(tmp_path: Path) ->
 
     # The link's x axis is the world's y axis, and its y axis the world's -x axis; it moves with (0.5, 0.25, 0).
     assert values[:3] == [3.0, 0.5**0.5, 1.0]
-    assert values[3:] == pytest.approx([0.25, 1.5, 0.0, 0.0, -2.0, 0.0], abs=1e-15)
+    assert values[3:] == pytest.approx([0.25, 1.5, 0.0, 0.0, -2.0, 0.0, 0.25, -0.5, 0.0, 0.0, 0.0, 1.0], abs=1e-15)
     assert asked == values[3:]
 
 

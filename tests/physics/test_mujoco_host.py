@@ -11,6 +11,7 @@ import math
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -269,6 +270,99 @@ def test_a_wind_that_is_connected_is_felt_at_the_first_point(tmp_path: Path) -> 
     felt = {v.name for v in description.variables if v.dependencies == ("wind_x", "wind_y", "wind_z")}
 
     assert felt == {f"cube.{what}_{axis}" for what in ("wind", "relative_velocity") for axis in "xyz"}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_velocities_in_body_axes_are_those_of_sensors(tmp_path: Path, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    attitude, velocity = random.normal(size=4), random.normal(size=6)
+    state = " ".join(map(str, (*random.normal(size=3), *attitude / np.linalg.norm(attitude))))
+    keys = f"<keyframe><key name='k' qpos='{state}' qvel='{' '.join(map(str, velocity))}'/></keyframe>"
+    sensors = "<sensor><velocimeter name='v' site='s'/><gyro name='w' site='s'/></sensor>"
+    cube = body(inertial="pos='0.3 -0.2 0.1' mass='2' diaginertia='1 1.2 1.5'").replace(
+        "<inertial", "<site name='s'/><inertial"
+    )
+    own = [f"cube.body_{what}_velocity_{axis}" for what in ("linear", "angular") for axis in "xyz"]
+    measured = [f"{name}.value[{number}]" for name in "vw" for number in (1, 2, 3)]
+
+    world = Driven(
+        write_world(tmp_path, cube, rest=keys + sensors),
+        outputs=[*own, *measured],
+        config=MujocoConfig(mujoco="world.xml", keyframe="k"),
+    )
+
+    for values in (list(world.read().values()), list(world.go(10).values())):
+        assert values[:6] == pytest.approx(values[6:], rel=1e-12, abs=1e-12)
+    assert world.instance.get_values(own) == values[:6]
+    assert list(world.read().values())[3:6] != velocity[3:].tolist()
+
+
+# --- the state of a free body
+
+# A half turn about x: the products of its matrix with a vector are exact.
+POSE, TWIST = [1.0, 2.0, 3.0, 0.0, 1.0, 0.0, 0.0], [0.25, -0.5, 0.75, 1.5, -2.5, 0.125]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"cube.state": [*POSE, *TWIST]}, [*POSE, *TWIST]),
+        ({"cube.pose": POSE, "cube.twist": TWIST}, [*POSE, *TWIST]),
+        ({"cube.twist": TWIST, "cube.pose": POSE}, [*POSE, *TWIST]),
+        ({"cube.pose": [*POSE[:4], 3.0, 0.0, 0.0]}, [*POSE, *[0.0] * 6]),
+        ({"cube.twist": TWIST}, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *TWIST]),
+        ({"cube.pose": [0.0] * 7}, [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]),
+    ],
+)
+def test_next_step_begins_with_the_state_that_was_set(
+    tmp_path: Path, given: dict[str, list[float]], expected: list[float]
+) -> None:
+    path = write_world(tmp_path, slider() + body(inertial="pos='0 0 0' mass='2' diaginertia='1 2 3'"))
+    names = [f"cube.{what}" for what in ("position_x", "orientation_y", "linear_velocity_z", "angular_velocity_x")]
+    driven = Driven(path, ["slide.effort"], [*names, "slide.position"])
+    before = driven.go(7, slide_effort=2.0)
+    driven.instance.set_values(given)
+
+    assert driven.instance.get_values(["cube.state", "cube.twist", "slide.position"]) == [
+        expected,
+        expected[7:],
+        before["slide.position"],
+    ]
+    engine = mujoco.MjData(driven.instance._model)
+    mujoco.mj_setState(driven.instance._model, engine, whole(driven), mujoco.mjtState.mjSTATE_INTEGRATION)
+    half_turn = -1.0 if expected[4] else 1.0
+    engine.qpos[1:8] = expected[:7]
+    engine.qvel[1:7] = [*expected[7:11], half_turn * expected[11], half_turn * expected[12]]
+    after = driven.go(3, slide_effort=2.0)
+    for _ in range(3):
+        mujoco.mj_step(driven.instance._model, engine)
+    mujoco.mj_kinematics(driven.instance._model, engine)
+
+    assert driven.instance.get_values(["cube.pose"]) == [[*engine.xpos[2].tolist(), *engine.xquat[2].tolist()]]
+    assert after["cube.position_x"] == engine.qpos[1]
+    assert after["slide.position"] == engine.qpos[0]
+
+
+def whole(driven: Driven) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.zeros(mujoco.mj_stateSize(driven.instance._model, kind))
+    mujoco.mj_getState(driven.instance._model, driven.instance._data, state, kind)
+    return state
+
+
+def test_free_bodies_have_a_state_that_can_be_a_start_value(tmp_path: Path) -> None:
+    keys = "<keyframe><key name='k' qpos='1 2 3 0 2 0 0 0' qvel='1 2 3 4 5 6 0'/></keyframe>"
+    path = write_world(tmp_path, body() + slider(), rest=keys)
+    config = MujocoConfig(mujoco="world.xml", keyframe="k")
+    variables = {own.name: own for own in load_world(path, config).description.variables}
+
+    state = variables["cube.state"]
+    assert (state.causality, state.variability, state.shape) == ("parameter", "tunable", (13,))
+    assert state.start == [1.0, 2.0, 3.0, 0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, -5.0, -6.0]
+    assert (variables["cube.pose"].start, variables["cube.twist"].start) == (state.start[:7], state.start[7:])
+    assert "sledge.state" not in variables
+    placed = Driven(path, config=config, start_values={"cube.pose": [5.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]})
+    assert placed.instance.get_values(["cube.state"]) == [[5.0, 0.0, 0.0, 1.0, *[0.0] * 3, *state.start[7:]]]
 
 
 # --- time and steps

@@ -15,8 +15,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+import fmu_mesh
 from fmu_mesh.run.options import PlanOptions
-from tests.helpers import Place
+from tests.helpers import Place, write_config
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
@@ -254,3 +255,53 @@ def test_every_instance_in_a_process_of_its_own_gives_the_same_floats(
     assert {key: column.tolist() for key, column in columns_of(output).items()} == {
         key: column.tolist() for key, column in expected.items()
     }
+
+
+# --- a body that is placed while the mesh runs
+
+
+def test_placed_body_moves_alike_in_processes_program_and_rerun(tmp_path: Path) -> None:
+    state = [1.0, 2.0, 3.0, 0.5, 0.5, -0.5, 0.5, 0.25, -0.5, 0.75, 1.5, -2.5, 0.125]
+    names = [
+        "position_x",
+        "position_z",
+        "orientation_w",
+        "linear_velocity_y",
+        "angular_velocity_z",
+        "body_linear_velocity_x",
+    ]
+    variables = [f"world.free_cube.{own}" for own in names]
+    config = write_config(
+        tmp_path,
+        name="placed",
+        instances={"world": {"mujoco": str(CONFIGS / "worlds/fluid_body.xml"), "keyframe": "moving"}},
+        connections=(),
+        stop_time=0.2,
+        record={"file": "placed.csv", "variables": [*variables, "world.free_cube.pose"]},
+    )
+    with fmu_mesh.load(config).start(paused=True) as run:
+        run.step(50)
+        run.set("world.free_cube.state", state)
+        run.step(50)
+        run.set("world.free_cube.state", state)  # again, although nothing else was set meanwhile
+        run.resume()
+        result = run.wait()
+    again = fmu_mesh.rerun(tmp_path / "placed.csv")
+    with fmu_mesh.load(config).open() as system:
+        system.step(50)
+        system.set("world.free_cube.state", state)
+        system.step(50)
+        half = system.get("world.free_cube.position_x")
+        system.set("world.free_cube.state", state)
+        system.step(100)
+        alone = [system.get(f"world.free_cube.{own}") for own in names]
+
+    columns = [result[f"world.free_cube.{own}"].tolist() for own in names]
+    assert [own[-1] for own in columns] == alone
+    assert columns == [again[f"world.free_cube.{own}"].tolist() for own in names]
+    moved = columns[0]
+    assert (moved[100], moved[50] == moved[51]) == (half, False)
+    assert moved[101] == moved[51] != moved[50], "the first step from the state, both times"
+    assert moved[51] == pytest.approx(1.0 + 0.25 * 0.001, rel=1e-12)
+    pose = [result[f"world.free_cube.pose[{number}]"][51] for number in (1, 3, 4)]
+    assert pose == [moved[51], columns[1][51], columns[2][51]]

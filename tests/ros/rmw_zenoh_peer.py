@@ -3,7 +3,7 @@
 Arguments: `sdk` (zenoh-ros2-sdk) or `pyzeros`, and JSON: `port` of the router, `domain`, `subscribe` and `publish`
 (message type by topic) and `count`. It prints one JSON line when it has declared its topics, publishes one sample of
 each kind for each line that it reads, and prints one JSON line with all that it has received when every subscribed
-topic has had `count` samples, more than a tenth of them different ones.
+topic has had `count` samples, more than a tenth of them different ones. Others are described at their functions.
 """
 
 from __future__ import annotations
@@ -122,6 +122,74 @@ def message(kind: str, number: int) -> Any:  # noqa: ANN401 any message
     else:
         made.data = f"text {number}" if kind.endswith("String") else 0.1 * number
     return made
+
+
+def lyrical(orders: dict[str, Any]) -> None:
+    """Be a node of Lyrical's rmw_zenoh, whose types with uint8[] have tokens of 14 parts and keys of their own.
+
+    Written after its source (0.10.5 and later): such a publisher uses the usual key only while somebody subscribes
+    whose token has 13 parts; without a subscriber it would send nothing, here it uses its own key. A subscriber has
+    both. For each line that it reads it sends ``data`` and prints where, and what came last.
+    """
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415  only needed here
+
+    store, domain = get_typestore(Stores.ROS2_KILTED), orders["domain"]
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{orders["port"]}"]')
+    received: dict[str, list[int]] = {}
+    others: set[str] = set()
+
+    def token_changed(sample: zenoh.Sample) -> None:
+        (others.add if sample.kind == zenoh.SampleKind.PUT else others.discard)(str(sample.key_expr))
+
+    with zenoh.open(config) as session:
+        place, alive = f"@ros2_lv/{domain}/{session.zid()}/0", session.liveliness()
+        kept: list[Any] = []
+
+        def declare(number: int, word: str, topic: str, kind: str) -> str:
+            typed = f"{kind.replace('/msg/', '::msg::dds_::')}_/{ros_hash(kind)}"
+            own = f"{place}/{number}/{word}/%/%/lyrical/{topic.replace('/', '%')}/{typed}/::,10:,:,:,,/backends:cpu"
+            assert len(own.split("/")) == 14
+            kept.append(alive.declare_token(own))
+            return f"{domain}{topic}/{typed}"
+
+        kept.append(alive.declare_token(f"{place}/0/NN/%/%/lyrical"))
+        kept.append(alive.declare_subscriber(f"@ros2_lv/{domain}/*/*/*/MS/**", token_changed, history=True))
+        for number, (topic, kind) in enumerate(orders["subscribe"].items(), start=1):
+            key = declare(number, "MS", topic, kind)
+
+            def arrived(sample: zenoh.Sample, topic: str = topic, kind: str = kind) -> None:
+                made: Any = store.deserialize_cdr(sample.payload.to_bytes(), kind)
+                received[topic] = made.data.tolist()
+
+            kept += [session.declare_subscriber(own, arrived) for own in (key, f"{key}/_buf_cpu")]
+        keys = {
+            topic: declare(number, "MP", topic, kind)
+            for number, (topic, kind) in enumerate(orders["publish"].items(), start=100)
+        }
+        say(declared=len(orders["subscribe"]) + len(keys))
+        for number, _line in enumerate(sys.stdin, start=1):
+            sent = {}
+            for topic, key in keys.items():
+                tokens = [token.split("/") for token in others]
+                is_usual = any(chunks[9] == topic.replace("/", "%") and len(chunks) == 13 for chunks in tokens)
+                attachment = struct.pack("<qqB16s", number, 0, 16, bytes(16))
+                data = image(store, orders["data"], orders["publish"][topic])
+                session.put(key if is_usual else f"{key}/_buf_cpu", data, attachment=attachment)
+                sent[topic] = "usual" if is_usual else "_buf_cpu"
+            say(sent=sent, received=dict(received))
+        for own in kept:
+            own.undeclare()
+
+
+def image(store: Any, data: list[int], kind: str) -> bytes:  # noqa: ANN401 a store of rosbags
+    """An image with this data, as rosbags writes it."""
+    header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    head, array = header(stamp=time(sec=0, nanosec=0), frame_id=""), np.array(data, np.uint8)
+    made = store.types[kind](head, 1, len(data), "mono8", 0, len(data), array)
+    return bytes(store.serialize_cdr(made, kind))
 
 
 def lines_of(stream: TextIO) -> asyncio.Queue[str | None]:
@@ -273,6 +341,5 @@ def simulation(orders: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    {"sdk": sdk, "pyzeros": pyzeros, "parameters": parameters, "simulation": simulation}[sys.argv[1]](
-        json.loads(sys.argv[2])
-    )
+    kinds = {"sdk": sdk, "pyzeros": pyzeros, "lyrical": lyrical, "parameters": parameters, "simulation": simulation}
+    kinds[sys.argv[1]](json.loads(sys.argv[2]))

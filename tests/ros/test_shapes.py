@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fmu_mesh
@@ -154,6 +155,14 @@ def test_bodies_and_sensors_have_the_vectors_of_other_shapes(tmp_path: Path) -> 
     }
     assert topic(tmp_path, imu="world.base").frame_id == "base"
 
+    body = topic(tmp_path, odometry="world.base")
+    assert (body.frame_id, body.constants) == ("world", (("child_frame_id", "base"),))
+    assert fields(body) == {
+        **vector("pose.pose.position", "world.base.position"),
+        **quaternion("pose.pose.orientation", "world.base.orientation"),
+        **vector("twist.twist.linear", "world.base.body_linear_velocity"),
+        **vector("twist.twist.angular", "world.base.body_angular_velocity"),
+    }
     velocities = {"linear": "world.velocimeter.value", "angular": "world.gyro.value"}
     odometry = topic(tmp_path, odometry={"body": "world.base", **velocities}, frame_id="odom")
     assert (odometry.name, odometry.frame_id, odometry.constants) == ("/odom", "odom", (("child_frame_id", "base"),))
@@ -195,7 +204,10 @@ def test_single_components_are_given_beside_vectors(tmp_path: Path) -> None:
         # The order of a quaternion by number is not the same everywhere.
         ({"imu": {"orientation": "world.attitude.value"}}, "or each component (`orientation.x: …`)"),
         ({"imu": {}}, "ros.topics[0].imu: nothing; expected `instance.vector` by part: orientation, angular_velocity"),
-        ({"odometry": "world.base"}, "no `linear` and no `angular`; expected a vector for each, of velocities in the"),
+        (
+            {"odometry": {"position": "world.base.position", "orientation": "world.base.orientation"}},
+            "no `linear` and no `angular`; expected a vector for each, of velocities in the",
+        ),
     ],
 )
 def test_what_is_wrong_with_shapes_is_told(tmp_path: Path, item: dict[str, Any], message: str) -> None:
@@ -239,3 +251,37 @@ def test_recorded_shapes_have_values_of_world_and_unit_quaternions(tmp_path: Pat
             # MuJoCo does not normalize again what is nearer to 1 than `mjMINVAL`; one rounding is that of `hypot`.
             assert abs(math.hypot(*rotation) - 1.0) <= mujoco.mjMINVAL + math.ulp(1.0)
             assert own.header.frame_id == "world"
+
+
+def test_odometry_of_a_body_is_how_its_sensors_move(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
+    local = [f"world.base.body_{what}_velocity_{axis}" for what in ("linear", "angular") for axis in "xyz"]
+    topics: list[dict[str, Any]] = [{"odometry": "world.base"}, {"twist": "world.base"}]
+    record = {"file": "robot.mcap", "variables": ["world.*", *local]}
+    config = robot(tmp_path, *topics, record=record, stop_time=2.0)
+
+    fmu_mesh.load(config).run(processes=False)
+    result = fmu_mesh.load(config).run(processes=False, record="memory")
+
+    messages = messages_of(tmp_path / "robot.mcap")
+    assert len(messages["/odom"]) == len(messages["/twist"]) == 201
+    for point, ((_, own), (_, world)) in enumerate(zip(messages["/odom"], messages["/twist"], strict=True)):
+        rotation = [getattr(own.pose.pose.orientation, letter) for letter in QUATERNION]
+        for what, sensor_name in {"linear": "velocimeter", "angular": "gyro"}.items():
+            measured = [result[f"world.{sensor_name}.value[{number}]"][point] for number in (1, 2, 3)]
+            found = [getattr(getattr(own.twist.twist, what), axis) for axis in "xyz"]
+            # The same vector through another path: twice the quaternion, not its matrix.
+            of_world = [getattr(getattr(world.twist, what), axis) for axis in "xyz"]
+            assert found == pytest.approx(into_axes(rotation, of_world), rel=1e-12, abs=1e-12)
+            assert found == pytest.approx(measured, rel=1e-12, abs=1e-12)
+    first = messages["/odom"][0][1].twist.twist.angular
+    assert (first.x, first.y, first.z) == pytest.approx((1.0, 2.0, 3.0), rel=1e-14), "as in the keyframe"
+
+
+def into_axes(quaternion: list[float], vector: list[float]) -> list[float]:
+    """A vector in the axes that a unit quaternion (x, y, z, w) turns: v + 2 w (u x v) + 2 u x (u x v), u = -xyz."""
+    x, y, z, w = quaternion
+    u = np.array([-x, -y, -z])
+    turned = np.cross(u, vector)
+    found: list[float] = (np.array(vector) + 2 * w * turned + 2 * np.cross(u, turned)).tolist()
+    return found

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+import fmu_mesh
 from fmu_mesh.ros.messages.definitions import MessageTypes
 from fmu_mesh.ros.messages.simulation_types import (
     SIMULATION_SERVICES,
@@ -28,6 +29,7 @@ SHARED = Path(built_types_or_skip()["LD_LIBRARY_PATH"].split(os.pathsep)[0]).par
 need("mujoco")
 
 WORLD = Path(__file__).parents[2] / "configs/worlds/fluid_body.xml"
+PENDULUM = WORLD.with_name("damped_pendulum.xml")
 STEP_SIZE = 0.001
 
 
@@ -38,11 +40,18 @@ def ros(place: Place, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
         yield ros
 
 
-def configured(place: Place, *, factor: float = 0.0, stop_time: float = 1000.0, **ros: Any) -> Path:  # noqa: ANN401 keys of the section
+def configured(
+    place: Place,
+    *,
+    factor: float = 0.0,
+    stop_time: float = 1000.0,
+    instances: dict[str, Any] | None = None,
+    **ros: Any,  # noqa: ANN401 keys of the section
+) -> Path:
     return write_config(
         place.folder,
         name="lab",
-        instances={"world": {"mujoco": str(WORLD), "keyframe": "moving"}},
+        instances={"world": {"mujoco": str(WORLD), "keyframe": "moving"}, **(instances or {})},
         connections=(),
         stop_time=stop_time,
         simulation={"step_size": STEP_SIZE, "real_time_factor": factor},
@@ -101,7 +110,7 @@ class Simulator:
 
 @pytest.fixture
 def started(request: pytest.FixtureRequest, ros: Ros, place: Place) -> tuple[Simulator, Launched, Any]:
-    """A paused mesh with its gateway, and the clients of a peer; the parameter has more of `ros` and the factor."""
+    """A paused mesh with its gateway, and the clients of a peer; the parameter is for `configured`."""
     config = configured(place, **getattr(request, "param", {}))
     launched = place.start("launch", config, "--paused", "--no-progress")
     place.note()
@@ -132,6 +141,7 @@ def test_mesh_is_paused_stepped_played_and_quit_from_ros(started: tuple[Simulato
         SimulatorFeature.STEP_SIMULATION_MULTIPLE,
         SimulatorFeature.STEP_SIMULATION_ACTION,
         SimulatorFeature.ENTITY_STATE_GETTING,
+        SimulatorFeature.ENTITY_STATE_SETTING,
         SimulatorFeature.SIMULATION_RESET,
     }
     assert simulator.state == SimulationStates.PAUSED
@@ -161,6 +171,8 @@ def test_bodies_of_world_are_entities_with_pose_and_twist(
     request = simulator.request("GetEntities")
     request.filters.filter = "free"
     assert simulator._ros.called(simulator._clients["GetEntities"], request).entities == ["world.free_cube"]
+    request.filters.filter = "(?i)^WORLD.f"
+    assert simulator._ros.called(simulator._clients["GetEntities"], request).entities == ["world.free_cube"]
     request.filters.filter = "("
     assert (
         simulator._ros.called(simulator._clients["GetEntities"], request).result.result == ResultCode.OPERATION_FAILED
@@ -175,7 +187,71 @@ def test_bodies_of_world_are_entities_with_pose_and_twist(
     assert state.pose.position.x == rows_of(place.folder / "lab.csv")[100][1] != 0.0
     assert (state.pose.orientation.w, state.twist.linear.x, state.header.frame_id) == (1.0, 1.0, "world")
     assert simulator("GetEntityState", entity="world.nobody").result.result == ResultCode.NOT_FOUND
-    assert simulator("SetEntityState", entity="world.cube").result.result == ResultCode.FEATURE_UNSUPPORTED
+
+
+@pytest.mark.parametrize("started", [{"instances": {"arms": {"mujoco": str(PENDULUM)}}}], indirect=True, ids=["arms"])
+def test_free_body_is_placed_exactly_and_results_list_it(
+    started: tuple[Simulator, Launched, Any], place: Place
+) -> None:
+    simulator, launched, _peer = started
+    pose = {"position": (1.0, -2.0, 3.0), "orientation": (0.0, 1.0, 0.0, 0.0)}  # w, x, y, z: a half turn
+    twist = {"linear": (0.5, 0.25, -1.5), "angular": (2.0, -3.0, 0.125)}
+
+    def asked(entity: str = "world.cube", frame: str = "world", **flags: bool) -> tuple[int, str]:
+        request = simulator.request("SetEntityState", entity=entity, **flags)
+        request.state.header.frame_id = frame
+        put(request.state.pose.position, pose["position"])
+        put(request.state.pose.orientation, pose["orientation"])
+        put(request.state.twist.linear, twist["linear"])
+        put(request.state.twist.angular, twist["angular"])
+        answer = simulator._ros.called(simulator._clients["SetEntityState"], request, once=True).result
+        return answer.result, answer.error_message
+
+    def placed() -> list[float]:
+        state = simulator("GetEntityState", entity="world.cube").state
+        vectors = (state.pose.position, state.pose.orientation, state.twist.linear, state.twist.angular)
+        return [number for vector in vectors for number in got(vector)]
+
+    assert simulator("StepSimulation", steps=10).result.result == ResultCode.OK
+    before = placed()
+    assert asked() == (ResultCode.OK, ""), "nothing is to be set"
+    assert placed() == before
+    assert asked(set_twist=True) == (ResultCode.OK, "")
+    assert placed() == [*before[:7], *twist["linear"], *twist["angular"]]
+    assert asked(set_pose=True, set_twist=True, frame="") == (ResultCode.OK, "")
+    assert placed() == [*pose["position"], *pose["orientation"], *twist["linear"], *twist["angular"]]
+    assert simulator("StepSimulation", steps=5).result.result == ResultCode.OK
+    after = placed()
+    code, text = asked("arms.damped_by_fmu", set_pose=True)
+    assert (code, "'arms.damped_by_fmu' has no free joint of MuJoCo" in text) == (ResultCode.OPERATION_FAILED, True)
+    code, text = asked(set_pose=True, frame="map")
+    assert (code, "the frame 'map'" in text) == (ResultCode.OPERATION_FAILED, True)
+    pose["orientation"] = (0.0, 0.0, 0.0, 0.0)
+    assert asked(set_pose=True)[0] == ResultCode.INVALID_POSE
+    assert asked("world.nobody")[0] == ResultCode.NOT_FOUND
+    assert placed() == after
+    assert simulator.set(SimulationStates.QUITTING) == (ResultCode.OK, "")
+    assert launched.wait() == 130
+
+    state = [*pose["position"], 0.0, 1.0, 0.0, 0.0, *twist["linear"], *twist["angular"]]
+    with fmu_mesh.load(place.folder / "lab.yaml").open() as system:
+        system.step(10)
+        system.set("world.cube.state", state)
+        system.step(5)
+        assert system.get("world.cube.state").tolist() == after
+    result = fmu_mesh.Result.read(place.folder / "lab.csv")
+    listed = [(own["instance"], own["variable"], own["point"]) for own in result.metadata["set"]]
+    assert listed == [("world", "cube.twist", 10), ("world", "cube.state", 10)]
+    assert result.metadata["set"][1]["value"] == state
+
+
+def put(vector: Any, numbers: tuple[float, ...]) -> None:  # noqa: ANN401 a message
+    for letter, number in zip("wxyz"[-len(numbers) :], numbers, strict=True):
+        setattr(vector, letter, number)
+
+
+def got(vector: Any) -> list[float]:  # noqa: ANN401 a message
+    return [getattr(vector, letter) for letter in "wxyz" if hasattr(vector, letter)]
 
 
 def test_reset_begins_again_at_first_point_with_equal_values(started: tuple[Simulator, Launched, Any]) -> None:

@@ -31,7 +31,7 @@ from ..body_axes import relative_velocity, to_body
 from ..world_variables import WorldVariable
 from .gazebo_process import HOW_TO_GET_IT, GazeboGone, GazeboProcess
 from .gazebo_section import GazeboClassicConfig
-from .gazebo_world import JOINT_STATE, LINK_STATE, load_gazebo_world
+from .gazebo_world import DERIVED, JOINT_STATE, LINK_STATE, load_gazebo_world
 
 __all__ = ["GazeboClassicInstance"]
 
@@ -63,8 +63,7 @@ class GazeboClassicInstance:
             "effort": np.zeros(joints),
             "wrench": np.zeros(6 * links),
             "wind": np.zeros(3),
-            "body_wind": np.zeros(3 * links),
-            "relative_velocity": np.zeros(3 * links),
+            **{what: np.zeros(3 * links) for what in DERIVED},
         }
         inputs = world.description.with_causality("input")
         self._inputs_by_name = {variable.name: world.places[variable.name] for variable in inputs}
@@ -152,7 +151,7 @@ class GazeboClassicInstance:
         return float(self._arrays[place.where][place.index])
 
     def _derive(self, links: Sequence[int]) -> None:
-        """Compute the wind, and the velocity against it, for these links in their axes."""
+        """Compute the wind, and the velocities also against it, for these links in their axes."""
         arrays, wind = self._arrays, self._arrays["wind"].tolist()
         for link in links:
             first = JOINT_STATE * len(self._world.joints) + LINK_STATE * link
@@ -160,6 +159,8 @@ class GazeboClassicInstance:
             rotation, place = _matrix(*state[3:7]), slice(3 * link, 3 * link + 3)
             arrays["body_wind"][place] = to_body(rotation, wind)
             arrays["relative_velocity"][place] = relative_velocity(rotation, state[7:10], wind)
+            arrays["body_linear_velocity"][place] = to_body(rotation, state[7:10])
+            arrays["body_angular_velocity"][place] = to_body(rotation, state[10:13])
 
     def _write_outputs(self, step: int) -> None:
         self._derive(self._derived)
@@ -172,7 +173,7 @@ class GazeboClassicInstance:
 
 def _derived_links(places: Sequence[WorldVariable]) -> list[int]:
     """The links for which these places need a computation."""
-    return sorted({place.index // 3 for place in places if place.where in {"body_wind", "relative_velocity"}})
+    return sorted({place.index // 3 for place in places if place.where in DERIVED})
 
 
 def _matrix(w: float, x: float, y: float, z: float) -> list[float]:

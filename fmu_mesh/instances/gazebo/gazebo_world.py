@@ -30,6 +30,9 @@ __all__ = ["GazeboJoint", "GazeboLink", "GazeboPlugin", "GazeboWorld", "load_gaz
 JOINT_STATE, LINK_STATE = 3, 13
 """Numbers per joint (position, velocity, acceleration) and link (position, attitude, two velocities) in a state."""
 
+DERIVED = ("body_wind", "relative_velocity", "body_linear_velocity", "body_angular_velocity")
+"""Vectors of a link that are computed from its state and the wind."""
+
 _DEFAULT_STEP_SIZE = 1e-3
 """s; of SDF (physics, max_step_size)."""
 
@@ -190,7 +193,7 @@ def _variables(joints: tuple[GazeboJoint, ...], links: tuple[GazeboLink, ...]) -
 def _link_variables(name: str, number: int, state: int) -> Iterator[WorldVariable]:
     in_state = {"position": 0, "orientation": 3, "linear_velocity": 7, "angular_velocity": 10}
     places = {what: ("state", state + offset) for what, offset in in_state.items()}
-    places |= {"wind": ("body_wind", 3 * number), "relative_velocity": ("relative_velocity", 3 * number)}
+    places |= {what: (what, 3 * number) for what in DERIVED} | {"wind": ("body_wind", 3 * number)}
     places |= {"force": ("wrench", 6 * number), "moment": ("wrench", 6 * number + 3)}
     variables = [*body_variables(name, "link", places)]
     yield from variables[:LINK_STATE]

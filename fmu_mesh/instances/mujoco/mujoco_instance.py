@@ -30,7 +30,7 @@ from ...simtime import TimeGrid, steps_between
 from ...variables.model_description import Value
 from ..body_axes import relative_velocity, to_body, wrench_at_center
 from ..contract import KeepsStateAsBytes, LogMessage
-from ..world_variables import WorldVariable
+from ..world_variables import STATE, WorldVariable
 from .mujoco_section import MujocoConfig
 from .mujoco_world import engine, load_world, warnings
 from .rendering import Picture
@@ -40,6 +40,8 @@ __all__ = ["MujocoInstance"]
 Floats = NDArray[np.float64]
 
 _OF_VELOCITIES = frozenset({"linear_velocity", "angular_velocity", "body_wind", "relative_velocity"})
+_SELDOM = frozenset({"body_linear_velocity", "body_angular_velocity", "state"})
+"""These take more time, so they are computed only for the bodies of which one is read."""
 _OF_JOINTS = frozenset({"position", "velocity", "acceleration", "effort_applied", "actuator_force"})
 """These are up to date after a step."""
 _INPUTS = frozenset({"effort", "effort_command", "wrench", "control", "wind"})
@@ -80,10 +82,8 @@ class MujocoInstance(KeepsStateAsBytes):
             "wrench": np.zeros(6 * bodies),
             "control": np.zeros(self._model.nu),
             "wind": np.array(self._model.opt.wind, dtype=np.float64),
-            "linear_velocity": np.zeros(3 * bodies),
-            "angular_velocity": np.zeros(3 * bodies),
-            "body_wind": np.zeros(3 * bodies),
-            "relative_velocity": np.zeros(3 * bodies),
+            **{what: np.zeros(3 * bodies) for what in _OF_VELOCITIES | _SELDOM},
+            "state": np.zeros(STATE * bodies),
         }
         self._arrays: dict[str, Floats] = {
             **self._own,
@@ -122,9 +122,12 @@ class MujocoInstance(KeepsStateAsBytes):
             raise InitializationFailed(f"MuJoCo says: {' '.join(warnings[0].split())}", instance=self.name)
 
     def set_values(self, values: Mapping[str, Value]) -> None:
-        """Set inputs by name, and before the first point positions and velocities of joints."""
+        """Set inputs and free bodies by name, and before the first point positions and velocities of joints."""
         for name, value in values.items():
             entry = self._entries[name]
+            if entry.where == "state":
+                self._place(*divmod(entry.index, STATE), np.array(value, dtype=np.float64))
+                continue
             self._arrays[entry.where][entry.index] = value
             if entry.where == "effort_command" and not self._direct[entry.index] and self._bound:
                 text = f"'{name}' was set, but the joint has an actuator: set the actuator's own input"
@@ -135,7 +138,8 @@ class MujocoInstance(KeepsStateAsBytes):
         """Current values of variables by name."""
         entries = [self._entries[name] for name in names]
         self._refresh(sensors=any(entry.where == "sensor" for entry in entries), bodies=_bodies_of(entries))
-        return [float(self._arrays[entry.where][entry.index]) for entry in entries]
+        found = [self._arrays[entry.where][entry.index :][: entry.variable.size].tolist() for entry in entries]
+        return [own if entry.variable.shape else own[0] for entry, own in zip(entries, found, strict=True)]
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
@@ -153,7 +157,7 @@ class MujocoInstance(KeepsStateAsBytes):
         self._outputs = [(ring, _grouped([self._entries[name] for name in ring.layout.names])) for ring in outputs]
         self._reads = any(entry.where not in _OF_JOINTS for entry in read)
         self._reads_sensors = any(entry.where == "sensor" for entry in read)
-        self._reads_bodies = tuple(sorted(_bodies_of(read)))
+        self._reads_bodies = _bodies_of(read)
         self._finish(step)
         self._bound = True
 
@@ -228,6 +232,18 @@ class MujocoInstance(KeepsStateAsBytes):
         bodies = {entry.index // 6 for entry in entries if entry.where == "wrench"}
         self._driven = tuple(sorted({*self._driven, *bodies}))
 
+    def _place(self, body: int, first: int, numbers: Floats) -> None:
+        """Set the state of a free body from its number ``first`` on; the others stay, as they are in world axes."""
+        self._refresh(sensors=False, bodies={body: True})
+        state, joint = self._own["state"][STATE * body :][:STATE], self._model.body_jntadr[body]
+        state[first:][: len(numbers)] = numbers
+        self._mujoco.mju_normalize4(state[3:7])
+        rotation = np.zeros(9)
+        self._mujoco.mju_quat2Mat(rotation, state[3:7])
+        self._data.qpos[self._model.jnt_qposadr[joint] :][:7] = state[:7]
+        angular = to_body(rotation.tolist(), state[10:].tolist())  # MuJoCo has it in body axes
+        self._data.qvel[self._model.jnt_dofadr[joint] :][:6] = (*state[7:10], *angular)
+
     def _apply(self) -> None:
         """Apply what is constant during an own step: efforts of joints, controls of the model's actuators, the wind."""
         own, memory = self._own, self._memory
@@ -277,8 +293,11 @@ class MujocoInstance(KeepsStateAsBytes):
 
     # --- what is read
 
-    def _refresh(self, *, sensors: bool, bodies: Iterable[int] = ()) -> None:
-        """Compute what follows from positions and velocities for this point: after `mj_step` it is one step old."""
+    def _refresh(self, *, sensors: bool, bodies: Mapping[int, bool]) -> None:
+        """Compute what follows from positions and velocities for this point: after `mj_step` it is one step old.
+
+        ``bodies`` is what `_bodies_of` returns.
+        """
         mujoco, model, data, own = self._mujoco, self._model, self._data, self._own
         if sensors:  # those of accelerations and forces keep what the last step found
             mujoco.mj_step1(model, data)
@@ -288,7 +307,7 @@ class MujocoInstance(KeepsStateAsBytes):
             mujoco.mj_comVel(model, data)
         wind = own["wind"].tolist()
         result = np.zeros(6)
-        for body in bodies:
+        for body, wholly in bodies.items():
             place = slice(3 * body, 3 * body + 3)
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, result, 0)
             rotation, velocity = data.xmat[body].tolist(), result[3:].tolist()
@@ -296,6 +315,10 @@ class MujocoInstance(KeepsStateAsBytes):
             own["linear_velocity"][place] = velocity
             own["body_wind"][place] = to_body(rotation, wind)
             own["relative_velocity"][place] = relative_velocity(rotation, velocity, wind)
+            if wholly:
+                own["body_linear_velocity"][place] = to_body(rotation, velocity)
+                own["body_angular_velocity"][place] = to_body(rotation, result[:3].tolist())
+                own["state"][STATE * body :][:STATE] = (*data.xpos[body], *data.xquat[body], *velocity, *result[:3])
 
     def _finish(self, step: int) -> None:
         """Compute the outputs of this point, write them as row ``step``, and show the world."""
@@ -319,13 +342,19 @@ class MujocoInstance(KeepsStateAsBytes):
 def _grouped(entries: Sequence[WorldVariable]) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
     """(kind, indices in its array, columns) of all variables, so that one assignment copies all of a kind."""
     groups: dict[str, tuple[list[int], list[int]]] = {}
-    for column, entry in enumerate(entries):
-        places, columns = groups.setdefault(entry.where, ([], []))
-        places.append(entry.index)
+    flat = [(entry.where, entry.index + element) for entry in entries for element in range(entry.variable.size)]
+    for column, (where, index) in enumerate(flat):
+        places, columns = groups.setdefault(where, ([], []))
+        places.append(index)
         columns.append(column)
     return [(where, np.array(places), np.array(columns)) for where, (places, columns) in groups.items()]
 
 
-def _bodies_of(entries: Iterable[WorldVariable]) -> set[int]:
-    """The bodies whose velocities have to be computed for these variables."""
-    return {entry.index // 3 for entry in entries if entry.where in _OF_VELOCITIES}
+def _bodies_of(entries: Iterable[WorldVariable]) -> dict[int, bool]:
+    """The bodies whose velocities have to be computed for these variables; True where a seldom one is among them."""
+    found: dict[int, bool] = {}
+    for entry in entries:
+        if entry.where in _OF_VELOCITIES | _SELDOM:
+            body = entry.index // (STATE if entry.where == "state" else 3)
+            found[body] = found.get(body, False) or entry.where in _SELDOM
+    return found

@@ -16,6 +16,8 @@ So no two variables have the same name.
 | `<body>.position_x/y/z`, `.orientation_w/x/y/z` | output | of the body's origin in world axes, as a unit quaternion |
 | `<body>.linear_velocity_…`, `.angular_velocity_…` | output | of the body's origin, in world axes |
 | `<body>.wind_…`, `.relative_velocity_…` | output | the wind, and the origin's velocity against it, in body axes |
+| `<body>.body_linear_velocity_…`, `.body_angular_velocity_…` | local | of the body's origin, in body axes |
+| `<body>.pose`, `.twist`, `.state` | parameter | set a body with a free joint: 7, 6 and all 13 numbers in world axes |
 | `<body>.force_…`, `.moment_…` | input | acting at the body's origin, and about it, in body axes |
 | `<sensor>.value`, `<sensor>.value[1]` … | output | at the point; of forces and accelerations: of the last step |
 | `<actuator>.control` / `.force` | input / output | an actuator of the model / its force in the last step |
@@ -32,13 +34,24 @@ from types import ModuleType
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from ...errors import LoadFailed
 from ...files import opened
 from ...installing import importing
 from ...text import did_you_mean, listed
 from ...variables.model_description import DefaultExperiment, ModelDescription
-from ..world_variables import WorldVariable, body_variables, joint_variables, numbered, world_input, world_output
+from ..body_axes import to_world
+from ..world_variables import (
+    STATE,
+    WorldVariable,
+    body_state,
+    body_variables,
+    joint_variables,
+    numbered,
+    world_input,
+    world_output,
+)
 from .mujoco_section import MujocoConfig
 
 __all__ = ["World", "engine", "load_world", "warnings"]
@@ -114,6 +127,7 @@ def _keyframe(model: Any, name: str | None, path: Path) -> int | None:  # noqa: 
 def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
     yield from _joints(mujoco, model, keyframe)
     yield from _bodies(model)
+    yield from _free_bodies(mujoco, model, keyframe)
     for number in range(model.nsensor):
         sensor = model.sensor(number)
         first, size = int(sensor.adr[0]), int(sensor.dim[0])
@@ -130,8 +144,7 @@ def _entries(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[W
 
 
 def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
-    positions = model.qpos0 if keyframe is None else model.key_qpos[keyframe]
-    velocities = [0.0] * model.nv if keyframe is None else model.key_qvel[keyframe]
+    positions, velocities = _start(model, keyframe)
     for joint in _of_one_axis(mujoco, model):
         if not joint.name:
             continue
@@ -140,6 +153,11 @@ def _joints(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[Wo
         places = {what: (what, dof) for what in _OF_DOFS} | {"position": ("position", qpos)}
         start = {"position": float(positions[qpos]), "velocity": float(velocities[dof])}
         yield from joint_variables(joint.name, places, revolute=revolute, start=start)
+
+
+def _start(model: Any, keyframe: int | None) -> tuple[Any, Any]:  # noqa: ANN401  mujoco has no types
+    """Positions and velocities at the start."""
+    return (model.qpos0, [0.0] * model.nv) if keyframe is None else (model.key_qpos[keyframe], model.key_qvel[keyframe])
 
 
 def _of_one_axis(mujoco: ModuleType, model: Any) -> list[Any]:  # noqa: ANN401  mujoco has no types
@@ -152,10 +170,26 @@ def _bodies(model: Any) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has 
     for number in range(_WORLD_BODY + 1, model.nbody):
         if name := model.body(number).name:
             vectors = ("linear_velocity", "angular_velocity", "relative_velocity")
-            places = {what: (what, 3 * number) for what in vectors}
+            in_body = ("body_linear_velocity", "body_angular_velocity")
+            places = {what: (what, 3 * number) for what in (*vectors, *in_body)}
             places |= {"position": ("body_position", 3 * number), "orientation": ("body_orientation", 4 * number)}
             places |= {"force": ("wrench", 6 * number), "moment": ("wrench", 6 * number + 3)}
             yield from body_variables(name, "body", {**places, "wind": ("body_wind", 3 * number)}, _WIND)
+
+
+def _free_bodies(mujoco: ModuleType, model: Any, keyframe: int | None) -> Iterator[WorldVariable]:  # noqa: ANN401  mujoco has no types
+    positions, velocities = _start(model, keyframe)
+    for joint in map(model.joint, range(model.njnt)):
+        body = int(joint.bodyid[0])
+        if joint.type[0] != mujoco.mjtJoint.mjJNT_FREE or not (name := model.body(body).name):
+            continue
+        pose = np.array(positions[int(joint.qposadr[0]) :][:7])
+        linear, angular = np.array(velocities[int(joint.dofadr[0]) :][:6]).reshape(2, 3).tolist()
+        mujoco.mju_normalize4(pose[3:])
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, pose[3:])
+        start = (*pose.tolist(), *linear, *to_world(rotation.tolist(), angular))
+        yield from body_state(name, "body", ("state", STATE * body), start)
 
 
 def _limits(mujoco: ModuleType, model: Any, free: set[str]) -> Iterator[tuple[int, float, float]]:  # noqa: ANN401  mujoco has no types

@@ -336,7 +336,8 @@ def _array(attribute: object, variable: Variable) -> Array:
     except ValueError:  # rows of different lengths
         raise _refused(attribute, variable) from None
     is_boolean = array.dtype == np.bool_
-    fits = is_boolean == (variable.type == "Boolean") and np.can_cast(array.dtype, dtype, "same_kind")
+    whole = array.dtype.kind == "i" and dtype.kind == "u"  # as a list of int: the numbers decide below
+    fits = is_boolean == (variable.type == "Boolean") and (whole or np.can_cast(array.dtype, dtype, "same_kind"))
     if not fits or array.shape != shape:
         raise _refused(attribute, variable)
     with np.errstate(over="ignore"):

@@ -39,6 +39,7 @@ import zenoh
 from ...config.mesh import RosConfig
 from ...errors import MeshLost, MessageRefused
 from ...simtime import TimeGrid
+from ...text import shown
 from ...wire.client.readings import latecomers
 from ...wire.keys import Keys
 from ...wire.messages import decode_json
@@ -245,7 +246,7 @@ class Gateway:
                 for message, time_s in assembler.add(port, stamp.point, stamp.time, value):
                     put(message, time_s)
             except CdrError as error:
-                variable.warn(f"{value!r} cannot be sent on '{assembler.topic.name}': {error}")
+                variable.warn(f"{shown(value)} cannot be sent on '{assembler.topic.name}': {error}")
         if self._clock is not None and variable.holds_until < 0:
             self._clock.begin(stamp.point)
         was_last = variable.holds_until <= self._complete

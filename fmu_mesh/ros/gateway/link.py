@@ -48,7 +48,7 @@ _MAX_WARNINGS = 20
 
 _BRIDGES = "@/*/@ros2_lv"
 _BRIDGED = "@/*/@ros2_lv/MP/**"
-_CLOCK_TOPICS = ("clock", "%clock")
+_CLOCK_TOPICS = (("clock",), ("%clock",))
 _GATEWAYS = "@/*/@fmu_mesh/*/*/*"
 
 _WHO = {"ros2dds": ("the bridge", "zenoh-bridge-ros2dds"), "rmw_zenoh": ("the router", "rmw_zenohd")}
@@ -250,7 +250,7 @@ class RosLink:
         with self._changed:
             keys = sorted(self._tokens)
         names = {key.split("/")[1]: key.split("/")[3:] for key in keys if "/@fmu_mesh/" in key}
-        clocks = [key.split("/") for key in keys if "/MP/" in key and topic_in(key)[0] in _CLOCK_TOPICS]
+        clocks = [key.split("/") for key in keys if "/MP/" in key and topic_in(key)[:1] in _CLOCK_TOPICS]
         own = str(self._ros.zid())
         return tuple(
             _described(chunks, names.get(zid))

@@ -43,7 +43,12 @@ _SHAPES = {
         "odom",
         "nav_msgs/msg/Odometry",
         ("pose.pose.position", "pose.pose.orientation", "twist.twist.linear", "twist.twist.angular"),
-        {"position": "position", "orientation": "orientation"},
+        {
+            "position": "position",
+            "orientation": "orientation",
+            "linear": "body_linear_velocity",
+            "angular": "body_angular_velocity",
+        },
     ),
     "imu": _Shape(
         "imu",

@@ -10,10 +10,13 @@ come: here as queries of Zenoh, in `fmu_mesh.ros.node.simulation_server` through
 
 from __future__ import annotations
 
+import math
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import zenoh
@@ -49,6 +52,7 @@ SIMULATION_THREADS = 4
 _ANSWER_S = 10.0
 _LONGEST_STEP_S = 3600.0
 _LOOKS = 20
+_FLAGS = re.compile(r"\(\?[aiLmsux]+\)")
 _TIME_AND_STATE = 1 | 2
 """Bits of SCOPE_TIME and SCOPE_STATE; SCOPE_ALL has them, too, and SCOPE_DEFAULT is 0."""
 _STATES: dict[MeshState, SimulationStates] = {
@@ -57,8 +61,11 @@ _STATES: dict[MeshState, SimulationStates] = {
     "running": SimulationStates.PLAYING,
     "paused": SimulationStates.PLAYING,  # in a step
 }
-_VECTORS = {"position": "xyz", "orientation": "xyzw", "linear_velocity": "xyz", "angular_velocity": "xyz"}
-"""What a body of a world has as outputs (`fmu_mesh.instances.world_variables`), in world axes."""
+_VECTORS = {"position": "xyz", "orientation": "wxyz", "linear_velocity": "xyz", "angular_velocity": "xyz"}
+"""What a body of a world has as outputs (`fmu_mesh.instances.world_variables`), in world axes; the order of a state."""
+_SETS = ("state", "pose", "twist")
+"""The parameters that set a free body: arrays of numbers in this order."""
+_WORLD = "world"
 
 
 class _Refusal(Exception):
@@ -93,6 +100,7 @@ class SimulationServices:
         self._stepping = threading.Lock()
         self._is_stopped = False
         self._known: dict[str, list[Target]] | None = None
+        self._free: dict[str, dict[int, Target]] = {}  # by the size of what they set
         answers = (
             self._features,
             self._get_state,
@@ -201,8 +209,9 @@ class SimulationServices:
             text = "bodies have no categories, tags and bounds: only the filter by name can be used"
             raise _Refusal(ResultCode.FEATURE_UNSUPPORTED, text)
         bodies, wanted = self._bodies(), filters["filter"]
+        flags = first.group() if (first := _FLAGS.match(wanted)) else ""  # Python wants them at the beginning
         try:
-            found = matched(f"{EXPRESSION}.*(?:{wanted}).*", bodies) if wanted else bodies
+            found = matched(f"{EXPRESSION}{flags}.*(?:{wanted[len(flags) :]}).*", bodies) if wanted else bodies
         except ValueError as error:
             text = f"the filter '{wanted}' is no regular expression: {error}"
             raise _Refusal(ResultCode.OPERATION_FAILED, text) from error
@@ -210,22 +219,36 @@ class SimulationServices:
 
     def _get_entity(self, request: Message) -> Message:
         readings = self._at_one_point(self._body(request["entity"]))
-        values = {reading.variable.rpartition(".")[2]: reading.value for reading in readings}
-        vectors = {what: {axis: values[f"{what}_{axis}"] for axis in letters} for what, letters in _VECTORS.items()}
+        values = [reading.value if isinstance(reading.value, list) else [reading.value] for reading in readings]
+        numbers = chain.from_iterable(values)
+        vectors = {what: {axis: next(numbers) for axis in letters} for what, letters in _VECTORS.items()}
         state: dict[str, Any] = self.codecs["GetEntityState"][1].empty()["state"]
         return {
             "state": {
                 **state,
-                "header": {"stamp": to_stamp(readings[0].time), "frame_id": "world"},
+                "header": {"stamp": to_stamp(readings[0].time), "frame_id": _WORLD},
                 "pose": {"position": vectors["position"], "orientation": vectors["orientation"]},
                 "twist": {"linear": vectors["linear_velocity"], "angular": vectors["angular_velocity"]},
             }
         }
 
     def _set_entity(self, request: Message) -> Message:
-        self._body(request["entity"])
-        text = "a body moves by what acts on it in the mesh: its state cannot be set"
-        raise _Refusal(ResultCode.FEATURE_UNSUPPORTED, text)
+        entity, state = request["entity"], request["state"]
+        self._body(entity)
+        if (free := self._free.get(entity)) is None:
+            text = f"'{entity}' has no free joint of MuJoCo: it moves by what acts on it in the mesh, and cannot be set"
+            raise _Refusal(ResultCode.OPERATION_FAILED, text)
+        if (frame := state["header"]["frame_id"]) not in ("", _WORLD):
+            raise _Refusal(ResultCode.OPERATION_FAILED, f"the frame '{frame}': a state is set in the frame '{_WORLD}'")
+        position, orientation = state["pose"]["position"], state["pose"]["orientation"]
+        pose = [*(position[axis] for axis in "xyz"), *(orientation[axis] for axis in "wxyz")]
+        twist = [state["twist"][part][axis] for part in ("linear", "angular") for axis in "xyz"]
+        if request["set_pose"] and not (all(map(math.isfinite, pose)) and any(pose[3:])):
+            raise _Refusal(ResultCode.INVALID_POSE, f"the pose {pose} (x, y, z; w, x, y, z) is none")
+        numbers = [*(pose if request["set_pose"] else ()), *(twist if request["set_twist"] else ())]
+        if numbers:  # in one message, so all hold from the same point on
+            self._client.set(free[len(numbers)], numbers)
+        return {}
 
     def _body(self, entity: str) -> list[Target]:
         bodies = self._bodies()
@@ -234,7 +257,7 @@ class SimulationServices:
         return bodies[entity]
 
     def _bodies(self) -> dict[str, list[Target]]:
-        """The outputs of each body of each world by `instance.body`; asked for once in a run."""
+        """What has the state of each body of each world, by `instance.body`; asked for once in a run."""
         if self._known is None:
             found: dict[str, list[Target]] = {}
             for instance in self._client.info().instances:
@@ -245,13 +268,17 @@ class SimulationServices:
                     name.removesuffix(".orientation_w") for name in targets if name.endswith(".orientation_w")
                 ):
                     found[body] = [targets[f"{body}.{what}_{axis}"] for what in _VECTORS for axis in _VECTORS[what]]
+                    own = [targets[name] for what in _SETS if (name := f"{body}.{what}") in targets]
+                    if len(own) == len(_SETS):
+                        found[body] = own[:1]  # one message has all, also what has been set since this point
+                        self._free[body] = {target.variable.shape[0]: target for target in own}
             self._known = found
         return self._known
 
     def _at_one_point(self, targets: list[Target]) -> list[Reading]:
         """The values of variables of an instance at the same point.
 
-        Those that are recorded or connected are in its memory, the others are read at the next point: while the mesh
+        Outputs that are recorded or connected are in its memory, the others are read at the next point: while the mesh
         runs, an answer may have values of two points.
         """
         for _ in range(_LOOKS):

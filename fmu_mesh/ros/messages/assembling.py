@@ -6,6 +6,7 @@ Owns which values belong into one message: those of one communication point, not
 from __future__ import annotations
 
 import math
+from base64 import b64decode
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -82,7 +83,9 @@ class Assembler:
             waiting.clear()
 
     def make(self, values: list[Any], time: float) -> bytes:
-        """Make the message with these values, one per port, at ``time`` in s; arrays as lists, or flat in numpy.
+        """Make the message with these values, one per port, at ``time`` in s.
+
+        Arrays are lists, or flat in numpy; a Binary is bytes, or base64 as in JSON.
 
         Raises:
             CdrError: a value does not fit into its field.
@@ -101,7 +104,7 @@ class Assembler:
         element = kind if isinstance(kind, Basic) else getattr(kind, "element", None)
         floats = isinstance(element, Basic) and element.kind in FLOATS
         dtype = np.float64 if floats else DTYPES[port.variable.type]
-        shape = port.variable.shape
+        shape, is_binary = port.variable.shape, port.variable.type == "Binary"
         if shape and "layout" in self._message:
             self._message["layout"]["dim"] = [
                 {"label": f"dim{axis}", "size": size, "stride": math.prod(shape[axis:])}
@@ -112,6 +115,8 @@ class Assembler:
             if shape:
                 elements = value if isinstance(value, np.ndarray) else flattened(value, len(shape))
                 container[last] = np.asarray(elements, dtype)  # "-INF" becomes a float, too
+            elif is_binary:
+                container[last] = np.frombuffer(b64decode(value) if isinstance(value, str) else value, np.uint8)
             else:
                 container[last] = float(value) if floats and isinstance(value, str) else value
 
@@ -189,6 +194,8 @@ def _headers(value: Any, kind: FieldType, types: MessageTypes, path: str = "") -
 
 def _in_shape(value: Any, port: Port) -> Value:  # noqa: ANN401 a field of any message
     """A field as a value of the mesh, an array in the shape of its variable."""
+    if port.variable.type == "Binary":
+        return bytes(value)
     plain: Value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     if not port.variable.shape:
         return plain

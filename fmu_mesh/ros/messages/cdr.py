@@ -89,10 +89,11 @@ class Codec:
         """The bytes of a message, little endian.
 
         Raises:
-            CdrError: a field is missing, or its value does not fit.
+            CdrError: a field is missing, its value does not fit, or it is all too large.
         """
         data = bytearray(b"\x00\x01\x00\x00")
         self._field.encode(data, message)
+        _check_size(data)
         return bytes(data)
 
     def decode(self, data: bytes) -> Message:
@@ -101,8 +102,7 @@ class Codec:
         Raises:
             CdrError: ``data`` is not a message of this type.
         """
-        if len(data) > MAX_MESSAGE_SIZE:
-            raise CdrError(f"{len(data)} bytes are too many for a message")
+        _check_size(data)
         byte_order = _BYTE_ORDERS.get(data[:2]) if len(data) >= HEADER_SIZE else None
         if byte_order is None:
             raise CdrError(f"it does not start as CDR does ({data[:HEADER_SIZE].hex(' ')})")
@@ -319,6 +319,11 @@ def _format(basic: str) -> str:
     if basic not in _FORMATS:
         raise CdrError(f"a field of the type {basic} cannot be sent or received")
     return _FORMATS[basic]
+
+
+def _check_size(data: bytes | bytearray) -> None:
+    if len(data) > MAX_MESSAGE_SIZE:
+        raise CdrError(f"{len(data)} bytes are too many for a message")
 
 
 def _align(data: bytearray, size: int) -> None:

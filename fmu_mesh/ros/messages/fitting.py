@@ -15,9 +15,9 @@ from ...config.findings import Findings
 from ...config.mesh import RosTopicConfig
 from ...text import listed, nearest, shown
 from ...variables.model_description import Variable
-from ...variables.value_types import VariableType, nested
+from ...variables.value_types import VariableType, nested, zero
 from .assembling import Assembler, Disassembler
-from .cdr import MAX_MESSAGE_SIZE, CdrError
+from .cdr import CdrError
 from .definitions import (
     FLOATS,
     HEADER,
@@ -39,6 +39,8 @@ from .topics import Direction, Port, Topic
 __all__ = ["TopicEntry", "carries", "check_topic", "default_type"]
 
 _OTHER_NAMES: Mapping[str, str] = {"byte": "uint8", "char": "uint8", "Boolean": "bool", "Enumeration": "int64"}
+
+_BYTES = tuple(Basic(name) for name in ("uint8", "byte", "char"))
 
 _PLAIN: Mapping[str, type | tuple[type, ...]] = {
     "string": str,
@@ -138,14 +140,12 @@ def _why_not_carried(topic: Topic, types: MessageTypes) -> str | None:
         if topic.direction == "in":
             Disassembler(topic, types)
             return None
-        empty = {"String": "", "Boolean": False}
-        values = [
-            nested([empty.get(port.variable.type, 0)] * port.variable.size, port.variable.shape) for port in topic.ports
-        ]
-        size = len(Assembler(topic, types).make(values, 0.0))
+        variables = [port.variable for port in topic.ports]
+        values = [nested([zero(own.type)] * own.size, own.shape) for own in variables]
+        Assembler(topic, types).make(values, 0.0)
     except CdrError as error:
         return str(error)
-    return None if size <= MAX_MESSAGE_SIZE else f"{size} bytes are too many for a message"
+    return None
 
 
 def _check_port(entry: TopicEntry, topic: Topic, port: Port, types: MessageTypes, findings: Findings) -> None:
@@ -161,11 +161,15 @@ def _check_port(entry: TopicEntry, topic: Topic, port: Port, types: MessageTypes
         expected = f"one of {listed(error.names)}{'' if written else ', given in `fields`'}"
         findings.add(place, str(error), expected, nearest(port.path, error.names) if written else None)
         return
-    reason = _unfit(kind, port.variable, topic.direction)
+    if port.variable.type == "Binary":
+        fits = not port.variable.shape and isinstance(kind, Sequence) and kind.element in _BYTES
+        reason = None if fits else "only uint8[] holds a Binary, and one of them"
+    else:
+        reason = _unfit(kind, port.variable, topic.direction)
     if reason is not None:
         found = f"'{port.path}' of '{message}' for '{port.instance}.{port.variable.name}': {reason}"
         best = default_type(port.variable.type, array=bool(port.variable.shape))
-        findings.add(place, found, f"a field that holds it, as in {best}")
+        findings.add(place, found, f"a field that holds it{f', as in {best}' if best else ''}")
 
 
 def _check_constant(

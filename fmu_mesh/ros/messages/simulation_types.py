@@ -47,7 +47,7 @@ SIMULATION_SERVICES = {
 
 
 class ResultCode(IntEnum):
-    """Codes in a `Result`; those above 100 belong to `SetSimulationState`."""
+    """Codes in a `Result`; those above 100 belong to `SetSimulationState`, and the last one to `SetEntityState`."""
 
     FEATURE_UNSUPPORTED = 0
     OK = 1
@@ -56,6 +56,7 @@ class ResultCode(IntEnum):
     ALREADY_IN_TARGET_STATE = 101
     STATE_TRANSITION_ERROR = 102
     INCORRECT_TRANSITION = 103
+    INVALID_POSE = 101
 
 
 class SimulationStates(IntEnum):
@@ -72,6 +73,7 @@ class SimulatorFeature(IntEnum):
     """The numbers in `SimulatorFeatures` of what a mesh can do."""
 
     ENTITY_STATE_GETTING = 10
+    ENTITY_STATE_SETTING = 11
     SIMULATION_RESET = 20
     SIMULATION_STATE_GETTING = 24
     SIMULATION_STATE_SETTING = 25
