@@ -134,6 +134,11 @@ class Granting:
         most = planned if self.last_point < planned and node != RECORDER else self.grant + self._most_ahead
         return -1 <= point <= most
 
+    @property
+    def is_led(self) -> bool:
+        """Whether the slowest instance limits the grant, and not the wall clock or a pause."""
+        return self.grant == self._lead.granted
+
     def led(self, wanted: int, now: float) -> int:
         """The point up to which all may be granted now, at most the ``wanted`` one; ``now`` is monotonic, in s."""
         self._lead.points(self.reached, now)
@@ -164,8 +169,7 @@ class Granting:
 
         Nothing if the grant is below the ``wanted`` point and all have it: only the wall clock lets it grow.
         """
-        is_led = self.grant == self._lead.granted
-        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted and not is_led):
+        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted and not self.is_led):
             return None
         nodes = [node for node in self.seen if node != RECORDER]
         if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:
@@ -174,7 +178,7 @@ class Granting:
         reached = self.progress[slowest]
         if reached >= self.reaches_all and reached >= 0:
             return None
-        goal = self.grant if self.reaches_all == self.grant and not is_led else (reached + self.reaches_all) // 2
+        goal = self.grant if self.reaches_all == self.grant and not self.is_led else (reached + self.reaches_all) // 2
         return slowest, max(goal, reached + 1)
 
     def no_progress(self, silent_s: float, stopped: Sequence[str]) -> DeadlineExceeded:

@@ -63,6 +63,6 @@ class Resting:
             slowest = RECORDER
         text = f"{mesh} is at point {granting.slowest}, on its way to point {goal}, where it is going to rest"
         text += f"; {spoken(slowest)} is at point {granting.progress[slowest]}"
-        if granting.grant < min(goal, granting.last_point):
+        if granting.grant < min(goal, granting.last_point) and not granting.is_led:
             text += f", and the wall clock allows point {granting.grant}"
         return DeadlineExceeded(f"{text}.", hint="A larger `timeout=...` waits longer.")
