@@ -358,8 +358,12 @@ def _collected(
         try:
             reply = replies.get(timeout=_OVER_CHECK_S)
         except queue.Empty:  # only then: an answer may come just before the end, as that to `stop`
-            if over():
-                break
+            try:
+                if over():
+                    break
+            except MeshLost:
+                if replies.empty():  # it may have come while this was found out
+                    raise
             continue
         if reply is None:
             break
