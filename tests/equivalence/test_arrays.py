@@ -215,7 +215,7 @@ def test_an_element_that_is_not_finite_ends_the_run_with_its_name(
 def test_arrays_are_read_set_and_watched_while_a_mesh_runs(tmp_path: Path) -> None:
     mesh = mesh_of(tmp_path, 10_000)
 
-    with mesh.start(stop_time=None, real_time_factor=1.0) as run:
+    with mesh.start(stop_time=600.0, real_time_factor=1.0) as run:
         field = run.get("camera.field")
         sample = next(iter(run.watch("camera.unread")))
         given = next(iter(run.watch("sum.u")))  # its ring has more rows than one of this width
