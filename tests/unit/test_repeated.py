@@ -571,7 +571,7 @@ def test_the_memory_stays_the_same(tmp_path: Path) -> None:
 
     with repeating(tmp_path) as runs:
         before = 0
-        for number in range(1000):
+        for number in range(2000):
             repeated(runs, mesh.plan(start_values={"pendulum.d": number * 1e-4}))
             if number == 300:
                 before = process.memory_info().rss
