@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 from setproctitle import setproctitle
 
-from ..errors import ConfigurationError, FmuError, FmuMeshError, RunReset, StepFailed
+from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
@@ -157,7 +157,8 @@ class _NodeProcess:
                     self._begin_again(node.new_start)
                     continue
                 # If there is a launcher, one process shows what happened, and the others only end.
-                if process.is_child and node.failure_is_known:
+                # It tells who was interrupted by the exit code, and interrupts those whom a lost master leaves behind.
+                if process.is_child and (node.failure_is_known or isinstance(error, Interrupted)):
                     error.already_reported()
                 raise
             return

@@ -208,8 +208,7 @@ def enter_run_folder(folder: Path, node: str) -> None:
         except FileNotFoundError:  # it is removed by somebody who leaves it, with the note or without
             continue
         except OSError as error:
-            message = f"no file can be made in the runtime folder '{folder}': {error.strerror or error}"
-            raise ConfigurationError(message, hint=_FOLDER_HINT) from error
+            raise _unfit(folder, error) from error
     raise MeshLost(f"the runtime folder '{folder}' is removed again and again", hint="Does something else do that?")
 
 
@@ -227,6 +226,11 @@ def tidy_run_folder(folder: Path) -> None:
                     _remove_traces(folder, note.stem)
         except OSError:  # its process still holds the lock, or another process was faster
             continue
+
+
+def _unfit(folder: Path, error: OSError) -> ConfigurationError:
+    message = f"no file can be made in the runtime folder '{folder}': {error.strerror or error}"
+    return ConfigurationError(message, hint=_FOLDER_HINT)
 
 
 def _remove_traces(folder: Path, name: str) -> None:
@@ -280,11 +284,18 @@ def _socket_name(node: str) -> str:
 
 
 def write_note(folder: Path, note: MeshNote) -> None:
-    """Write the note of a running mesh atomically, so that no reader gets an incomplete one."""
+    """Write the note of a running mesh atomically, so that no reader gets an incomplete one.
+
+    Raises:
+        ConfigurationError: the folder has no room any more.
+    """
     temporary = folder / "mesh.json.new"
     note = msgspec.structs.replace(note, host=this_host())
-    temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
-    temporary.replace(folder / "mesh.json")
+    try:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(note)))
+        temporary.replace(folder / "mesh.json")
+    except OSError as error:
+        raise _unfit(folder, error) from error
 
 
 def meshes() -> Iterator[MeshNote]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ MOUNT = 'mkdir -p "$FMU_MESH_RUNTIME_DIR" && mount -t tmpfs -o "mode=700,$1" tmp
 MOUNT += '&& mount -t tmpfs -o "mode=700,$2" tmpfs "$TMPDIR" && shift 2 && "$@" '
 MOUNT += '&& ls -A "$FMU_MESH_RUNTIME_DIR" "$TMPDIR"'
 ROOMY = "size=100m"
+ELSEWHERE = "/dev/shm"  # noqa: S108 another file system; each test has a private folder there
 
 
 def launched(place: Place, name: str, runtime: str, temporary: str, *options: str) -> Launched:
@@ -118,6 +120,22 @@ def test_the_first_instance_of_a_process_shares_the_library_and_no_resource(prep
     assert second[0].read_bytes() == original.read_bytes()
     assert second[1].read_text() == "as it was"
     assert (original.parents[2] / "resources" / "state.txt").read_text() == "as it was"
+
+
+@pytest.mark.skipif(not os.access(ELSEWHERE, os.W_OK), reason="needs a second file system")
+def test_room_is_looked_for_before_a_library_is_copied_to_another_file_system(
+    prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [library] = (tmp_path / "server").glob("*/binaries/linux64/*.so")
+    asked: list[int] = []
+    monkeypatch.setattr("fmu_mesh.instances.fmi.archive.archive._refuse_unfit", lambda _place, size: asked.append(size))
+
+    with tempfile.TemporaryDirectory(dir=ELSEWHERE) as elsewhere:
+        extracted(prepared, Path(elsewhere))
+    monkeypatch.setattr("fmu_mesh.instances.fmi.archive.sources._linked", set())
+    extracted(prepared, tmp_path / "node")
+
+    assert asked[0] > library.stat().st_size > asked[1] > 0  # linked: only the resources are written
 
 
 def test_a_shared_library_that_is_renamed_stays_as_it_was_for_others(

@@ -8,7 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from fmu_mesh.wire.runtime import enter_run_folder, leave_run_folder, remove_stale_folders, run_folder
+from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.wire.runtime import (
+    MeshNote,
+    enter_run_folder,
+    leave_run_folder,
+    remove_stale_folders,
+    run_folder,
+    write_note,
+)
 from tests.helpers import DEADLINE_S
 
 _VISITS = 400
@@ -53,3 +61,8 @@ def test_a_folder_that_is_in_use_stays(tmp_path: Path, monkeypatch: pytest.Monke
     leave_run_folder(folder)
     leave_run_folder(folder)  # it is not there any more
     assert not folder.exists()
+
+
+def test_a_note_that_cannot_be_written_is_a_readable_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"no file can be made in the runtime folder .*: No such file"):
+        write_note(tmp_path / "gone", MeshNote("mesh", "prefix", (), 1, "file"))

@@ -136,8 +136,8 @@ def content_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], None]) -> Path:
-    """Make a private folder for an FMU, with ``size`` bytes that ``fill`` writes; returns the folder.
+def in_new_folder(path: Path, parent: Path, size: Callable[[Path], int], fill: Callable[[Path], None]) -> Path:
+    """Make a private folder for an FMU, with ``size(place)`` bytes that ``fill`` writes; returns the folder.
 
     It is below ``parent``. If that has no room, or no code may run from there, it is in the folder for temporary files,
     and `files.remove_tree` finds it by a link below ``parent``. After `LoadFailed` nothing is left behind.
@@ -154,7 +154,7 @@ def in_new_folder(path: Path, parent: Path, size: int, fill: Callable[[Path], No
                 stack.callback(shutil.rmtree, folder, ignore_errors=True)
                 if place != parent:
                     (parent / f"{folder.name}{files.ELSEWHERE}").symlink_to(folder)
-                _refuse_unfit(place, size)
+                _refuse_unfit(place, size(place))
                 fill(folder)
             except (OSError, LoadFailed) as error:
                 cause = error.__cause__ if isinstance(error, LoadFailed) else error

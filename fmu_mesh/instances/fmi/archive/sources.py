@@ -99,7 +99,7 @@ def extract(
         folder = _copied(path, prepared, parent)
     else:
         with opened(path, terms) as fmu:
-            folder = in_new_folder(path, parent, fmu.unpacked_size(), partial(_fill, fmu, tell, model))
+            folder = in_new_folder(path, parent, lambda _: fmu.unpacked_size(), partial(_fill, fmu, tell, model))
     rename_libraries(folder)
     return folder
 
@@ -134,7 +134,10 @@ def _copied(path: Path, prepared: Path, parent: Path) -> Path:
     def fill(folder: Path) -> None:
         shutil.copytree(prepared, folder, symlinks=True, dirs_exist_ok=True, copy_function=copy)
 
-    size = sum(one.lstat().st_size for one in (resources if links else prepared).rglob("*"))
+    def size(place: Path) -> int:
+        can_link = links and place.stat().st_dev == prepared.stat().st_dev
+        return sum(one.lstat().st_size for one in (resources if can_link else prepared).rglob("*"))
+
     return in_new_folder(path, parent, size, fill)
 
 
