@@ -123,7 +123,7 @@ def test_the_first_instance_of_a_process_shares_the_library_and_no_resource(prep
 
 
 @pytest.mark.skipif(not os.access(ELSEWHERE, os.W_OK), reason="needs a second file system")
-def test_room_is_looked_for_before_a_library_is_copied_to_another_file_system(
+def test_room_for_a_copy_on_another_file_system_is_looked_for(
     prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     [library] = (tmp_path / "server").glob("*/binaries/linux64/*.so")
