@@ -106,7 +106,7 @@ def image_of(data: bytes) -> tuple[Any, bytes]:
     return own, bytes(store.serialize_cdr(own, IMAGE))
 
 
-@pytest.mark.parametrize("data", [b"", MASK, bytes(100_000)])
+@pytest.mark.parametrize("data", [b"", MASK, bytes(3 * 1920 * 1080)], ids=["nothing", "a mask", "full HD"])
 def test_binary_and_bytes_of_messages_are_equal_both_ways(data: bytes) -> None:
     types = MessageTypes("kilted")
     _, written = image_of(data)

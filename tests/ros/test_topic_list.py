@@ -51,6 +51,7 @@ def test_a_topic_of_constants_is_latched_and_has_its_text(tmp_path: Path) -> Non
         (b"x" * (MAX_MESSAGE_SIZE + 1), f"which cannot be read (it has more than {MAX_MESSAGE_SIZE} bytes)"),
         (b"x" * MAX_MESSAGE_SIZE, "are too many for a message"),
     ],
+    ids=["not UTF-8", "a byte more than a message", "as long as a message"],
 )
 def test_a_file_that_no_message_can_hold_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
     found = problem(with_file(tmp_path, content), DESCRIPTION)

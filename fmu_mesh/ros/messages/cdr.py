@@ -27,8 +27,8 @@ Message = dict[str, Any]
 ByteOrder = Literal["<", ">"]
 """Little or big endian, as in `struct`."""
 
-MAX_MESSAGE_SIZE: Final = 4 * 2**20
-"""Largest size of a message, in bytes."""
+MAX_MESSAGE_SIZE: Final = 64 * 2**20
+"""Largest size of a message, in bytes: an image of 3840x2160 points with four bytes each has 32 MiB."""
 
 _ZEROS: Final = bytes(MAX_MESSAGE_SIZE)
 """The decoder makes an empty message of them; the operating system gives no memory for what nobody writes."""
