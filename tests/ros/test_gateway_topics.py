@@ -243,7 +243,6 @@ def mapped(message: str, fields: dict[str, str], **more: Any) -> dict[str, Any]:
         (mapped(TF, {"transforms[0].transform": "delay.y"}), "it is a message itself"),
         (mapped(TF, {"transforms[-1].transform.rotation.w": "delay.y"}), "an index is a whole number from 0 to 65535"),
         (mapped(TF, {"transforms[99999999].transform.rotation.w": "gain.u"}), "a whole number from 0 to 65535"),
-        (mapped(TF, {"transforms[65535].transform.rotation.w": "delay.y"}), "bytes are too many for a message"),
         (mapped(PRIMITIVE, {"dimensions[3]": "gain.u"}), "an index is a whole number from 0 to 2"),
         (mapped(JOINTS, {"position[100000]": "delay.y"}), "an index is a whole number from 0 to 65535"),
         (mapped(JOINTS, {"position": "delay.y"}), "one value into an array; write an index, such as data[0]"),
