@@ -288,7 +288,7 @@ def test_progress_that_a_stranger_sends_makes_no_result_shorter(place: Place) ->
         status = f"{stranger.public.root}/*/status"
 
         def believed() -> bool:
-            for node in ("gate", "@record"):  # again and again: what they send themselves may come later
+            for node in ("gate", "@record"):  # until it is believed: nobody answers a put
                 stranger.put(stranger.keys.progress(node), HEADER.pack(PROGRESS, 0, 0, 200))
             return any(
                 reply.ok and b'"state":"stopping"' in reply.ok.payload.to_bytes() for reply in session.get(status)
