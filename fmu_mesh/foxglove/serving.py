@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final
 
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, from_report
-from ..ros.messages.stamp import nanoseconds
+from ..ros_wire.stamp import nanoseconds
 from ..simtime import ENDLESS, TimeGrid
 from ..web_server import ServedMesh
 from ..wire.client.following import ValueStream

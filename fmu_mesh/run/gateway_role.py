@@ -8,7 +8,7 @@ from ..errors import ConfigurationError, Interrupted
 from ..ros.gateway.gateway import Gateway, open_profiles
 from ..ros.gateway.link import RosLink, open_ros
 from ..ros.gateway.mapping import resolve
-from ..ros.messages.topics import RosPlan
+from ..ros_wire.topics import RosPlan
 from ..system.plan import MASTER
 from ..wire.keys import Keys
 from ..wire.runtime import socket_endpoint

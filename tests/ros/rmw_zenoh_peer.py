@@ -21,10 +21,10 @@ from typing import Any, TextIO
 import numpy as np
 import zenoh
 
-from fmu_mesh.ros.gateway.rmw_zenoh import SERVICES
-from fmu_mesh.ros.messages.definitions import MessageTypes
-from fmu_mesh.ros.messages.ros_names import service_name
-from fmu_mesh.ros.messages.simulation_types import SIMULATION_SERVICES, define_simulation_types
+from fmu_mesh.ros.gateway.parameter_services import SERVICES
+from fmu_mesh.ros_wire.definitions import MessageTypes
+from fmu_mesh.ros_wire.ros_names import service_name
+from fmu_mesh.ros_wire.simulation_types import SIMULATION_SERVICES, define_simulation_types
 
 
 def say(**what: object) -> None:

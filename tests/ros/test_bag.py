@@ -15,9 +15,9 @@ from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.ros.bags.bag import Bag, BagSample
 from fmu_mesh.ros.bags.playing import Played, schedule
-from fmu_mesh.ros.messages.cdr import Codec
-from fmu_mesh.ros.messages.definitions import MessageTypes
-from fmu_mesh.ros.messages.topics import Port, Topic
+from fmu_mesh.ros_wire.cdr import Codec
+from fmu_mesh.ros_wire.definitions import MessageTypes
+from fmu_mesh.ros_wire.topics import Port, Topic
 from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.variables.model_description import Variable
 from tests.fmus.helpers import find_fmu

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fmu_mesh.ros.messages.cdr import MAX_MESSAGE_SIZE, CdrError, Codec
-from fmu_mesh.ros.messages.definitions import MAX_ELEMENTS, Array, Basic, FieldType, MessageTypes, Nested, Sequence
+from fmu_mesh.ros_wire.cdr import MAX_MESSAGE_SIZE, CdrError, Codec
+from fmu_mesh.ros_wire.definitions import MAX_ELEMENTS, Array, Basic, FieldType, MessageTypes, Nested, Sequence
 
 CUSTOM = {
     "lab_msgs/msg/Part": "string<=8 name\nint8 small\nfloat32[3] xyz\nbool[] flags\n",

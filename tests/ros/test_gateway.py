@@ -16,9 +16,9 @@ import psutil
 import pytest
 import zenoh
 
-from fmu_mesh.ros.messages.cdr import Codec
-from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
-from fmu_mesh.ros.messages.ros_names import dds_type
+from fmu_mesh.ros_wire.cdr import Codec
+from fmu_mesh.ros_wire.definitions import MessageTypes, Nested
+from fmu_mesh.ros_wire.ros_names import dds_type
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import free_port
 

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from fmu_mesh.ros.gateway.gateway import Gateway
-from fmu_mesh.ros.messages.topics import RosPlan
+from fmu_mesh.ros_wire.topics import RosPlan
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.wire.keys import Keys
 from tests.helpers import DEADLINE_S, wait_until

@@ -15,8 +15,8 @@ from typing import IO
 
 import pytest
 
-from fmu_mesh.ros.messages.topics import Topic
 from fmu_mesh.ros.node.gateway_node import RclpyProfile
+from fmu_mesh.ros_wire.topics import Topic
 from tests.helpers import DEADLINE_S, FMUS, Place, write_config
 from tests.ros.ros_peer import Ros, ros_or_skip
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmu_mesh.ros.messages.assembling import Assembler, Disassembler
-from fmu_mesh.ros.messages.cdr import CdrError, Codec
-from fmu_mesh.ros.messages.definitions import MessageTypes, Nested
-from fmu_mesh.ros.messages.topics import Port, Topic
+from fmu_mesh.ros_wire.assembling import Assembler, Disassembler
+from fmu_mesh.ros_wire.cdr import CdrError, Codec
+from fmu_mesh.ros_wire.definitions import MessageTypes, Nested
+from fmu_mesh.ros_wire.topics import Port, Topic
 from fmu_mesh.variables.model_description import Variable, VariableType
 from fmu_mesh.variables.value_types import DTYPES
 

@@ -12,7 +12,7 @@ from fmu_mesh.config.loading import read_file
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.ros.gateway.mapping import resolve
-from fmu_mesh.ros.messages.topics import RosPlan
+from fmu_mesh.ros_wire.topics import RosPlan
 from fmu_mesh.variables.model_description import ModelDescription, Variable
 from tests.fmus.helpers import find_fmu
 from tests.helpers import FMUS, write_config

@@ -14,9 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.ros.messages.assembling import Assembler, Disassembler
-from fmu_mesh.ros.messages.cdr import MAX_MESSAGE_SIZE, CdrError
-from fmu_mesh.ros.messages.definitions import MessageTypes
+from fmu_mesh.ros_wire.assembling import Assembler, Disassembler
+from fmu_mesh.ros_wire.cdr import MAX_MESSAGE_SIZE, CdrError
+from fmu_mesh.ros_wire.definitions import MessageTypes
 from tests.helpers import Launched, Place, wait_until, write_config
 from tests.planning import prepare
 from tests.ros.peers import Peer, free_port, need

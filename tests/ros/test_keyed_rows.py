@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import pytest
 
-from fmu_mesh.ros.messages.assembling import Assembler, Disassembler
-from fmu_mesh.ros.messages.cdr import CdrError, Codec
-from fmu_mesh.ros.messages.definitions import Key, MessageTypes, UnknownField, path_parts
-from fmu_mesh.ros.messages.keyed_rows import FieldReader, by_index
-from fmu_mesh.ros.messages.topics import Port, Topic
+from fmu_mesh.ros_wire.assembling import Assembler, Disassembler
+from fmu_mesh.ros_wire.cdr import CdrError, Codec
+from fmu_mesh.ros_wire.definitions import Key, MessageTypes, UnknownField, path_parts
+from fmu_mesh.ros_wire.keyed_rows import FieldReader, by_index
+from fmu_mesh.ros_wire.topics import Port, Topic
 from fmu_mesh.variables.model_description import Variable, VariableType
 
 TYPES = MessageTypes("kilted")

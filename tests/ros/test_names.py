@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import fmu_mesh.ros.node
-from fmu_mesh.ros.messages.ros_names import absolute, dds_type, name_problems, ros_name, topic_problem
-from fmu_mesh.ros.messages.stamp import in_nanoseconds, nanoseconds, to_stamp
+from fmu_mesh.ros_wire.ros_names import absolute, dds_type, name_problems, ros_name, topic_problem
+from fmu_mesh.ros_wire.stamp import in_nanoseconds, nanoseconds, to_stamp
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ import pytest
 from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
-from fmu_mesh.ros.messages.ros_names import ros_name
 from fmu_mesh.ros.node.node_topics import topics_of
+from fmu_mesh.ros_wire.ros_names import ros_name
 from tests.fmus.helpers import find_fmu
 from tests.fmus.packing import repacked
 from tests.helpers import DEADLINE_S, FMUS

@@ -11,9 +11,9 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from fmu_mesh.ros.messages.cdr import Codec
-from fmu_mesh.ros.messages.definitions import MessageTypes
-from fmu_mesh.ros.messages.ros_names import dds_type
+from fmu_mesh.ros_wire.cdr import Codec
+from fmu_mesh.ros_wire.definitions import MessageTypes
+from fmu_mesh.ros_wire.ros_names import dds_type
 from tests.helpers import Place, wait_until, write_config
 from tests.ros.peers import free_port
 

@@ -11,7 +11,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.ros.messages.topics import Topic
+from fmu_mesh.ros_wire.topics import Topic
 from tests.helpers import write_config
 from tests.planning import prepare
 from tests.ros.test_bag import messages_of

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 import fmu_mesh
-from fmu_mesh.ros.messages.definitions import MessageTypes
-from fmu_mesh.ros.messages.simulation_types import (
+from fmu_mesh.ros_wire.definitions import MessageTypes
+from fmu_mesh.ros_wire.simulation_types import (
     SIMULATION_SERVICES,
     ResultCode,
     SimulationStates,

@@ -11,7 +11,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.ros.messages.cdr import MAX_MESSAGE_SIZE
+from fmu_mesh.ros_wire.cdr import MAX_MESSAGE_SIZE
 from tests.helpers import Place, write_config
 from tests.ros.test_gateway_topics import configured, planned
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.ros.messages.definitions import Basic, MessageTypes, UnknownField, UnknownType
-from fmu_mesh.ros.messages.fitting import carries, default_type
+from fmu_mesh.ros_wire.definitions import Basic, MessageTypes, UnknownField, UnknownType
+from fmu_mesh.ros_wire.fitting import carries, default_type
 from fmu_mesh.variables.value_types import TYPES as FMI_TYPES
 
 SHARE = Path(sys.prefix) / "share"

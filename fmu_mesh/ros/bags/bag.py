@@ -24,15 +24,15 @@ from ...config.scenario_section import ScenarioSource, ScenarioValues
 from ...errors import ConfigurationError
 from ...installing import importing
 from ...results.formats import near_hint, reading
+from ...ros_wire.assembling import Disassembler
+from ...ros_wire.cdr import CdrError
+from ...ros_wire.definitions import MessageTypes
+from ...ros_wire.stamp import nanoseconds
+from ...ros_wire.topics import Topic
 from ...system.scenario import BagValues, is_bag
 from ...text import did_you_mean, listed, nearest
 from ...variables.model_description import ModelDescription, Value
 from ..gateway.mapping import Resolver, message_types
-from ..messages.assembling import Disassembler
-from ..messages.cdr import CdrError
-from ..messages.definitions import MessageTypes
-from ..messages.stamp import nanoseconds
-from ..messages.topics import Topic
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict

@@ -1,6 +1,6 @@
 """Recording into MCAP, which `ros2 bag` and Foxglove read as ROS messages, by simulation time.
 
-Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros.messages.topics` says what a topic is.
+Owns which topics a recording has, and how rows become messages. `fmu_mesh.ros_wire.topics` says what a topic is.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ...config.mesh import Qos, RosConfig, RosTopicConfig
 from ...files import Kept, open_alone
 from ...installing import importing
 from ...results.recording import Columns, Recording, Tail
+from ...ros_wire.assembling import Assembler
+from ...ros_wire.cdr import Codec
+from ...ros_wire.definitions import CLOCK, MessageTypes
+from ...ros_wire.fitting import TopicEntry, check_topic
+from ...ros_wire.stamp import nanoseconds, to_stamp
+from ...ros_wire.topics import CLOCK_TOPIC, RosPlan, Topic
 from ...variables.model_description import ModelDescription
 from ...variables.value_types import VariableType
 from ..gateway.mapping import Resolver, message_types
-from ..messages.assembling import Assembler
-from ..messages.cdr import Codec
-from ..messages.definitions import CLOCK, MessageTypes
-from ..messages.fitting import TopicEntry, check_topic
-from ..messages.stamp import nanoseconds, to_stamp
-from ..messages.topics import CLOCK_TOPIC, RosPlan, Topic
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedColumn, RecordedMcap, TopicColumns
 
 __all__ = ["McapFile"]

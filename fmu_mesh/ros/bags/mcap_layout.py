@@ -10,8 +10,8 @@ from typing import Final
 
 import msgspec
 
+from ...ros_wire.definitions import Distribution
 from ...variables.value_types import VariableType
-from ..messages.definitions import Distribution
 
 __all__ = ["NOTE", "RECORDING", "ROWS", "RecordedColumn", "RecordedMcap", "TopicColumns"]
 

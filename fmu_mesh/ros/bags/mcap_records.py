@@ -41,10 +41,10 @@ from numpy.typing import NDArray
 from ...errors import ConfigurationError
 from ...files import Kept, decoded_json, opened
 from ...results.recording import Columns, metadata_in, with_notes
+from ...ros_wire.cdr import HEADER_SIZE, Codec
+from ...ros_wire.definitions import NUMBERS, Basic, MessageTypes, Part, path_parts
 from ...simtime import ENDLESS, TimeGrid
 from ...variables.value_types import DTYPES, VariableType, is_text
-from ..messages.cdr import HEADER_SIZE, Codec
-from ..messages.definitions import NUMBERS, Basic, MessageTypes, Part, path_parts
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap, TopicColumns
 
 __all__ = ["finish_mcap", "read_mcap"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 
-from .profile import Put
+from ...ros_wire.profile import Put
 
 __all__ = ["Deadline"]
 

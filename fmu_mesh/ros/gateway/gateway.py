@@ -38,6 +38,13 @@ import zenoh
 
 from ...config.mesh import RosConfig
 from ...errors import MeshLost, MessageRefused
+from ...ros_wire.assembling import Assembler, Disassembler
+from ...ros_wire.cdr import CdrError, Codec
+from ...ros_wire.definitions import CLOCK
+from ...ros_wire.profile import Profile, Put, Ros2Dds, Take, ZenohProfile
+from ...ros_wire.rmw_zenoh import RmwZenoh
+from ...ros_wire.stamp import to_stamp
+from ...ros_wire.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from ...simtime import TimeGrid
 from ...text import shown
 from ...wire.client.readings import latecomers
@@ -47,14 +54,8 @@ from ...wire.refusals import Refusals
 from ...wire.session import Question, ask, undeclare_all
 from ...wire.values import Stamp, encode_origin, encode_value, json_encoding
 from ...wire.views import MeshInfo
-from ..messages.assembling import Assembler, Disassembler
-from ..messages.cdr import CdrError, Codec
-from ..messages.definitions import CLOCK
-from ..messages.stamp import to_stamp
-from ..messages.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from .deadline import Deadline
-from .profile import Profile, Put, Ros2Dds, Take, ZenohProfile
-from .rmw_zenoh import ParameterServices, RmwZenoh
+from .parameter_services import ParameterServices
 from .simulation_services import SimulationServices
 
 __all__ = ["Gateway", "open_profiles"]

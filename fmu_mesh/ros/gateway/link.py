@@ -26,12 +26,12 @@ from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
 from ...errors import FmuMeshError
+from ...ros_wire.profile import ZenohProfile, topic_in
 from ...wire.keys import Keys, escape, unescape
 from ...wire.session import Wiring, close_session, is_of_this_host, open_session, undeclare_all
 from ...wire.values import json_encoding
 from ...wire.views import RosView
 from .deadline import Deadline
-from .profile import ZenohProfile, topic_in
 
 __all__ = ["RosLink", "open_ros", "two_clocks"]
 

@@ -17,17 +17,17 @@ from ...config.loading import LoadedConfig
 from ...config.mesh import Config, ConstantFile, Qos, RosConfig, RosTopicConfig
 from ...errors import ConfigurationError
 from ...files import opened
+from ...ros_wire.cdr import MAX_MESSAGE_SIZE
+from ...ros_wire.definitions import MessageTypes, is_message_name
+from ...ros_wire.fitting import TopicEntry, check_topic, default_type
+from ...ros_wire.ros_names import absolute, name_problems, ros_name, topic_problem
+from ...ros_wire.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
 from ...system.couplings import driven_inputs
 from ...system.start_values import sized
 from ...text import listed, nearest, nearest_file
 from ...variables.model_description import Causality, ModelDescription, Variability, Variable
 from ...variables.value_types import FMI2_TYPES, VariableType
 from ...wire.views import InstanceInfo, VariableView
-from ..messages.cdr import MAX_MESSAGE_SIZE
-from ..messages.definitions import MessageTypes, is_message_name
-from ..messages.fitting import TopicEntry, check_topic, default_type
-from ..messages.ros_names import absolute, name_problems, ros_name, topic_problem
-from ..messages.topics import Descriptions, Direction, Kind, NodeParameter, Port, RosPlan, Topic
 from .shapes import expanded
 
 __all__ = ["Resolver", "descriptions_of", "message_types", "resolve"]

@@ -14,14 +14,12 @@ from typing import Self
 
 import zenoh
 
-from ..messages.cdr import Message
+from ...ros_wire.cdr import Message
+from ...ros_wire.rmw_zenoh import Service
 
-__all__ = ["Service", "ServiceThreads"]
+__all__ = ["ServiceThreads"]
 
 log = logging.getLogger(__name__)
-
-Service = Callable[[Message, Callable[[Message], None]], None]
-"""Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
 
 _ANSWERS_END_S = 2.0
 """As long as the mesh may take for the answers that are under way, in s."""

@@ -13,10 +13,10 @@ import msgspec
 
 from ...config.findings import Findings
 from ...config.mesh import RosTopicConfig
+from ...ros_wire.fitting import TopicEntry
+from ...ros_wire.topics import Descriptions
 from ...text import listed, nearest
 from ...variables.model_description import ModelDescription
-from ..messages.fitting import TopicEntry
-from ..messages.topics import Descriptions
 
 __all__ = ["expanded"]
 

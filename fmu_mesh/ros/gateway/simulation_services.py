@@ -24,24 +24,24 @@ import zenoh
 from ... import __version__
 from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import FmuMeshError
-from ...text import EXPRESSION, matched
-from ...wire.client.mesh_client import MeshClient
-from ...wire.client.readings import Reading, Target
-from ...wire.client.waiting import begun_again
-from ...wire.keys import Keys
-from ...wire.views import Command, MeshState
-from ..messages.cdr import Codec, Message
-from ..messages.definitions import MessageTypes
-from ..messages.ros_names import absolute, service_name
-from ..messages.simulation_types import (
+from ...ros_wire.cdr import Codec, Message
+from ...ros_wire.definitions import MessageTypes
+from ...ros_wire.rmw_zenoh import RmwZenoh
+from ...ros_wire.ros_names import absolute, service_name
+from ...ros_wire.simulation_types import (
     SIMULATION_SERVICES,
     ResultCode,
     SimulationStates,
     SimulatorFeature,
     define_simulation_types,
 )
-from ..messages.stamp import to_stamp
-from .rmw_zenoh import RmwZenoh
+from ...ros_wire.stamp import to_stamp
+from ...text import EXPRESSION, matched
+from ...wire.client.mesh_client import MeshClient
+from ...wire.client.readings import Reading, Target
+from ...wire.client.waiting import begun_again
+from ...wire.keys import Keys
+from ...wire.views import Command, MeshState
 from .service_threads import ServiceThreads
 
 __all__ = ["SIMULATION_THREADS", "SimulationServices"]

@@ -4,7 +4,7 @@
 it.
 """
 
-from ..messages.ros_names import ros_name
+from ...ros_wire.ros_names import ros_name
 from .entry import create_node, main
 from .variable_parameters import declare_parameters, initialize_from_parameters
 

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
+from ...ros_wire.definitions import CLOCK
+from ...ros_wire.topics import CLOCK_TOPIC, Topic
 from ...variables.model_description import Value, Variable
-from ..messages.definitions import CLOCK
-from ..messages.topics import CLOCK_TOPIC, Topic
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
 from .node_topics import LOG_INTERVAL_S, FmuTopics, own_names, topics_of
 from .rclpy_modules import RosNode, RosTypes, message_class, ros_module, steady_timer, time_message, watch_clock

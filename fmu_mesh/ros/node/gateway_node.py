@@ -22,15 +22,15 @@ from msgspec.structs import replace
 from ...config.mesh import RosConfig
 from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
+from ...ros_wire.profile import Profile, Put, Take
+from ...ros_wire.topics import RosPlan, Topic
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
 from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
-from ..gateway.profile import Profile, Put, Take
 from ..gateway.simulation_services import SimulationServices
-from ..messages.topics import RosPlan, Topic
 from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, watch_clock
 from .simulation_server import SimulationServer
 

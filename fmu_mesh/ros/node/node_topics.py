@@ -22,16 +22,16 @@ from msgspec.structs import replace
 from ...config.findings import Findings
 from ...config.yaml_text import Plain, read
 from ...errors import CallRefused, ConfigurationError
+from ...ros_wire.cdr import CdrError
+from ...ros_wire.definitions import Basic, UnknownField, path_parts
+from ...ros_wire.fitting import default_type
+from ...ros_wire.keyed_rows import FieldReader, by_index
+from ...ros_wire.ros_names import topic_problem
+from ...ros_wire.stamp import in_nanoseconds
+from ...ros_wire.topics import Port, Topic
 from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import flattened, nested
-from ..messages.cdr import CdrError
-from ..messages.definitions import Basic, UnknownField, path_parts
-from ..messages.fitting import default_type
-from ..messages.keyed_rows import FieldReader, by_index
-from ..messages.ros_names import topic_problem
-from ..messages.stamp import in_nanoseconds
-from ..messages.topics import Port, Topic
 from .driving import FmuDriver, FmuThread, Update
 from .rclpy_modules import RosNode, RosTypes, message_class, ros_module, time_message
 from .variable_parameters import names_of

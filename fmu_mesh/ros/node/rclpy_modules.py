@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any
 
 from ...errors import ConfigurationError
+from ...ros_wire.definitions import Array, Basic, FieldType, FieldTypes, Nested, Sequence
+from ...ros_wire.topics import CLOCK_TOPIC
 from ..gateway.link import two_clocks
-from ..messages.definitions import Array, Basic, FieldType, FieldTypes, Nested, Sequence
-from ..messages.topics import CLOCK_TOPIC
 
 __all__ = ["RosNode", "RosTypes", "message_class", "ros_module", "steady_timer", "time_message", "watch_clock"]
 

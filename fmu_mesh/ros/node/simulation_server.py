@@ -10,11 +10,11 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Any
 
+from ...ros_wire.cdr import Message
+from ...ros_wire.ros_names import absolute, service_name
+from ...ros_wire.simulation_types import SIMULATION_SERVICES, ResultCode
 from ..gateway.service_threads import ServiceThreads
 from ..gateway.simulation_services import SIMULATION_THREADS, SimulationServices
-from ..messages.cdr import Message
-from ..messages.ros_names import absolute, service_name
-from ..messages.simulation_types import SIMULATION_SERVICES, ResultCode
 from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["SimulationServer"]

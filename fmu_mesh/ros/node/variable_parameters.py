@@ -11,10 +11,10 @@ from typing import Any
 
 from ...adapter import FMIAdapter
 from ...errors import CallRefused, ConfigurationError
+from ...ros_wire.ros_names import collision, name_problems, ros_name
 from ...text import nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import nested
-from ..messages.ros_names import collision, name_problems, ros_name
 from .rclpy_modules import RosNode, ros_module
 
 __all__ = [

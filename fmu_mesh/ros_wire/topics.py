@@ -11,8 +11,8 @@ from typing import Literal
 
 import msgspec
 
-from ...config.ros_section import MeshTopic, Qos, RosProfile
-from ...variables.model_description import ModelDescription, Variable
+from ..config.ros_section import MeshTopic, Qos, RosProfile
+from ..variables.model_description import ModelDescription, Variable
 from .definitions import CLOCK, MessageTypes
 
 __all__ = [

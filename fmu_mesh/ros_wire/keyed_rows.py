@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from ...printing import printable
-from ...text import listed
+from ..printing import printable
+from ..text import listed
 from .cdr import CdrError
 from .definitions import FLOATS, Basic, FieldTypes, Key, Part
 from .topics import Topic

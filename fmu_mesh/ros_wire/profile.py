@@ -14,11 +14,11 @@ from typing import Protocol
 import zenoh
 import zenoh.ext
 
-from ...config.mesh import Qos
-from ...wire.session import matches, undeclare_all
-from ...wire.views import RosTopicView
-from ..messages.definitions import MessageTypes
-from ..messages.topics import Topic
+from ..config.mesh import Qos
+from ..wire.session import matches, undeclare_all
+from ..wire.views import RosTopicView
+from .definitions import MessageTypes
+from .topics import Topic
 
 __all__ = ["Profile", "Put", "Ros2Dds", "Take", "ZenohProfile", "topic_in"]
 

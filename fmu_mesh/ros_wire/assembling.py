@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ...variables.model_description import Value
-from ...variables.value_types import DTYPES, flattened, nested
+from ..variables.model_description import Value
+from ..variables.value_types import DTYPES, flattened, nested
 from .cdr import CdrError, Codec, Message
 from .definitions import FLOATS, HEADER, Array, Basic, FieldType, MessageTypes, Nested, Part, Sequence, path_parts
 from .keyed_rows import FieldReader

@@ -4,7 +4,7 @@ A path has the names of fields, indexes (`poses[0]`), and keys. A key finds an e
 (`transforms[child_frame_id=tool]`), or in a parallel array of texts (`position[name=elbow]`).
 
 The definitions come from `rosbags` as data; no code that `rosbags` could generate from them is run. The bytes of a
-message are the matter of `fmu_mesh.ros.messages.cdr`.
+message are the matter of `fmu_mesh.ros_wire.cdr`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 from msgspec.structs import replace
 
-from ...errors import ConfigurationError
-from ...installing import importing
+from ..errors import ConfigurationError
+from ..installing import importing
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

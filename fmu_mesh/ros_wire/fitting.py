@@ -11,11 +11,11 @@ from collections.abc import Mapping
 import msgspec
 import numpy as np
 
-from ...config.findings import Findings
-from ...config.mesh import RosTopicConfig
-from ...text import listed, nearest, shown
-from ...variables.model_description import Variable
-from ...variables.value_types import VariableType, nested, zero
+from ..config.findings import Findings
+from ..config.mesh import RosTopicConfig
+from ..text import listed, nearest, shown
+from ..variables.model_description import Variable
+from ..variables.value_types import VariableType, nested, zero
 from .assembling import Assembler, Disassembler
 from .cdr import CdrError
 from .definitions import (
