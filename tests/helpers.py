@@ -34,6 +34,7 @@ __all__ = [
     "BY_ZENOH",
     "DEADLINE_S",
     "FMUS",
+    "NUMBERS_OF_ZENOH",
     "PAIR",
     "Launched",
     "Place",
@@ -60,6 +61,9 @@ BY_ZENOH: Mapping[str, bool] = {"shared_memory": False, "row_streams": False}
 
 DEADLINE_S = 100.0
 """Longer than anything takes on a busy machine, shorter than the timeout of a test."""
+
+NUMBERS_OF_ZENOH = 1 << 16
+"""So many keys a session of Zenoh 1.10 can declare until it gives a number a second time."""
 
 _LOOK_S = 0.01
 

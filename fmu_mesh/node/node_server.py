@@ -80,6 +80,7 @@ class NodeServer:
         self._inbox = inbox
         self._activity = activity
         self._streams: list[InstanceStreams] = []
+        self._declared: dict[str, zenoh.KeyExpr] = {}
         self._searches = False
         self._next_search = 0.0
         self._waiting_rows = 0
@@ -110,7 +111,8 @@ class NodeServer:
         self._activity.serve(runners)
         for runner in runners.values():
             changed = partial(self._jobs.put, self._search)
-            self._streams.append(InstanceStreams(runner, self._session, self._keys, self._plan.grid, changed))
+            grid, declared = self._plan.grid, self._declared
+            self._streams.append(InstanceStreams(runner, self._session, self._keys, grid, changed, declared))
             for kind in ("in", "param"):
                 key = f"{self._keys.instance(runner.name)}/{kind}/*"
                 take = partial(self._answers.put_arrived, runner)

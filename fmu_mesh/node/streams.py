@@ -31,6 +31,9 @@ __all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "Variable
 # `update` takes `_wanted` in one assignment, and `collect` copies rows, so nobody waits for anybody: a slow
 # subscriber loses samples, and never slows down a step.
 #
+# What may go wrong (ADR 77): while the declaration of a key ends, Zenoh loses a value that arrives with this key, and
+# after 65,536 declarations it mistakes one key of a session for another. So what `look` has asked for stays declared.
+#
 # Tried and given up (ADR 68): a publisher and a listener for each variable (a thread of zenoh-python for each of
 # 60,000), a listener without them (declaring takes time that grows with the square), and the list of subscribers in
 # the admin space (a session that answers it while another one subscribes can stand for ever, zenoh 1.10).
@@ -38,6 +41,9 @@ __all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "Variable
 MAX_WAITING_ROWS = 1 << 14
 _MAX_WAITING_VALUES = 1 << 20
 """Somebody may subscribe to all 60,000 variables of an FMU: their rows would need gigabytes."""
+
+_MOST_DECLARED: Final = 1 << 12
+"""Keys that stay declared; each takes longer than the one before. What is asked for beyond them counts as subscribed."""
 
 PRIORITY = zenoh.Priority.DATA_LOW
 """Frames and grants must not wait behind samples for subscribers."""
@@ -113,15 +119,23 @@ class InstanceStreams:
 
     One publisher for all variables tells whether somebody may listen. Only then `look` finds out to what, so that
     nothing is declared for a variable (an FMU may have 60,000). ``changed`` is called on a thread of Zenoh when the
-    instance gets its first or loses its last subscriber.
+    instance gets its first or loses its last subscriber. ``declared`` has the keys that all streams of this session
+    have asked for.
     """
 
-    def __init__(
-        self, runner: Runner, session: zenoh.Session, keys: Keys, grid: TimeGrid, changed: Callable[[], None]
+    def __init__(  # noqa: PLR0913, PLR0917  one instance and its surroundings
+        self,
+        runner: Runner,
+        session: zenoh.Session,
+        keys: Keys,
+        grid: TimeGrid,
+        changed: Callable[[], None],
+        declared: dict[str, zenoh.KeyExpr],
     ) -> None:
         self.runner = runner
         self._session = session
         self._keys = VariableKeys(keys, runner)
+        self._declared = declared
         self._dropped = 0
         self._grid = grid
         self._next = 0
@@ -184,7 +198,12 @@ class InstanceStreams:
                 yield from self._subscribed(root, [*group])
 
     def _is_subscribed(self, key: str) -> bool:
-        with self._session.declare_publisher(key, allowed_destination=zenoh.Locality.REMOTE) as publisher:
+        if key not in self._declared:
+            if len(self._declared) >= _MOST_DECLARED:
+                return True
+            self._declared[key] = self._session.declare_keyexpr(key)
+        own, remote = self._declared[key], zenoh.Locality.REMOTE
+        with self._session.declare_publisher(own, allowed_destination=remote) as publisher:
             return matches(publisher)
 
     @cached_property

@@ -279,10 +279,11 @@ class Question(msgspec.Struct, frozen=True):
     """A query that waits ``deadline_s`` seconds for its answer; an error names ``whom`` it was for.
 
     It overtakes messages of a lower ``priority``, and follows earlier ones of the same. It is sent ``once`` where its
-    repetition would have an effect: then the loss of the answer ends in the deadline.
+    repetition would have an effect: then the loss of the answer ends in the deadline. Who asks such questions again and
+    again declares their ``key`` (`zenoh.Session.declare_keyexpr`), because each of them needs its number (ADR 77).
     """
 
-    key: str
+    key: str | zenoh.KeyExpr
     whom: str
     deadline_s: float
     payload: bytes | None = None
@@ -301,8 +302,8 @@ def answers(
 ) -> list[zenoh.Sample]:
     """Query until a queryable answers; return at least one answer.
 
-    A query that is sent before the queryable is known gets no reply. So this waits until a queryable matches, and
-    repeats the query when the matching changes.
+    A query that is sent before the queryable is known gets no reply. So then this waits until a queryable matches, and
+    repeats the query when the matching changes. Only this wait declares something.
 
     ``over`` says whether the answer is not needed any more. With ``every`` this waits for the end of the query; without
     it, the first answer is enough.
@@ -313,7 +314,18 @@ def answers(
     """
     end = time.monotonic() + question.deadline_s
     changed, sent = threading.Event(), False
-    encoding = json_encoding if question.payload is not None else None
+
+    def asked(get: Callable[..., object]) -> list[zenoh.Sample]:
+        # Zenoh does not report that the process of the queryable is gone: it would wait for the timeout.
+        replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+        encoding = json_encoding if question.payload is not None else None
+        handler = Callback(replies.put, partial(replies.put, None))
+        get(handler, payload=question.payload, encoding=encoding, attachment=question.attachment)
+        return _collected(replies, over, every=every)
+
+    get = partial(session.get, question.key, timeout=question.deadline_s, priority=question.priority)
+    if not question.once and (samples := asked(get)):
+        return samples
     with session.declare_querier(question.key, timeout=question.deadline_s, priority=question.priority) as querier:
         listener = querier.declare_matching_listener(lambda _status: changed.set())
         try:
@@ -321,11 +333,7 @@ def answers(
                 changed.clear()
                 if matches(querier) and not (sent and question.once):
                     sent = True
-                    # Zenoh does not report that the process of the queryable is gone: it would wait for the timeout.
-                    replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
-                    handler = Callback(replies.put, partial(replies.put, None))
-                    querier.get(handler, payload=question.payload, encoding=encoding, attachment=question.attachment)
-                    if samples := _collected(replies, over, every=every):
+                    if samples := asked(querier.get):
                         return samples
                 if over():
                     raise MeshLost(f"{question.whom} has not answered yet, and this process does not wait any more")

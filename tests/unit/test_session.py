@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from pathlib import Path
 from typing import cast
 
 import psutil
@@ -12,8 +13,8 @@ import zenoh
 
 from fmu_mesh.errors import ConfigurationError, DeadlineExceeded, MeshLost
 from fmu_mesh.wire.client.mesh_client import key_expression
-from fmu_mesh.wire.session import Question, Wiring, ask, close_session, is_of_this_host, open_session
-from tests.helpers import DEADLINE_S
+from fmu_mesh.wire.session import Question, Wiring, ask, close_session, is_of_this_host, matches, open_session
+from tests.helpers import DEADLINE_S, NUMBERS_OF_ZENOH, wait_until
 
 
 class Slow:
@@ -96,6 +97,31 @@ def test_a_question_that_is_sent_once_is_not_repeated(once: bool) -> None:  # no
     assert asked.acquire(blocking=False) is not once
     queryable.undeclare()
     close_session(session)
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_many_questions_leave_the_publishers_of_session_alone(once: bool, tmp_path: Path) -> None:  # noqa: FBT001
+    at, received = (f"unixsock-stream/{tmp_path}/tool.sock",), list[bytes]()
+    with open_session(Wiring(listen=at)) as mesh, open_session(Wiring(mode="client", connect=at)) as tool:
+
+        def answer(query: zenoh.Query) -> None:
+            query.reply("lab/mesh/command", b"{}")
+            query.drop()
+
+        mesh.declare_queryable("lab/mesh/command", answer)
+        mesh.declare_subscriber("lab/gain/in/u", lambda sample: received.append(sample.payload.to_bytes()))
+        publisher = tool.declare_publisher("lab/gain/in/u", congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: matches(publisher), "the input")
+        key = tool.declare_keyexpr("lab/mesh/command") if once else "lab/mesh/command"
+        question = Question(key, "the mesh", DEADLINE_S, once=once)
+        for _ in range(NUMBERS_OF_ZENOH - 50):
+            tool.declare_keyexpr("lab/other")
+
+        for _ in range(100):
+            ask(tool, question)
+        publisher.put(b"1.0")
+
+        wait_until(lambda: received, "the value")
 
 
 def test_a_bad_key_expression_is_reported_without_the_sources_of_zenoh() -> None:

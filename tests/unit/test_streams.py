@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Self, cast
+from typing import Any, Literal, Self, cast
 
 import pytest
 import zenoh
@@ -15,6 +18,8 @@ from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.wire.keys import Keys
+from fmu_mesh.wire.session import Wiring, matches, open_session
+from tests.helpers import DEADLINE_S, NUMBERS_OF_ZENOH, wait_until
 from tests.scenarios.scenario import variable
 
 ROOT = "fmu_mesh/lab/unit"
@@ -26,6 +31,9 @@ class Session:
     def __init__(self, subscribed: list[str]) -> None:
         self.subscribed = [zenoh.KeyExpr(key) for key in subscribed]
         self.asked = 0
+
+    def declare_keyexpr(self, key: str) -> zenoh.KeyExpr:
+        return zenoh.KeyExpr(key)
 
     def declare_publisher(self, key: object, **_settings: object) -> Publisher:
         return Publisher(self, zenoh.KeyExpr(str(key)))
@@ -51,13 +59,15 @@ class Publisher:
         return SimpleNamespace(matching=any(self._key.intersects(key) for key in self._session.subscribed))
 
 
-def streams_of(names: list[str], session: Session) -> InstanceStreams:
-    """The streams of an instance whose local variables have these names."""
-    variables = {name: variable(name, "local") for name in names}
+def streams_of(
+    names: list[str], session: Session | zenoh.Session, causality: Literal["local", "input"] = "local"
+) -> InstanceStreams:
+    """The streams of an instance whose variables have these names."""
+    variables = {name: variable(name, causality) for name in names}
     description = SimpleNamespace(variables=[*variables.values()], variable=variables.get)
     runner = SimpleNamespace(name="unit", instance=SimpleNamespace(description=description))
     return InstanceStreams(
-        cast("Any", runner), cast("Any", session), Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 10), lambda: None
+        cast("Any", runner), cast("Any", session), Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 10), lambda: None, {}
     )
 
 
@@ -114,6 +124,69 @@ def test_when_the_last_subscriber_has_gone_no_variable_is_wanted() -> None:
     assert not streams._wanted
 
 
+def test_more_questions_than_keys_may_stay_declared_find_too_much_and_never_too_little() -> None:
+    names = [f"{number}.x" for number in range(10_000)]
+    session = Session([Keys("fmu_mesh", "lab").variable("unit", "local", name) for name in names[::2]])
+    streams = streams_of(names, session)
+
+    streams.look()
+
+    assert {*names[::2]} <= streams._wanted.keys()
+    assert len(streams._declared) == 4096
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """The session of a node, and that of somebody who subscribes to one of its variables."""
+    at = (f"unixsock-stream/{tmp_path}/node.sock",)
+    with (
+        open_session(Wiring(listen=at, publishes=f"{ROOT}/*/*")) as node,
+        open_session(Wiring(mode="client", connect=at)) as tool,
+    ):
+        tool.declare_subscriber(f"{ROOT}/in/*", lambda _sample: None)
+        yield node, tool
+
+
+def test_no_value_that_is_sent_to_an_input_is_lost_while_it_looks(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+    node, tool = pair
+    received: list[int] = []
+    node.declare_subscriber(f"{ROOT}/in/*", lambda sample: received.append(int(sample.payload.to_bytes())))
+    publisher = tool.declare_publisher(f"{ROOT}/in/u", congestion_control=zenoh.CongestionControl.BLOCK)
+    wait_until(lambda: matches(publisher), "the input")
+    streams, done = streams_of(["u"], node, "input"), threading.Event()
+    wait_until(lambda: streams.is_followed, "the subscriber")
+
+    def send() -> None:
+        for number in range(20_000):
+            publisher.put(str(number))
+        done.set()
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    while not done.is_set():
+        streams.look()
+    sender.join(DEADLINE_S)
+
+    wait_until(lambda: received[-1:] == [19_999], "the last value")
+    assert received == [*range(20_000)]
+
+
+def test_a_long_search_leaves_the_other_publishers_of_session_alone(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+    node, tool = pair
+    received: list[bytes] = []
+    tool.declare_subscriber(f"{ROOT}/log", lambda sample: received.append(sample.payload.to_bytes()))
+    log = node.declare_publisher(f"{ROOT}/log", congestion_control=zenoh.CongestionControl.BLOCK)
+    streams = streams_of(["u"], node, "input")
+    wait_until(lambda: matches(log) and streams.is_followed, "the subscribers")
+
+    for _ in range(NUMBERS_OF_ZENOH + 100):
+        streams.look()
+    log.put(b"still there")
+
+    assert streams.is_followed
+    wait_until(lambda: received == [b"still there"], "the message")
+
+
 def test_rows_that_were_overwritten_before_they_were_read_are_dropped() -> None:
     watched = variable("y", "output")
     outputs = Ring(Layout.of([watched]), 4)
@@ -123,7 +196,7 @@ def test_rows_that_were_overwritten_before_they_were_read_are_dropped() -> None:
     )
     keys, grid = Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 100)
     session = Session([f"{ROOT}/out/y"])
-    streams = InstanceStreams(cast("Any", runner), cast("Any", session), keys, grid, lambda: None)
+    streams = InstanceStreams(cast("Any", runner), cast("Any", session), keys, grid, lambda: None, {})
     streams.look()
     streams.update()
 

@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -221,8 +221,8 @@ class MeshClient:
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
-        key, payload = self.keys.mesh_key("command"), msgspec.json.encode(command)
-        question = Question(key, self._who, timeout_s or self._timeout_s, payload, once=True)
+        payload = msgspec.json.encode(command)
+        question = Question(self._command_key, self._who, timeout_s or self._timeout_s, payload, once=True)
         return _understood(self._ask(question)[0], CommandAnswer, self._who)
 
     def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
@@ -357,6 +357,10 @@ class MeshClient:
         return _unknown(f"{self._who} has no instance '{name}'", name, there)
 
     # --- questions
+
+    @cached_property
+    def _command_key(self) -> zenoh.KeyExpr:
+        return self.session.declare_keyexpr(self.keys.mesh_key("command"))
 
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
