@@ -262,6 +262,8 @@ def _instances(
         not_finite = loaded.config.not_finite(config)
         start_values = resolve_start_values(name, config, descriptions[name], findings, finite=not_finite == "stop")
         config.check(f"instances.{name}", descriptions[name], findings)
+        if math.isfinite(base) and base > 0.0:
+            config.check_step(f"instances.{name}", step_points * base, findings)
         instances[name] = SystemInstance(
             name=name,
             fmu=str(loaded.resolve(config.path)) if config.path else "",
