@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from ...errors import ConfigurationError, FmuError, InitializationFailed, LoadFailed, MeshLost, StepFailed
 from ...rings.ring import Ring
@@ -63,6 +63,8 @@ class RosSimulatorInstance:
         self._per_step = 1
         self._stepping = False
         self._connection = self._connected()
+        self._open = ExitStack()
+        self._open.callback(self._connection.close)
         try:
             self._inputs: list[tuple[Assembler, Put, list[str]]] = []
             self._outputs: list[OutputTopic] = []
@@ -74,7 +76,7 @@ class RosSimulatorInstance:
             self._calls["GetSimulatorFeatures"] = self._client("GetSimulatorFeatures")
             self._check_features()
         except BaseException:
-            self._connection.close()
+            self.close()
             raise
 
     def enter_initialization(
@@ -151,7 +153,7 @@ class RosSimulatorInstance:
             self._stepping = False
             with suppress(MeshLost):  # it does not answer
                 self._calls["SetSimulationState"]({"state": {"state": SimulationStates.PAUSED}}, _PAUSE_S)
-        self._connection.close()
+        self._open.close()
 
     # --- the connection
 

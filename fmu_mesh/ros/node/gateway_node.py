@@ -107,11 +107,12 @@ class GatewayNode:
             stack.callback(profile.close)
             names = {topic.profile for topic in plan.topics} or {"ros2dds"}
             profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
-            gateway = Gateway(plan, client.session, client.keys, grid_of(info), profiles)
+            gateway = Gateway(plan, client.session, client.keys, grid_of(info))
             stack.callback(gateway.close)
-            gateway.open(_TIMEOUT_S)
+            gateway.open(profiles, _TIMEOUT_S)
             if self._interfaces is not None:
-                services = SimulationServices(self._interfaces, plan.types, client.session, client.keys, action=True)
+                mesh = client.session, client.keys, gateway.settle
+                services = SimulationServices(self._interfaces, plan.types, *mesh, action=True)
                 server = SimulationServer(self._node, services, plan.namespace)
                 stack.callback(server.close)
                 server.open()
