@@ -196,7 +196,7 @@ class RosSimulatorInstance:
     @property
     def _hint(self) -> str:
         services = absolute("step_simulation", self._own.namespace)
-        where = f" and the router at {', '.join(self._own.connect)}" if self._own.profile == "rmw_zenoh" else ""
+        where = f" through the router at {', '.join(self._own.connect)}" if self._own.profile == "rmw_zenoh" else ""
         return f"Start the simulator, which has to offer '{services}'{where}."
 
     def _ask(

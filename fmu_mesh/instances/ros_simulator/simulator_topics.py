@@ -26,6 +26,7 @@ from .simulator_section import RosSimulatorConfig, SimulatorTopicConfig
 
 __all__ = ["SimulatorTopics"]
 
+_SECTION = "section"
 _SIZED = re.compile(r"(.+)\[([1-9]\d*)\]")
 _TYPES: dict[str, VariableType] = {
     **{name.lower(): name for name in TYPES},
@@ -51,7 +52,7 @@ class SimulatorTopics(msgspec.Struct, frozen=True):
         Raises:
             LoadFailed: they cannot be what the section says; says why.
         """
-        findings = Findings("")
+        findings = Findings(_SECTION)
         try:
             types = MessageTypes(section.ros_simulator.distribution)
             define_simulation_types(types)
@@ -62,7 +63,7 @@ class SimulatorTopics(msgspec.Struct, frozen=True):
         if twice := sorted({name for name in names if names.count(name) > 1}):
             findings.add("topics", f"{listed(twice)} more than once", "a name of its own for each variable")
         if findings:
-            raise LoadFailed("; ".join(str(found).removeprefix(": ") for found in findings))
+            raise LoadFailed("; ".join(str(found).removeprefix(f"{_SECTION}: ") for found in findings))
         return cls(types, topics)
 
     @property
