@@ -91,11 +91,6 @@ class RclpyProfile:
         """The published topics that nobody subscribes to."""
         return [name for name, own in self._publishers if not own.get_subscription_count()]
 
-    def deliver(self, timeout_s: float) -> bool:
-        """Wait until all reliable subscribers have what was published, for so long in s at most; whether they have."""
-        timeout = ros_module("rclpy.duration").Duration(seconds=timeout_s)
-        return all(own.wait_for_all_acked(timeout) for _, own in self._publishers)
-
 
 def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
     qos, own = ros_module("rclpy.qos"), topic.qos

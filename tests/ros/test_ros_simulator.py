@@ -16,6 +16,7 @@ import yaml
 from fmu_mesh.ros_wire.simulation_types import SimulatorFeature
 from tests.helpers import Launched, Place, assert_readable, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import Peer, free_port, need
+from tests.ros.ros_peer import built_types_or_skip, environment, ros_or_skip
 
 DOMAIN = 7
 STEP_SIZE = 0.01
@@ -303,7 +304,7 @@ def test_check_finds_what_is_wrong_in_a_section(place: Place, change: dict[str, 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to another user")
 def test_interpreter_of_a_foreign_file_needs_permission(place: Place) -> None:
     need("rosbags", "xxhash")
-    plant = section(17447, STATE, profile="rclpy") | {"interpreter": sys.executable}
+    plant = section(17447, STATE, step=0.001, profile="rclpy") | {"interpreter": sys.executable}
     config = write_config(place.folder, instances={"plant": plant}, connections=())
     os.chown(config, 54321, 54321)
 
@@ -313,3 +314,51 @@ def test_interpreter_of_a_foreign_file_needs_permission(place: Place) -> None:
     assert "instances.plant.ros_simulator: Python code, in a file of the user 54321" in refused.errors
     assert allowed.wait() == 0
     assert f"runs the ROS simulator in the namespace /lab with {sys.executable}" in allowed.errors
+
+
+@pytest.fixture
+def ros(place: Place) -> dict[str, str]:
+    """The environment of ROS with its own types, which the test has, too."""
+    ros_or_skip()
+    place.environment |= built_types_or_skip() | environment(place.folder / "log")
+    return dict(place.environment)
+
+
+@contextmanager
+def real(ros: dict[str, str], **orders: Any) -> Iterator[Peer]:  # noqa: ANN401 see simulator_peer.py
+    """A simulator in rclpy."""
+    whole = {"step": STEP_SIZE, "features": MANY, "namespace": "/lab", **orders}
+    with Peer("simulator_peer.py", "rclpy", whole, environment=ros) as peer:
+        assert peer.answer(0) == {"declared": True}
+        yield peer
+
+
+@pytest.mark.parametrize("interpreter", [None, sys.executable], ids=["own", "another"])
+def test_simulator_in_rclpy_gives_the_result_of_one_mesh(
+    place: Place, ros: dict[str, str], interpreter: str | None
+) -> None:
+    (place.folder / "plant.py").write_text(PLANT)
+    plant = section(17447, {**STATE, "reliability": "reliable"}, FORCE, profile="rclpy", domain=None)
+    outer = controlled(place.folder, plant | {"interpreter": interpreter})
+    one = controlled(place.folder, {"python": "plant.py:Plant"}, "one")
+
+    with real(ros, late=True):
+        assert place.run("launch", outer, "--no-progress").wait() == 0
+        first = (place.folder / "outer.csv").read_bytes()
+        assert place.run("launch", outer, "--local", "--no-progress").wait() == 0
+    assert place.run("launch", one, "--no-progress").wait() == 0
+
+    assert first == (place.folder / "one.csv").read_bytes()
+    assert (place.folder / "outer.csv").read_bytes() == first, "in one process, and after a reset"
+
+
+def test_simulator_in_rclpy_that_ends_in_a_step_ends_the_run(place: Place, ros: dict[str, str]) -> None:
+    (place.folder / "plant.py").write_text(PLANT)
+    outer = controlled(place.folder, section(17447, STATE, FORCE, profile="rclpy", domain=None, timeout=5.0))
+
+    with real(ros, end_at=7):
+        done = place.run("launch", outer, "--no-progress")
+
+    assert done.wait() == 3
+    assert "instance plant, point 6, t = 0.06 s: " in done.message
+    assert "/lab/step_simulation" in done.message

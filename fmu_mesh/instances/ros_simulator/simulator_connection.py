@@ -46,9 +46,6 @@ class SimulatorConnection(Protocol):
     def wait(self, timeout_s: float) -> None:
         """Wait until a message may have come, for so long at most."""
 
-    def deliver(self, timeout_s: float) -> bool:
-        """Wait until all that was published is before a later request; whether it is, after so long at most."""
-
     def unheard(self) -> list[str]:
         """The published topics that nobody subscribes to."""
 
@@ -92,10 +89,6 @@ class ZenohConnection:
         self._arrived.wait(timeout_s)
         self._arrived.clear()  # whoever waits looks into its queue next
 
-    def deliver(self, timeout_s: float) -> bool:
-        """See `SimulatorConnection`: samples and requests of a session stay in order on their way."""
-        return True
-
     def unheard(self) -> list[str]:
         """See `SimulatorConnection`."""
         return self._profile.unheard()
@@ -132,7 +125,6 @@ class RclpyConnection:
             self._open = stack.pop_all()
         self.publish = self._profile.publish
         self.subscribe = self._profile.subscribe
-        self.deliver = self._profile.deliver
         self.unheard = self._profile.unheard
 
     def client(self, name: str, kind: str, *, repeats: bool = False) -> Call:

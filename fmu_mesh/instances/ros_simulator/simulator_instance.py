@@ -137,9 +137,6 @@ class RosSimulatorInstance:
             except CdrError as error:
                 text = f"the inputs do not fit into a message on '{assembler.topic.name}': {error}"
                 raise StepFailed(text, instance=self.name) from error
-        if self._inputs and not self._connection.deliver(self._own.timeout):
-            text = f"the messages of its inputs were not received within {self._own.timeout:g} s"
-            raise StepFailed(text, instance=self.name, hint=self._hint)
         self._stepping = True
         for steps in [self._per_step] if self._multiple else [1] * self._per_step:
             self._ask("StepSimulation", {"steps": steps}, StepFailed)
