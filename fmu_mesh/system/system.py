@@ -377,6 +377,8 @@ def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findin
         if (doubt := description.doubt_about_step(step)) is not None:
             expected = f"`step_size: {description.step_size or step:.12g}`, in `simulation` or for '{name}' alone"
             findings.add(f"instances.{name}.step_size", f"{doubt}; '{name}' may compute wrong values", expected)
+        for path, found, expected in section.doubts():
+            findings.add(f"instances.{name}.{path}", found, expected)
         silent = [clock.name for clock in description.clocks if clock.never_ticks]
         if silent:
             found = f"triggered input clocks of '{name}' never tick, because clocks cannot be connected yet"

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from fmu_mesh.ros_wire.simulation_types import SimulatorFeature
-from tests.helpers import Launched, Place, assert_readable, row_count, rows_of, wait_until, write_config
+from tests.helpers import FMUS, Launched, Place, assert_readable, row_count, rows_of, wait_until, write_config
 from tests.ros.peers import Peer, free_port, need
 from tests.ros.ros_peer import built_types_or_skip, environment, ros_or_skip
 
@@ -234,6 +234,31 @@ def test_input_that_nobody_subscribes_to_is_a_warning(place: Place, port: int) -
     assert "nobody subscribes to /lab/nowhere: these inputs have no effect" in done.errors
 
 
+def test_example_of_the_page_drives_its_cart(place: Place, port: int) -> None:
+    folder = Path(__file__).parents[2] / "examples/ros/simulator"
+
+    def placed(name: str) -> str:
+        text = (folder / name).read_text().replace("../../../results/", "").replace("../../../fmus", str(FMUS))
+        config = yaml.safe_load(text)
+        config.get("ros", config["instances"].get("cart", {}).get("ros_simulator"))["connect"] = [
+            f"tcp/127.0.0.1:{port}"
+        ]
+        (place.folder / name).write_text(yaml.safe_dump(config))
+        return name
+
+    simulator = place.start("launch", placed("cart.yaml"), "--paused", "--no-progress")
+    wait_until(lambda: row_count(place.folder / "cart.csv"), "point 0")
+
+    assert place.run("launch", placed("controlled.yaml"), "--no-progress").wait() == 0
+    simulator.signal(signal.SIGINT)
+    simulator.wait()
+
+    rows, cart = rows_of(place.folder / "controlled.csv"), rows_of(place.folder / "cart-2.csv")
+    assert [row[1:3] for row in rows] == [(row[2], row[1]) for row in cart[::10]]
+    assert len(rows) == 501
+    assert abs(rows[-1][1] - 1.0) < abs(rows[0][1] - 1.0)
+
+
 def failed(place: Place, port: int, *topics: dict[str, Any], plant: dict[str, Any] | None = None) -> str:
     """What a mesh says whose simulator fails."""
     (place.folder / "plant.py").write_text(PLANT)
@@ -283,7 +308,7 @@ def test_failures_of_a_simulator_name_instance_point_and_reason(place: Place, po
         ({"topics": [{**STATE, "outputs": {"twist.linear": "position"}}]}, "'twist.linear' of"),
         ({"topics": [STATE, PUSH, PUSH]}, "topics: force more than once"),
         ({"topics": [{**STATE, **PUSH}]}, "both `outputs` and `inputs`"),
-        ({"topics": [{**FORCE, "match": "stamp"}]}, "'std_msgs/msg/Float64' has no header"),
+        ({"topics": [{**SPEED, "match": "stamp"}]}, "topics[0]: 'std_msgs/msg/Float64', which has no header"),
         ({"topics": [{**STATE, "topic": "2d"}]}, "starts with a digit"),
     ],
 )
@@ -299,6 +324,20 @@ def test_check_finds_what_is_wrong_in_a_section(place: Place, change: dict[str, 
 
     assert done.wait() == 2
     assert text in done.errors
+
+
+def test_check_warns_of_a_topic_whose_newest_message_counts(place: Place) -> None:
+    need("rosbags", "xxhash")
+    config = write_config(
+        place.folder,
+        instances={"plant": section(17447, {**SPEED, "match": "newest"}, step=0.001)},
+        connections=(),
+    )
+
+    done = place.run("check", config)
+
+    assert done.wait() == 0
+    assert "instances.plant.topics[0].match: the newest message on 'speed': the result may differ" in done.output
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to another user")

@@ -64,7 +64,7 @@ class OutputTopic:
         self.name = topic.name
         self.variables = [port.variable.name for port in topic.ports]
         self.values: dict[str, Value] = {}
-        self._match = own.match or ("stamp" if types.has_header(topic.message) else "newest")
+        self._match = own.match
         self._every = own.every
         self._time = time
         self._disassembler = Disassembler(topic, types)

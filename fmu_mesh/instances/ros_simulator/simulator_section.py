@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import msgspec
@@ -77,12 +78,12 @@ class SimulatorTopicConfig(Base, frozen=True, kw_only=True):
     ] = {}
     inputs: Annotated[dict[str, str], Meta(description="Names of inputs by field.", examples=[{"data": "torque"}])] = {}
     match: Annotated[
-        Literal["stamp", "count", "newest"] | None,
+        Literal["stamp", "count", "newest"],
         Meta(
-            description="Which message belongs to a point: the one with its time in `header.stamp` (default where "
-            "there is a header), the one with its number, or the newest (default without a header)."
+            description="Which message of outputs belongs to a point: stamp: the one with its time in `header.stamp`; "
+            "count: the one with its number; newest: the newest when the simulator has stepped."
         ),
-    ] = None
+    ] = "stamp"
     every: Annotated[
         int, Meta(ge=1, description="Steps of the simulator between two messages of outputs, for stamp and count.")
     ] = 1
@@ -130,6 +131,13 @@ class RosSimulatorConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_f
         if step > 0.0 and not steps_between(0.0, step_size, step):
             found = f"{step_size:.12g} s, no whole multiple of the {step:.12g} s in `ros_simulator.step`"
             findings.add(f"{place}.step_size", found, "a multiple of the step of the simulator")
+
+    def doubts(self) -> Iterator[tuple[str, str, str]]:
+        """Topics of outputs for which nothing says which message belongs to a point."""
+        for number, own in enumerate(self.topics):
+            if own.outputs and own.match == "newest":
+                found = f"the newest message on '{own.topic}': the result may differ from run to run"
+                yield f"topics[{number}].match", found, "stamp or count, where the simulator can be relied on for it"
 
     def summary(self, description: ModelDescription) -> str:
         """Where the simulator is."""

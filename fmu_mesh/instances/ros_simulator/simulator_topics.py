@@ -95,8 +95,9 @@ def _topics(
         if own.type not in types:
             near = nearest(own.type, tuple(types.store.fielddefs))
             findings.add(f"{path}.type", f"the unknown message type '{own.type}'", "one of ROS", near)
-        elif own.match == "stamp" and not types.has_header(own.type):
-            findings.add(f"{path}.match", f"stamp, and '{own.type}' has no header", "count or newest")
+        elif own.outputs and own.match == "stamp" and not types.has_header(own.type):
+            found = f"'{own.type}', which has no header with a stamp"
+            findings.add(path, found, "`match: count` or `match: newest`, which say which message belongs to a point")
         if len(findings) > before:
             continue
         fields = own.outputs or own.inputs
