@@ -106,11 +106,12 @@ class Simulator:
 
 
 def stamp_of(step: int, orders: dict[str, Any]) -> tuple[int, int]:
-    return divmod(round(step * orders["step"] * 1e9), 10**9)
+    step_ns = float(orders["step"]) * 1e9
+    return divmod(round(step * step_ns), 10**9)
 
 
 def step_of(stamp: Any, orders: dict[str, Any]) -> int:  # noqa: ANN401 a message
-    return round((int(stamp.sec) + int(stamp.nanosec) * 1e-9) / orders["step"])
+    return round((int(stamp.sec) + int(stamp.nanosec) * 1e-9) / float(orders["step"]))
 
 
 def sdk(orders: dict[str, Any]) -> None:
