@@ -7,7 +7,8 @@ engines. It knows no kind.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, cast
@@ -154,15 +155,19 @@ class InstanceSection:
         return False
 
     def agreed(self) -> Self:
-        """The section without what may differ between hosts, such as the path of the model.
+        """The section without what may differ between hosts: the path of the model, and the interpreter.
 
         All processes of a mesh compare a hash of this; the content of the model is compared separately.
         """
-        return _replaced(self, {key_of(self): ""}) if self.path else self
+        return _replaced(self, {"interpreter": None} | ({key_of(self): ""} if self.path else {}))
 
-    def located(self, folder: Path) -> Self:  # noqa: ARG002  for those that name other files than their model
+    def located(self, folder: Path) -> Self:
         """The section with absolute paths for all files but the model; ``folder`` is that of the configuration."""
-        return self
+        if self.interpreter is None:
+            return self
+        found = shutil.which(self.interpreter) if "/" not in self.interpreter else None
+        # Not resolved: the Python of a virtual environment is a link, and where the link is says which environment.
+        return _replaced(self, {"interpreter": found or str(folder / Path(self.interpreter).expanduser())})
 
     def check(self, place: str, description: ModelDescription, findings: Findings) -> None:
         """Add a finding for every key of this section that does not fit the model.
@@ -172,6 +177,13 @@ class InstanceSection:
             description: the model description.
             findings: where the findings go.
         """
+
+    def check_step(self, place: str, step_size: float, findings: Findings) -> None:
+        """Add a finding if an instance cannot take steps of ``step_size`` s; otherwise as `check`."""
+
+    def doubts(self) -> Iterator[tuple[str, str, str]]:
+        """What works and may not be meant: each the path of a key in this section, what is found, and what to do."""
+        yield from ()
 
     def summary(self, description: ModelDescription) -> str:
         """In a few words what computes the model, for the page of `fmu-mesh check`."""

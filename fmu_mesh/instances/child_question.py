@@ -11,13 +11,16 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from shlex import quote
 
 import msgspec
 
+from .. import __version__
 from ..errors import LoadFailed
+from ..installing import installed_from
 from ..variables.model_description import ModelDescription
 
-__all__ = ["ask_description_of", "described", "run_child"]
+__all__ = ["ask_description_of", "check_version", "described", "run_child"]
 
 # Which processes meet here: the one that plans a run, and one child that imports or loads what a user wrote (ADR 56).
 # The child may hang, crash, print, leave threads and processes, or lose its parent.
@@ -92,6 +95,18 @@ def run_child(command: Sequence[str]) -> tuple[bytes, str]:
         for pipe in (child.stdout, child.stderr):
             if pipe is not None:
                 pipe.close()
+
+
+def check_version(python: str) -> None:
+    """Check that a Python has our version; `LoadFailed` if not."""
+    output, _ = run_child([python, "-Pc", "import fmu_mesh; print(fmu_mesh.__version__)"])
+    version = output.decode(errors="replace").strip()
+    if version != __version__:
+        has = f"has fmu-mesh {version}" if version else "has no fmu-mesh"
+        place = installed_from()
+        how = f"{quote(python)} -m pip install {place}" if place else f"from a clone of version {__version__}"
+        hint = f"Install fmu-mesh {__version__} there: {how}"
+        raise LoadFailed(f"the Python '{python}' {has}", hint=hint)
 
 
 def _last_words(errors: bytes) -> str:

@@ -14,6 +14,7 @@ from functools import partial
 
 import msgspec
 import zenoh
+from zenoh.handlers import Callback
 
 from ..errors import FmuError
 from ..system.plan import NodePlan
@@ -115,7 +116,8 @@ class NodeServer:
             self._streams.append(InstanceStreams(runner, self._session, self._keys, grid, changed, declared))
             for kind in ("in", "param"):
                 key = f"{self._keys.instance(runner.name)}/{kind}/*"
-                take = partial(self._answers.put_arrived, runner)
+                # On the thread that reads the link: what is put is a job before a query that came after it.
+                take = Callback(partial(self._answers.put_arrived, runner), indirect=False)
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
     @property

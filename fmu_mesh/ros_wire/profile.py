@@ -6,6 +6,9 @@ Keys of zenoh-bridge-ros2dds are topic names, payloads are CDR, and tokens annou
 contain the type hash, as in ROS since Iron.
 """
 
+# Threads: `take` of a plain subscriber is called on the thread that reads the link, so samples and requests of one
+# sender come in its order. It must return at once: it puts what comes into a queue (ADR 78).
+
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,6 +16,7 @@ from typing import Protocol
 
 import zenoh
 import zenoh.ext
+from zenoh.handlers import Callback
 
 from ..config.mesh import Qos
 from ..wire.session import matches, undeclare_all
@@ -26,7 +30,7 @@ Put = Callable[[bytes, float], None]
 """Publishes one message (CDR) that belongs to a simulation time in s."""
 
 Take = Callable[[bytes], None]
-"""Called with every message (CDR) that arrives, on a thread of Zenoh or ROS."""
+"""Called with every message (CDR) that arrives, on a thread of Zenoh or ROS; it must not wait."""
 
 _RELIABILITY, _DURABILITY, _KEEP_LAST = {"reliable": 1, "best_effort": 0}, {"volatile": 0, "transient_local": 1}, 0
 
@@ -91,7 +95,7 @@ class ZenohProfile:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.qos.depth)
             self._others.append(zenoh.ext.declare_advanced_subscriber(self._session, key, arrived, history=history))
         else:
-            self._others.append(self._session.declare_subscriber(key, arrived))
+            self._others.append(self._session.declare_subscriber(key, Callback(arrived, indirect=False)))
         self._subscribed.append((topic.name, self._announce("MS", topic.name, topic.message, topic.qos)))
 
     def close(self) -> None:
@@ -105,6 +109,10 @@ class ZenohProfile:
             yield RosTopicView(name, "out", matches(publisher))
         for name, token in self._subscribed:
             yield RosTopicView(name, "in", topic_in(token) in published)
+
+    def unheard(self) -> list[str]:
+        """The published topics that nobody subscribes to."""
+        return [name for name, publisher in self._publishers if not matches(publisher)]
 
     def _key(self, name: str, message: str) -> str:
         """The key of a topic or a service."""

@@ -6,6 +6,10 @@ for every slash within a part. Every sample, request and response has an attachm
 the 16 bytes that identify its sender (rmw_zenoh, docs/design.md).
 """
 
+# Threads: Zenoh calls `changed` and, of a server, `answer` on the thread that reads the link, so a request comes after
+# all samples that its sender has published before (`profile`). Neither waits: a service passes its work on. `call`
+# waits on the thread of its caller, and reads `here`, which `changed` replaces (ADR 78).
+
 from __future__ import annotations
 
 import itertools
@@ -13,16 +17,19 @@ import struct
 from collections.abc import Callable
 
 import zenoh
+from zenoh.handlers import Callback
 
 from ..config.mesh import Qos
+from ..errors import MeshLost
 from ..installing import importing
+from ..wire.session import Question, ask
 from .cdr import CdrError, Codec, Message
 from .profile import ZenohProfile
 from .ros_names import dds_type
 from .stamp import nanoseconds
 from .topics import RosPlan
 
-__all__ = ["RmwZenoh", "Service", "decode_attachment"]
+__all__ = ["Call", "RmwZenoh", "Service", "decode_attachment"]
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _SHORT_ATTACHMENT = struct.Struct("<qq16s")
@@ -32,6 +39,14 @@ _NO_HASH = "TypeHashNotSupported"
 
 Service = Callable[[Message, Callable[[Message], None]], None]
 """Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
+
+Call = Callable[[Message, float], Message]
+"""Sends a request and waits for its response, for so long in s.
+
+Raises:
+    DeadlineExceeded: it has not come in time, or there is no such server.
+    MeshLost: the server is gone, or has refused the request.
+"""
 
 
 class RmwZenoh(ZenohProfile):
@@ -67,8 +82,41 @@ class RmwZenoh(ZenohProfile):
 
             service(request, reply)
 
-        self._others.append(self._session.declare_queryable(key, answer, complete=True))
+        self._others.append(self._session.declare_queryable(key, Callback(answer, indirect=False), complete=True))
         self._announce("SS", name, kind, Qos())
+
+    def client(self, name: str, kind: str) -> Call:
+        """Declare a client of the service ``name``; a request is sent once, when there is a server."""
+        key, here = self._key(name, kind), set[str]()
+        request_codec = Codec(self._types, f"{kind}_Request")
+        response_codec = Codec(self._types, f"{kind}_Response")
+        attached = self._attached(self._announce("SC", name, kind, Qos()))
+        was_here = False
+
+        def changed(sample: zenoh.Sample) -> None:
+            nonlocal was_here
+            was_here = True
+            (here.add if sample.kind == zenoh.SampleKind.PUT else here.discard)(str(sample.key_expr))
+
+        servers = f"@ros2_lv/{self._domain}/*/*/*/SS/*/*/*/{_mangled(name)}/**"
+        directly = Callback(changed, indirect=False)
+        self._others.append(self._session.liveliness().declare_subscriber(servers, directly, history=True))
+
+        def over() -> bool:
+            if was_here and not here:
+                raise MeshLost(f"the server of '{name}' is gone")
+            return False
+
+        def call(request: Message, deadline_s: float) -> Message:
+            question = Question(
+                key, f"'{name}'", deadline_s, request_codec.encode(request), attachment=attached(0.0), once=True
+            )
+            try:
+                return response_codec.decode(ask(self._session, question, over))
+            except CdrError as error:
+                raise MeshLost(f"the response of '{name}' is not understood: {error}") from error
+
+        return call
 
     def _key(self, name: str, message: str) -> str:
         return f"{self._domain}/{name.strip('/')}/{dds_type(message)}/{self._hash(message)}"

@@ -47,7 +47,7 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         if not allowed:
             findings.add(f"instances.{name}.{key}", found, expected)
             continue
-        code = getattr(section, key).replace(section.path, str(path or ""), 1)
+        code = str(getattr(section, key)).replace(section.path, str(path or ""), 1)
         by = f" with {section.interpreter}" if section.interpreter is not None else ""
         tell(f"instance '{name}' runs {code}{by}, {allowed} ({found})")
 

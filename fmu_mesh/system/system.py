@@ -262,6 +262,8 @@ def _instances(
         not_finite = loaded.config.not_finite(config)
         start_values = resolve_start_values(name, config, descriptions[name], findings, finite=not_finite == "stop")
         config.check(f"instances.{name}", descriptions[name], findings)
+        if math.isfinite(base) and base > 0.0:
+            config.check_step(f"instances.{name}", step_points * base, findings)
         instances[name] = SystemInstance(
             name=name,
             fmu=str(loaded.resolve(config.path)) if config.path else "",
@@ -375,6 +377,8 @@ def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findin
         if (doubt := description.doubt_about_step(step)) is not None:
             expected = f"`step_size: {description.step_size or step:.12g}`, in `simulation` or for '{name}' alone"
             findings.add(f"instances.{name}.step_size", f"{doubt}; '{name}' may compute wrong values", expected)
+        for path, found, expected in section.doubts():
+            findings.add(f"instances.{name}.{path}", found, expected)
         silent = [clock.name for clock in description.clocks if clock.never_ticks]
         if silent:
             found = f"triggered input clocks of '{name}' never tick, because clocks cannot be connected yet"

@@ -359,6 +359,11 @@ NOT_RUN = [
         "`ros2` is not on PyPI; tests/ros/test_simulation_interfaces.py calls these services",
     ),
     (
+        "docs/ros-simulation.md",
+        "fmu-mesh router --listen tcp/127.0.0.1:7447       # or rmw_zenohd",
+        "they run at the same time; tests/ros/test_ros_simulator.py runs them",
+    ),
+    (
         "docs/ros-tutorial.md",
         "sudo apt install python3-venv",
         "it needs a ROS in /opt/ros; tests/ros/test_ros_tutorial.py runs the rest with rclpy from PyPI",

@@ -22,7 +22,7 @@ def run_while_samples_come(*tokens: zenoh.SampleKind) -> bool:
     """Whether a gateway that is told this, all before it looks, ends though the samples of the mesh go on and on."""
     nothing: Any = None
     plan = RosPlan(nothing)
-    gateway = Gateway(plan, nothing, Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 1000), {})
+    gateway = Gateway(plan, nothing, Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 1000))
     port = SimpleNamespace(instance="a", kind="out", variable=SimpleNamespace(name="y"), step_points=1)
     gateway._watch(cast("Any", port))
     for kind in tokens:

@@ -15,7 +15,7 @@ from typing import IO
 
 import pytest
 
-from fmu_mesh.ros.node.gateway_node import RclpyProfile
+from fmu_mesh.ros_wire.rclpy_profile import RclpyProfile
 from fmu_mesh.ros_wire.topics import Topic
 from tests.helpers import DEADLINE_S, FMUS, Place, write_config
 from tests.ros.ros_peer import Ros, ros_or_skip

@@ -7,19 +7,16 @@ import sys
 from collections.abc import Callable
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import msgspec
 
-from ... import __version__
 from ...config.mesh import LimitsConfig
 from ...errors import FmuMeshError, LoadFailed
 from ...files import sha256_of
-from ...installing import installed_from
 from ...system.process_sharing import BOTH_USE_PYTHON, Claims
 from ...variables.model_description import ModelDescription
-from ..child_question import ask_description_of, described, run_child
+from ..child_question import ask_description_of, check_version, described
 from ..contract import Instance, Kind, Opening
 from .python_section import PythonConfig, class_place_of
 
@@ -40,7 +37,7 @@ class PythonKind(Kind[PythonConfig]):
         if target.file and not path.is_file():
             raise LoadFailed("a folder" if path.is_dir() else "no such file")
         if section.interpreter is not None:
-            _check_version(section.interpreter)
+            check_version(section.interpreter)
         request = section.python, str(path), section.arguments
         return ask_description_of("its import", __name__, request, section.interpreter or sys.executable)
 
@@ -83,18 +80,6 @@ def answer_to(request: str) -> bytes:
         return description
 
     return described(describe)
-
-
-def _check_version(python: str) -> None:
-    """Check that a Python has our version."""
-    output, _ = run_child([python, "-Pc", "import fmu_mesh; print(fmu_mesh.__version__)"])
-    version = output.decode(errors="replace").strip()
-    if version != __version__:
-        has = f"has fmu-mesh {version}" if version else "has no fmu-mesh"
-        place = installed_from()
-        how = f"{quote(python)} -m pip install {place}" if place else f"from a clone of version {__version__}"
-        hint = f"Install fmu-mesh {__version__} there: {how}"
-        raise LoadFailed(f"the Python '{python}' {has}", hint=hint)
 
 
 KIND_OF_COMPONENTS = PythonKind()  # what the entry point `python` names

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from contextvars import ContextVar
-from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
 from msgspec import Meta
@@ -94,15 +92,6 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
         """The section without the file and the interpreter, which may be elsewhere on each host."""
         target = class_place_of(self.python)
         return replace(self, python=f"{target.module}:{target.name}", interpreter=None)
-
-    def located(self, folder: Path) -> Self:
-        """The section with the absolute path of the interpreter."""
-        if self.interpreter is None:
-            return self
-        path = Path(self.interpreter).expanduser()
-        found = shutil.which(self.interpreter) if "/" not in self.interpreter else None
-        # Not resolved: the Python of a virtual environment is a link, and where the link is says which environment.
-        return replace(self, interpreter=found or str(folder / path))
 
     def summary(self, description: ModelDescription) -> str:
         """The class, and where it runs."""

@@ -15,7 +15,8 @@ ROS, so no node and no master ever waits for ROS.
 # * The mesh ends while samples are on their way. The token of a follower makes the master stay until they are carried;
 #   the loss of the master's token can overtake samples (`latecomers`), so it is no reason to stop at once.
 # * The mesh is reset: its points begin again, and `/clock` jumps back. A point before the one of the last sample tells
-#   it; each node has sent its last samples before the first new one of any (ADR 75).
+#   it, or point 0 after point 0; each node has sent its last samples before the first new one of any (ADR 75). So every
+#   topic has a message of point 0 after a reset, for which programs wait that step the mesh.
 # * The token of the mesh comes back. It belongs to another run, whose points begin again: this gateway ends.
 #
 # A variable of a slower instance holds its value between two of its points. So everything up to a point has been
@@ -56,6 +57,7 @@ from ...wire.values import Stamp, encode_origin, encode_value, json_encoding
 from ...wire.views import MeshInfo
 from .deadline import Deadline
 from .parameter_services import ParameterServices
+from .settling import Settling
 from .simulation_services import SimulationServices
 
 __all__ = ["Gateway", "open_profiles"]
@@ -71,10 +73,13 @@ Event = Callable[[], None]
 
 
 @contextmanager
-def open_profiles(
-    section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys
+def open_profiles(  # noqa: PLR0913, PLR0917  one gateway and its surroundings
+    section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys, settle: Event
 ) -> Iterator[dict[str, ZenohProfile]]:
-    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the services."""
+    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the services.
+
+    ``settle`` waits until the mesh has all values that came before.
+    """
     profiles: dict[str, ZenohProfile] = {}
     with ExitStack() as stack:
         for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
@@ -84,7 +89,7 @@ def open_profiles(
             if isinstance(profile, RmwZenoh):
                 stack.enter_context(ParameterServices(plan, mesh, keys).served_by(profile))
                 if section.interfaces is not None:
-                    services = SimulationServices(section.interfaces, plan.types, mesh, keys)
+                    services = SimulationServices(section.interfaces, plan.types, mesh, keys, settle)
                     stack.enter_context(services.served_by(profile, plan.namespace))
         yield profiles
 
@@ -92,27 +97,25 @@ def open_profiles(
 class Gateway:
     """Carries topics between one mesh and ROS.
 
-    The caller closes the session and the profiles; the first of these has `/clock`.
-
-    Call `open`, then `run`, then `close`.
+    The caller closes the session and the profiles. Call `open`, then `run`, then `close`.
 
     Attributes:
+        settle: from any thread: wait until the mesh has the values of all messages that have arrived from ROS.
         ignored: by topic, how many elements of messages had keys that no variable has.
         deadlines: of the topics that have one.
     """
 
-    def __init__(
-        self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid, profiles: Mapping[str, Profile]
-    ) -> None:
+    def __init__(self, plan: RosPlan, mesh: zenoh.Session, keys: Keys, grid: TimeGrid) -> None:
         self.ignored: dict[str, int] = {}
         self.deadlines: list[Deadline] = []
         self._plan = plan
         self._mesh = mesh
         self._keys = keys
         self._grid = grid
-        self._profiles = profiles
+        self._profiles: Mapping[str, Profile] = {}
         self._refusals = Refusals()
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self.settle = Settling(mesh, self._events.put)
         self._left_out = 0
         self._interrupted = False
         self._ended = False
@@ -127,12 +130,13 @@ class Gateway:
         self._complete = self._newest = -1
         self._clock: _ClockPublisher | None = None
 
-    def open(self, patience_s: float = 60.0) -> None:
-        """Declare all topics; every later sample is carried.
+    def open(self, profiles: Mapping[str, Profile], patience_s: float = 60.0) -> None:
+        """Declare all topics; every later sample is carried. The first profile has `/clock`.
 
         Raises:
             MeshLost: the master does not answer.
         """
+        self._profiles = profiles
         for topic in self._plan.topics:
             if topic.direction == "out":
                 self._open_output(topic)
@@ -143,7 +147,7 @@ class Gateway:
             self._watch(self._plan.time_source)
         if self._plan.clock_points is not None:
             first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
-            put = next(iter(self._profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
+            put = next(iter(profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
             self._clock = _ClockPublisher(put, self._plan, self._grid)
         for key, variable in self._watched.items():
             self._take_values(key, variable)
@@ -239,7 +243,7 @@ class Gateway:
         except MessageRefused as error:
             variable.warn(f"a value that is not understood: {error}")
             return
-        if stamp.point < variable.newest:
+        if stamp.point < variable.newest or stamp.point == variable.newest == 0:
             self._begin_again()
         self._subscribe_awaited()
         for assembler, port, put in variable.outputs:
@@ -299,6 +303,7 @@ class Gateway:
         for key, value in zip(subscribed.keys, values, strict=True):
             if value is not None:
                 self._publishers[key].put(encode_value(value), attachment=attachment)
+                self.settle.sent(key)
         fields = subscribed.disassembler.fields
         if fields.ignored:
             self.ignored[subscribed.disassembler.topic.name] = fields.ignored

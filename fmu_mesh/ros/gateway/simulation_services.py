@@ -77,14 +77,18 @@ class _Refusal(Exception):
 
 
 class SimulationServices:
-    """Answers requests for one mesh. ``action`` says whether there is the action SimulateSteps, too."""
+    """Answers requests for one mesh. ``action`` says whether there is the action SimulateSteps, too.
 
-    def __init__(
+    ``settle`` waits until the mesh has all values that came before a step.
+    """
+
+    def __init__(  # noqa: PLR0913  one mesh, and what it offers
         self,
         section: SimulationInterfacesConfig,
         types: MessageTypes,
         mesh: zenoh.Session,
         keys: Keys,
+        settle: Callable[[], None],
         *,
         action: bool = False,
     ) -> None:
@@ -95,6 +99,7 @@ class SimulationServices:
         }
         self._section = section
         self._action = action
+        self._settle = settle
         self._closed = threading.Event()
         self._client = MeshClient(mesh, keys, (), _ANSWER_S, self._closed.is_set)
         self._stepping = threading.Lock()
@@ -188,6 +193,7 @@ class SimulationServices:
             text = f"the simulation is {state.name.lower()} or steps already: only a paused one can be stepped"
             raise _Refusal(ResultCode.OPERATION_FAILED, text)
         try:
+            self._settle()
             if request["steps"]:
                 self._client.rest(Command("step", request["steps"], paced=self._section.paced), _LONGEST_STEP_S)
         finally:

@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import ConfigurationError, FmuError, FmuMeshError, Interrupted
+from ...ros_wire.rclpy_profile import RosNode, ros_module
 from ...wire.client.reaching import Meshes
 from ..bags.playing import running_configuration
 from .fmu_node import PARAMETERS, FmuNode
 from .gateway_node import GatewayNode
-from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["create_node", "main"]
 

@@ -16,11 +16,12 @@ from typing import Any
 
 from ...errors import CallRefused, ConfigurationError, FmuMeshError
 from ...ros_wire.definitions import CLOCK
+from ...ros_wire.rclpy_profile import RosNode, message_class, ros_module
 from ...ros_wire.topics import CLOCK_TOPIC, Topic
 from ...variables.model_description import Value, Variable
 from .driving import DriveSettings, FmuDriver, FmuThread, Update
 from .node_topics import LOG_INTERVAL_S, FmuTopics, own_names, topics_of
-from .rclpy_modules import RosNode, RosTypes, message_class, ros_module, steady_timer, time_message, watch_clock
+from .rclpy_modules import RosTypes, steady_timer, time_message, watch_clock
 from .variable_parameters import (
     declare_parameters,
     names_of,

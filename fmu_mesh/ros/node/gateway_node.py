@@ -22,8 +22,9 @@ from msgspec.structs import replace
 from ...config.mesh import RosConfig
 from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
-from ...ros_wire.profile import Profile, Put, Take
-from ...ros_wire.topics import RosPlan, Topic
+from ...ros_wire.profile import Profile
+from ...ros_wire.rclpy_profile import RclpyProfile, RosNode, ros_module
+from ...ros_wire.topics import RosPlan
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
@@ -31,46 +32,13 @@ from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.simulation_services import SimulationServices
-from .rclpy_modules import RosNode, message_class, ros_module, steady_timer, watch_clock
+from .rclpy_modules import steady_timer, watch_clock
 from .simulation_server import SimulationServer
 
-__all__ = ["GatewayNode", "RclpyProfile"]
+__all__ = ["GatewayNode"]
 
 _TIMEOUT_S = 10.0
 _INTERVAL_S = 0.25
-
-
-class RclpyProfile:
-    """A profile whose topics are those of a node of rclpy, which takes and returns messages as CDR bytes."""
-
-    def __init__(self, node: RosNode) -> None:
-        self._node = node
-        self._entities = ExitStack()
-
-    def publish(self, topic: Topic) -> Put:
-        """Create a publisher of ``topic``."""
-        publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
-        self._entities.callback(self._node.destroy_publisher, publisher)
-
-        def put(data: bytes, _time: float) -> None:
-            try:
-                publisher.publish(data)
-            except Exception:
-                # Ctrl-C shuts ROS down while samples still arrive; nothing can be published any more.
-                if self._node.context.ok():
-                    raise
-
-        return put
-
-    def subscribe(self, topic: Topic, take: Take) -> None:
-        """Create a subscription of ``topic``."""
-        kind = message_class(topic.message)
-        subscription = self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True)
-        self._entities.callback(self._node.destroy_subscription, subscription)
-
-    def close(self) -> None:
-        """Destroy everything."""
-        self._entities.close()
 
 
 class GatewayNode:
@@ -139,11 +107,12 @@ class GatewayNode:
             stack.callback(profile.close)
             names = {topic.profile for topic in plan.topics} or {"ros2dds"}
             profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
-            gateway = Gateway(plan, client.session, client.keys, grid_of(info), profiles)
+            gateway = Gateway(plan, client.session, client.keys, grid_of(info))
             stack.callback(gateway.close)
-            gateway.open(_TIMEOUT_S)
+            gateway.open(profiles, _TIMEOUT_S)
             if self._interfaces is not None:
-                services = SimulationServices(self._interfaces, plan.types, client.session, client.keys, action=True)
+                mesh = client.session, client.keys, gateway.settle
+                services = SimulationServices(self._interfaces, plan.types, *mesh, action=True)
                 server = SimulationServer(self._node, services, plan.namespace)
                 stack.callback(server.close)
                 server.open()
@@ -209,14 +178,3 @@ class GatewayNode:
         if not carrying.is_alive():
             self._log.info("the mesh has ended")
             self._node.trigger_deactivate()
-
-
-def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
-    qos, own = ros_module("rclpy.qos"), topic.qos
-    duration = ros_module("rclpy.duration").Duration
-    return qos.QoSProfile(
-        depth=own.depth,
-        reliability=qos.ReliabilityPolicy[own.reliability.upper()],
-        durability=qos.DurabilityPolicy[own.durability.upper()],
-        deadline=duration(seconds=own.deadline or 0.0),  # 0 is none
-    )

@@ -26,6 +26,7 @@ from ...ros_wire.cdr import CdrError
 from ...ros_wire.definitions import Basic, UnknownField, path_parts
 from ...ros_wire.fitting import default_type
 from ...ros_wire.keyed_rows import FieldReader, by_index
+from ...ros_wire.rclpy_profile import RosNode, message_class, ros_module
 from ...ros_wire.ros_names import topic_problem
 from ...ros_wire.stamp import in_nanoseconds
 from ...ros_wire.topics import Port, Topic
@@ -33,7 +34,7 @@ from ...text import listed, nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import flattened, nested
 from .driving import FmuDriver, FmuThread, Update
-from .rclpy_modules import RosNode, RosTypes, message_class, ros_module, time_message
+from .rclpy_modules import RosTypes, time_message
 from .variable_parameters import names_of
 
 __all__ = ["LOG_INTERVAL_S", "FmuTopics", "fill", "message_time", "own_names", "topics_of", "values_in"]

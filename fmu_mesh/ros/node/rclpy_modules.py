@@ -1,66 +1,25 @@
-"""Access to ROS itself: its modules, the classes of its messages, timers on its steady clock, and who has `/clock`.
-
-The user installs and sources ROS; it is not a dependency of this package. So its modules are imported when they are
-needed.
-"""
+"""What a ROS node of ours needs of ROS itself: fields of its messages, timers on its steady clock, who has `/clock`."""
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from ...errors import ConfigurationError
 from ...ros_wire.definitions import Array, Basic, FieldType, FieldTypes, Nested, Sequence
+from ...ros_wire.rclpy_profile import RosNode, message_class, ros_module
 from ...ros_wire.topics import CLOCK_TOPIC
 from ..gateway.link import two_clocks
 
-__all__ = ["RosNode", "RosTypes", "message_class", "ros_module", "steady_timer", "time_message", "watch_clock"]
+__all__ = ["RosTypes", "steady_timer", "time_message", "watch_clock"]
 
 _INTERVAL_S = 1.0
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 _ARRAY = re.compile(r"(?P<sequence>sequence<)?(?P<element>.*?)(, (?P<bound>\d+))?(>|\[(?P<length>\d+)\])")
 _KINDS = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
-
-RosNode = Any
-"""`rclpy.node.Node`, which has no types where ROS is not installed."""
-
-
-def ros_module(name: str) -> Any:  # noqa: ANN401 a module of ROS has no types where ROS is not installed
-    """Import a module of ROS, such as `rclpy.lifecycle`.
-
-    Raises:
-        ConfigurationError: this Python has no ROS, or ROS has no such module.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition(".")[0]
-        raise ConfigurationError(
-            f"the ROS package '{package}' cannot be imported: {error}.",
-            hint="Source your ROS first (`source /opt/ros/DISTRO/setup.bash`) and use its Python; the package has to "
-            "be installed there.",
-        ) from error
-
-
-def message_class(type_name: str) -> Any:  # noqa: ANN401 as above
-    """The class of a message type such as `std_msgs/msg/Float64`.
-
-    Raises:
-        ConfigurationError: ROS has no such type.
-    """
-    parts = type_name.split("/")
-    if len(parts) != 3 or parts[1] != "msg":
-        raise ConfigurationError(f"'{type_name}' is no message type.", hint="Write PACKAGE/msg/TYPE.")
-    module = ros_module(f"{parts[0]}.msg")
-    found = getattr(module, parts[2], None)
-    if found is None:
-        raise ConfigurationError(f"the ROS package '{parts[0]}' has no message type '{parts[2]}'.")
-    return found
 
 
 class RosTypes(FieldTypes):
@@ -83,7 +42,7 @@ def _field_type(text: str) -> FieldType:
     return Nested(f"{package}/msg/{name}") if slash else Basic(_KINDS.get(kind, kind))
 
 
-def time_message(time: int) -> Any:  # noqa: ANN401 as above
+def time_message(time: int) -> Any:  # noqa: ANN401 a message has no types where ROS is not installed
     """``time`` in ns as a `builtin_interfaces/msg/Time`."""
     sec, nanosec = divmod(time, 1_000_000_000)
     return message_class("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)

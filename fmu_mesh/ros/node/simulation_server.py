@@ -11,11 +11,11 @@ from contextlib import ExitStack
 from typing import Any
 
 from ...ros_wire.cdr import Message
+from ...ros_wire.rclpy_profile import RosNode, ros_module
 from ...ros_wire.ros_names import absolute, service_name
 from ...ros_wire.simulation_types import SIMULATION_SERVICES, ResultCode
 from ..gateway.service_threads import ServiceThreads
 from ..gateway.simulation_services import SIMULATION_THREADS, SimulationServices
-from .rclpy_modules import RosNode, ros_module
 
 __all__ = ["SimulationServer"]
 

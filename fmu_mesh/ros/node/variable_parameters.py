@@ -11,11 +11,11 @@ from typing import Any
 
 from ...adapter import FMIAdapter
 from ...errors import CallRefused, ConfigurationError
+from ...ros_wire.rclpy_profile import RosNode, ros_module
 from ...ros_wire.ros_names import collision, name_problems, ros_name
 from ...text import nearest
 from ...variables.model_description import ModelDescription, Value, Variable
 from ...variables.value_types import nested
-from .rclpy_modules import RosNode, ros_module
 
 __all__ = [
     "declare_parameters",

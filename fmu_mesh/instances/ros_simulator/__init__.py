@@ -1,0 +1,1 @@
+"""ROS simulators that are stepped through `simulation_interfaces`."""
