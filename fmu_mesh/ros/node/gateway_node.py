@@ -1,22 +1,26 @@
 """The gateway of a mesh as a ROS lifecycle node: rclpy carries its topics, so every middleware of ROS works.
 
-`fmu_mesh.ros.gateway.gateway` carries the samples. Here are the profile for rclpy, and the parameters of the mesh as
-parameters of the node.
+`fmu_mesh.ros.gateway.gateway` carries the samples. Here are the profile for rclpy, what `fmu-mesh status` says of it,
+and the parameters of the mesh as parameters of the node.
 """
 
-# Threads: `gateway` runs the gateway and publishes; Zenoh calls its callbacks. The executor of rclpy makes the
-# transitions, looks four times a second whether the gateway has ended, takes messages, and sets parameters, for which
-# it waits for the mesh. The exit stacks undo what a transition did in the order in which the threads need it: first no
-# more looks, then the end of the thread, then the subscribers and the publishers that it used (ADR 0030, 0031).
+# Threads: `gateway` runs the gateway and publishes; Zenoh calls its callbacks, and `_answer`, which reads what the last
+# look has found. The executor of rclpy makes the transitions, looks four times a second whether the gateway has ended
+# and which topics have a partner, takes messages, and sets parameters, for which it waits for the mesh. The exit stacks
+# undo what a transition did in the order in which the threads need it: first no more looks and answers, then the end
+# of the thread, then the subscribers and the publishers that it used (ADR 0030, 0031).
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
+import zenoh
 from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
@@ -27,6 +31,9 @@ from ...ros_wire.topics import RosPlan, Topic
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
+from ...wire.session import undeclare_all
+from ...wire.values import json_encoding
+from ...wire.views import RosTopicView, RosView
 from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
@@ -46,11 +53,13 @@ class RclpyProfile:
     def __init__(self, node: RosNode) -> None:
         self._node = node
         self._entities = ExitStack()
+        self._partners: list[tuple[str, Literal["in", "out"], Callable[[], int]]] = []
 
     def publish(self, topic: Topic) -> Put:
         """Create a publisher of ``topic``."""
         publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
         self._entities.callback(self._node.destroy_publisher, publisher)
+        self._partners.append((topic.name, "out", publisher.get_subscription_count))
 
         def put(data: bytes, _time: float) -> None:
             try:
@@ -67,6 +76,13 @@ class RclpyProfile:
         kind = message_class(topic.message)
         subscription = self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True)
         self._entities.callback(self._node.destroy_subscription, subscription)
+        # Older rclpy also counts those that offer less than this topic asks for.
+        counted = getattr(subscription, "get_publisher_count", None) or partial(self._node.count_publishers, topic.name)
+        self._partners.append((topic.name, "in", counted))
+
+    def topics(self) -> tuple[RosTopicView, ...]:
+        """All topics, and which of them have a partner."""
+        return tuple(RosTopicView(name, direction, counted() > 0) for name, direction, counted in [*self._partners])
 
     def close(self) -> None:
         """Destroy everything."""
@@ -91,6 +107,7 @@ class GatewayNode:
         self._interfaces: SimulationInterfacesConfig | None = None
         self._targets: dict[str, Target] = {}
         self._run = ""
+        self._topics: tuple[RosTopicView, ...] = ()
         self._active = ExitStack()
 
     def configure(self) -> None:
@@ -151,7 +168,13 @@ class GatewayNode:
             thread.start()
             stack.callback(thread.join, _TIMEOUT_S)
             stack.callback(gateway.end)
-            timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread))
+            self._topics = profile.topics()
+            who = f"the node '{self._node.get_fully_qualified_name()}' is the gateway"
+            view = RosView("rclpy", (), connected=True, activity=who)
+            key = f"{client.keys.mesh_key('ros')}/{client.session.zid()}"
+            answers = client.session.declare_queryable(key, lambda query: self._answer(key, query, view, gateway))
+            stack.callback(undeclare_all, [answers])
+            timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread, profile))
             stack.callback(self._node.destroy_timer, timer)
             if plan.clock_points is not None:
                 stack.callback(watch_clock(self._node, "`clock_rate: null` in the section `ros`"))
@@ -205,10 +228,18 @@ class GatewayNode:
                 return result(successful=False, reason=str(error))
         return result(successful=True)
 
-    def _look(self, carrying: threading.Thread) -> None:
+    def _look(self, carrying: threading.Thread, profile: RclpyProfile) -> None:
+        self._topics = profile.topics()
         if not carrying.is_alive():
             self._log.info("the mesh has ended")
             self._node.trigger_deactivate()
+
+    def _answer(self, key: str, query: zenoh.Query, view: RosView, gateway: Gateway) -> None:
+        """On a thread of Zenoh: what `fmu-mesh status` says of this gateway."""
+        missed = {own.topic: own.missed for own in gateway.deadlines if own.missed}
+        view = replace(view, topics=self._topics, ignored=dict(gateway.ignored), missed=missed)
+        query.reply(key, msgspec.json.encode(view), encoding=json_encoding)
+        query.drop()
 
 
 def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy
