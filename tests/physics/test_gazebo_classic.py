@@ -16,6 +16,9 @@ from fmu_mesh.run.options import PlanOptions
 from tests.helpers import FMUS, Place, rows_of
 from tests.plain_run import PlainRun
 from tests.planning import prepare
+from tests.ros.peers import need
+from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
+from tests.ros.worlds_in_ros import GAZEBO_WORLDS, record, watch
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 EXAMPLES = CONFIGS.parent / "examples" / "gazebo_fmi"
@@ -221,6 +224,27 @@ def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: P
     assert len(results[0]) == 1001
     assert len(results[0][0]) > 4  # the inputs as well
     assert results[0] == results[1]
+
+
+# ---- ready shapes of ROS ----
+
+
+def test_recorded_shapes_of_ros_have_values_of_real_worlds(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
+
+    record(tmp_path, GAZEBO_WORLDS)
+
+
+@pytest.mark.parametrize("frames", [False, True], ids=["bodies", "frames"])
+def test_real_ros_sees_worlds_and_pushes_a_cube(place: Place, monkeypatch: pytest.MonkeyPatch, *, frames: bool) -> None:
+    ros_or_skip()
+    need("sensor_msgs", "nav_msgs")
+    if frames:
+        built_types_or_skip()
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
+
+    with Ros(place.folder / "log") as ros:
+        watch(ros, place, GAZEBO_WORLDS, frames=frames)
 
 
 # ---- worlds of gazebo-fmi, by one command ----
