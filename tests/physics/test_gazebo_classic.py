@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
 from fmu_mesh.run.options import PlanOptions
-from tests.helpers import FMUS, Place, rows_of
+from tests.helpers import FMUS, Place, rows_of, wait_until
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 from tests.ros.peers import need
@@ -298,6 +299,39 @@ def test_a_launched_world_has_the_arms_of_figure_20(place: Place) -> None:
     assert [angle.max() for angle in angles] == pytest.approx([1.171, 1.229, 1.113], abs=1e-3)
     assert [settled(result["time"], angle) for angle in angles] == pytest.approx([1.67, 14.56, 3.4], abs=0.02)
     assert not tuned["world.no_actuator_model::joint.effort_applied"].any()  # a controller without gains
+
+
+def test_targets_are_set_while_a_world_runs_as_by_gz_joint(place: Place) -> None:
+    place.environment = {**place.environment, "GAZEBO_RESOURCE_PATH": str(FMUS)}
+    output = place.folder / "result.csv"
+    world = EXAMPLES / "simple_electrical_actuator.world"
+    options = ["--real-time-factor", "0", "--no-progress", "--output", str(output)]
+    run = place.start("launch", world, *options, "--set", "joint_actuator.motorConstant=0.1")
+    place.note()
+
+    def moved(model: str, p: float, d: float, target: float) -> None:
+        """What `gz joint -m MODEL -j joint --pos-p P --pos-d D --pos-t TARGET` does."""
+        for name, value in {"p": p, "d": d, "target": target}.items():
+            done = place.run("set", f"{model}-joint-pid.{name}", str(value))
+            assert done.wait() == 0, done.errors
+
+        def there() -> bool:
+            keys = [f"world.{model}::joint.{end}" for end in ("position", "velocity")]
+            done = place.run("get", *keys, "--json")
+            assert done.wait() == 0, done.errors
+            position, velocity = (json.loads(line)["value"] for line in done.output.splitlines())
+            return abs(position - target) < 0.05 and abs(velocity) < 0.01
+
+        wait_until(there, f"the joint of {model} at {target}")
+
+    moved("no_actuator_model", 10.0, 3.0, 1.0)
+    moved("simple_electrical_actuator_model", 109.0, 60.0, 1.0)
+    moved("simple_electrical_actuator_model", 109.0, 60.0, -0.5)
+    assert place.run("stop", "simple_electrical_actuator").wait() == 0
+    assert run.wait() == 0, run.errors  # it has no stop time
+
+    angles = table_of(output)
+    assert angles["world.no_actuator_model::joint.position"][-1] == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("engine", ["ode", "simbody", "dart"])
