@@ -320,7 +320,7 @@ def test_targets_are_set_while_a_world_runs_as_by_gz_joint(place: Place) -> None
             done = place.run("get", *keys, "--json")
             assert done.wait() == 0, done.errors
             position, velocity = (json.loads(line)["value"] for line in done.output.splitlines())
-            return abs(position - target) < 0.05 and abs(velocity) < 0.01
+            return bool(abs(position - target) < 0.05 and abs(velocity) < 0.01)
 
         wait_until(there, f"the joint of {model} at {target}")
 
