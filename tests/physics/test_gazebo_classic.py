@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 
+import fmu_mesh
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
 from fmu_mesh.run.options import PlanOptions
 from tests.helpers import FMUS, Place, rows_of, wait_until
@@ -19,6 +21,7 @@ from tests.plain_run import PlainRun
 from tests.planning import prepare
 from tests.ros.peers import need
 from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
+from tests.ros.test_bag import messages_of
 from tests.ros.worlds_in_ros import GAZEBO_WORLDS, record, watch
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -246,6 +249,47 @@ def test_real_ros_sees_worlds_and_pushes_a_cube(place: Place, monkeypatch: pytes
 
     with Ros(place.folder / "log") as ros:
         watch(ros, place, GAZEBO_WORLDS, frames=frames)
+
+
+def test_published_world_with_a_section_for_ros_names_its_joints(place: Place) -> None:
+    pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
+    place.environment = {**place.environment, "GAZEBO_RESOURCE_PATH": str(FMUS)}
+    target = place.folder / "mesh.yaml"
+    done = place.run("convert", EXAMPLES / "damped_pendulum.world", target)
+    assert done.wait() == 0, done.errors
+    config = yaml.safe_load(target.read_text(encoding="utf-8"))
+    config["ros"] = {"topics": [{"joint_states": "world"}, {"tf": "world"}]}
+    config["record"] = {"file": str(place.folder / "world.mcap")}
+    config["simulation"] |= {"stop_time": 0.1, "real_time_factor": 0}
+    target.write_text(yaml.safe_dump(config), encoding="utf-8")
+
+    run = place.run("launch", target, "--no-progress")
+    assert run.wait() == 0, run.errors
+
+    messages = messages_of(place.folder / "world.mcap")
+    names = ["pendulum_damped_via_sdf", "pendulum_damped_via_fmi"]
+    state, transforms = messages["/joint_states"][-1][1], messages["/tf"][-1][1].transforms
+    assert state.name == [f"{name}::joint" for name in names]
+    assert state.position[0] == state.position[1] != 0.0
+    assert [own.child_frame_id for own in transforms] == [f"{name}::pendulum" for name in names]
+    assert {own.header.frame_id for own in transforms} == {"world"}
+
+
+def test_a_world_is_reset_to_equal_floats() -> None:
+    mesh = fmu_mesh.load(CONFIGS / "electrical_actuator_gazebo.yaml")
+    mesh.configure(simulation={"stop_time": 0.2})
+
+    with mesh.start(paused=True, record="memory") as run:
+        run.step(100)
+        run.reset()
+        run.resume()
+        again = run.wait()
+        first = run.results[0]
+
+    assert (len(first.times), len(again.times)) == (101, 201)
+    for name in again:
+        assert np.array_equal(first[name], again[name][:101]), name
+        assert np.ptp(first[name]) > 0.0, name
 
 
 # ---- worlds of gazebo-fmi, by one command ----
