@@ -7,10 +7,13 @@ needed.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 from ..errors import ConfigurationError
+from ..wire.views import RosTopicView
 from .profile import Put, Take
 from .topics import Topic
 
@@ -59,13 +62,13 @@ class RclpyProfile:
     def __init__(self, node: RosNode) -> None:
         self._node = node
         self._entities = ExitStack()
-        self._publishers: list[tuple[str, Any]] = []
+        self._partners: list[tuple[str, Literal["in", "out"], Callable[[], int]]] = []
 
     def publish(self, topic: Topic) -> Put:
         """Create a publisher of ``topic``."""
         publisher = self._node.create_publisher(message_class(topic.message), topic.name, _quality(topic))
         self._entities.callback(self._node.destroy_publisher, publisher)
-        self._publishers.append((topic.name, publisher))
+        self._partners.append((topic.name, "out", publisher.get_subscription_count))
 
         def put(data: bytes, _time: float) -> None:
             try:
@@ -82,14 +85,21 @@ class RclpyProfile:
         kind = message_class(topic.message)
         subscription = self._node.create_subscription(kind, topic.name, take, _quality(topic), raw=True)
         self._entities.callback(self._node.destroy_subscription, subscription)
+        # Older rclpy also counts those that offer less than this topic asks for.
+        counted = getattr(subscription, "get_publisher_count", None) or partial(self._node.count_publishers, topic.name)
+        self._partners.append((topic.name, "in", counted))
+
+    def topics(self) -> tuple[RosTopicView, ...]:
+        """All topics, and which of them have a partner."""
+        return tuple(RosTopicView(name, direction, counted() > 0) for name, direction, counted in [*self._partners])
+
+    def unheard(self) -> list[str]:
+        """The published topics that nobody subscribes to."""
+        return [own.topic for own in self.topics() if own.direction == "out" and not own.matched]
 
     def close(self) -> None:
         """Destroy everything."""
         self._entities.close()
-
-    def unheard(self) -> list[str]:
-        """The published topics that nobody subscribes to."""
-        return [name for name, own in self._publishers if not own.get_subscription_count()]
 
 
 def _quality(topic: Topic) -> Any:  # noqa: ANN401 a type of rclpy

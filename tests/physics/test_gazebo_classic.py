@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 
+import fmu_mesh
 from fmu_mesh.instances.gazebo.gazebo_process import PROGRAM_VARIABLE, GazeboGone, find_program
 from fmu_mesh.run.options import PlanOptions
-from tests.helpers import FMUS, Place, rows_of
+from tests.helpers import FMUS, Place, rows_of, wait_until
 from tests.plain_run import PlainRun
 from tests.planning import prepare
+from tests.ros.peers import need
+from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
+from tests.ros.test_bag import messages_of
+from tests.ros.worlds_in_ros import GAZEBO_WORLDS, record, watch
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 EXAMPLES = CONFIGS.parent / "examples" / "gazebo_fmi"
@@ -223,6 +230,68 @@ def test_a_distributed_run_equals_the_one_in_one_process_in_every_float(place: P
     assert results[0] == results[1]
 
 
+# ---- ready shapes of ROS ----
+
+
+def test_recorded_shapes_of_ros_have_values_of_real_worlds(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
+
+    record(tmp_path, GAZEBO_WORLDS)
+
+
+@pytest.mark.parametrize("frames", [False, True], ids=["bodies", "frames"])
+def test_real_ros_sees_worlds_and_pushes_a_cube(place: Place, monkeypatch: pytest.MonkeyPatch, *, frames: bool) -> None:
+    ros_or_skip()
+    need("sensor_msgs", "nav_msgs")
+    if frames:
+        built_types_or_skip()
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
+
+    with Ros(place.folder / "log") as ros:
+        watch(ros, place, GAZEBO_WORLDS, frames=frames)
+
+
+def test_published_world_with_a_section_for_ros_names_its_joints(place: Place) -> None:
+    pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
+    place.environment = {**place.environment, "GAZEBO_RESOURCE_PATH": str(FMUS)}
+    target = place.folder / "mesh.yaml"
+    done = place.run("convert", EXAMPLES / "damped_pendulum.world", target)
+    assert done.wait() == 0, done.errors
+    config = yaml.safe_load(target.read_text(encoding="utf-8"))
+    config["ros"] = {"topics": [{"joint_states": "world"}, {"tf": "world"}]}
+    config["record"] = {"file": str(place.folder / "world.mcap")}
+    config["simulation"] |= {"stop_time": 0.1, "real_time_factor": 0}
+    target.write_text(yaml.safe_dump(config), encoding="utf-8")
+
+    run = place.run("launch", target, "--no-progress")
+    assert run.wait() == 0, run.errors
+
+    messages = messages_of(place.folder / "world.mcap")
+    names = ["pendulum_damped_via_sdf", "pendulum_damped_via_fmi"]
+    state, transforms = messages["/joint_states"][-1][1], messages["/tf"][-1][1].transforms
+    assert state.name == [f"{name}::joint" for name in names]
+    assert state.position[0] == state.position[1] != 0.0
+    assert [own.child_frame_id for own in transforms] == [f"{name}::pendulum" for name in names]
+    assert {own.header.frame_id for own in transforms} == {"world"}
+
+
+def test_a_world_is_reset_to_equal_floats() -> None:
+    mesh = fmu_mesh.load(CONFIGS / "electrical_actuator_gazebo.yaml")
+    mesh.configure(simulation={"stop_time": 0.2})
+
+    with mesh.start(paused=True, record="memory") as run:
+        run.step(100)
+        run.reset()
+        run.resume()
+        again = run.wait()
+        first = run.results[0]
+
+    assert (len(first.times), len(again.times)) == (101, 201)
+    for name in again:
+        assert np.array_equal(first[name], again[name][:101]), name
+        assert np.ptp(first[name]) > 0.0, name
+
+
 # ---- worlds of gazebo-fmi, by one command ----
 
 
@@ -274,6 +343,39 @@ def test_a_launched_world_has_the_arms_of_figure_20(place: Place) -> None:
     assert [angle.max() for angle in angles] == pytest.approx([1.171, 1.229, 1.113], abs=1e-3)
     assert [settled(result["time"], angle) for angle in angles] == pytest.approx([1.67, 14.56, 3.4], abs=0.02)
     assert not tuned["world.no_actuator_model::joint.effort_applied"].any()  # a controller without gains
+
+
+def test_targets_are_set_while_a_world_runs_as_by_gz_joint(place: Place) -> None:
+    place.environment = {**place.environment, "GAZEBO_RESOURCE_PATH": str(FMUS)}
+    output = place.folder / "result.csv"
+    world = EXAMPLES / "simple_electrical_actuator.world"
+    options = ["--real-time-factor", "0", "--no-progress", "--output", str(output)]
+    run = place.start("launch", world, *options, "--set", "joint_actuator.motorConstant=0.1")
+    place.note()
+
+    def moved(model: str, p: float, d: float, target: float) -> None:
+        """What `gz joint -m MODEL -j joint --pos-p P --pos-d D --pos-t TARGET` does."""
+        for name, value in {"p": p, "d": d, "target": target}.items():
+            done = place.run("set", f"{model}-joint-pid.{name}", str(value))
+            assert done.wait() == 0, done.errors
+
+        def there() -> bool:
+            keys = [f"world.{model}::joint.{end}" for end in ("position", "velocity")]
+            done = place.run("get", *keys, "--json")
+            assert done.wait() == 0, done.errors
+            position, velocity = (json.loads(line)["value"] for line in done.output.splitlines())
+            return bool(abs(position - target) < 0.05 and abs(velocity) < 0.01)
+
+        wait_until(there, f"the joint of {model} at {target}")
+
+    moved("no_actuator_model", 10.0, 3.0, 1.0)
+    moved("simple_electrical_actuator_model", 109.0, 60.0, 1.0)
+    moved("simple_electrical_actuator_model", 109.0, 60.0, -0.5)
+    assert place.run("stop", "simple_electrical_actuator").wait() == 0
+    assert run.wait() == 0, run.errors  # it has no stop time
+
+    angles = table_of(output)
+    assert angles["world.no_actuator_model::joint.position"][-1] == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("engine", ["ode", "simbody", "dart"])

@@ -17,7 +17,7 @@ import pytest
 
 from fmu_mesh.ros_wire.rclpy_profile import RclpyProfile
 from fmu_mesh.ros_wire.topics import Topic
-from tests.helpers import DEADLINE_S, FMUS, Place, write_config
+from tests.helpers import DEADLINE_S, FMUS, Place, wait_until, write_config
 from tests.ros.ros_peer import Ros, ros_or_skip
 
 ros_or_skip()
@@ -354,6 +354,9 @@ def test_who_else_publishes_the_clock_is_named_with_the_way_out(ros: Ros, place:
         node.says(
             {"gateway": "here: `clock_rate: null` in the section `ros`", "fmu": "here: publish_clock: false"}[own]
         )
+        if own == "gateway":
+            line = "the node '/other/simulator' publishes /clock, too"
+            wait_until(lambda: line in place.run("status", "lab").output, "the same line of `status`")
 
         assert node.interrupted() == 0
 

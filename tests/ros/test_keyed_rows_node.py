@@ -90,6 +90,8 @@ def test_joint_commands_reach_their_joints_through_the_gateway_in_any_order(
     said = caplog.text
     assert said.count("elements that no variable has are ignored: elbow; variables have bare, weak") == 1
     assert "'position[name=weak]' is one of 1 elements for 2 texts in 'name'" in said
+    status = place.run("status", "arm")
+    assert "1 elements on /joint_commands were ignored: no variable has their keys" in status.output, status.story()
     assert place.run("stop", "arm").wait() == 0
 
 

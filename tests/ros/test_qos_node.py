@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.helpers import FMUS, Place, wait_until, write_config
-from tests.ros.ros_peer import Ros, ros_or_skip
+from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
 
 ros_or_skip()
 
@@ -84,6 +84,87 @@ def test_late_nodes_get_latched_values_in_the_namespace_of_the_gateway(
 
     ros.until(refused, "a warning that the late node asks for more than is offered")
     node.trigger_deactivate()
+    place.run("stop", "one").wait()
+    assert launched.wait() == 130, launched.errors
+
+
+def test_late_node_gets_frames_that_never_change(ros: Ros, place: Place) -> None:
+    built_types_or_skip()
+    from tf2_msgs.msg import TFMessage  # noqa: PLC0415 only where it is built
+
+    path = "transforms[child_frame_id=camera].transform"
+    constants = {f"{path}.translation.z": 1.5, f"{path}.rotation.w": 1.0}
+    config = write_config(
+        place.folder,
+        name="one",
+        instances={"gain": {"fmu": "Gain"}},
+        connections=(),
+        stop_time=3600.0,
+        simulation={"step_size": 0.01, "real_time_factor": 1.0},
+        ros={
+            "profile": "rclpy",
+            "topics": [
+                {"topic": "/tf_static", "type": "tf2_msgs/msg/TFMessage", "frame_id": "world", "constants": constants},
+                "gain.y",
+            ],
+        },
+    )
+    place.start("launch", config)
+    place.note()
+    node = ros.fmu(config=str(config))
+    ros.until(lambda: str(node.trigger_configure()).endswith("SUCCESS"), "the mesh")
+    node.trigger_activate()
+
+    late = ros.peer("late")
+    static, frames = ros.collect(late, TFMessage, "/tf_static", latched())  # as the listener of tf2
+    ros.matched(static)
+    ros.until(lambda: frames, "the frames")
+
+    [frame] = frames[0].transforms
+    assert (frame.header.frame_id, frame.child_frame_id) == ("world", "camera")
+    assert (frame.transform.translation.z, frame.transform.rotation.w) == (1.5, 1.0)
+    assert len(frames) == 1
+
+
+def test_node_that_asks_for_a_deadline_hears_that_a_mesh_pauses(ros: Ros, place: Place) -> None:
+    from rclpy.event_handler import SubscriptionEventCallbacks  # noqa: PLC0415 only where ROS is installed
+    from std_msgs.msg import Float64  # noqa: PLC0415 as above
+
+    states: list[Any] = []
+    missed: list[Any] = []
+    peer = ros.peer()
+    subscription = peer.create_subscription(
+        Float64,
+        "/state",
+        states.append,
+        latched(deadline_s=0.5),
+        event_callbacks=SubscriptionEventCallbacks(deadline=missed.append),
+    )
+    qos = {"durability": "transient_local", "depth": 1, "deadline": 0.5}
+    config = write_config(
+        place.folder,
+        name="one",
+        instances={"gain": {"fmu": "Gain", "start_values": {"k": 2.0}}},
+        connections=(),
+        stop_time=3600.0,
+        simulation={"step_size": 0.01, "real_time_factor": 1.0},
+        ros={"profile": "rclpy", "topics": [{"topic": "/state", "variable": "gain.y", **qos}]},
+    )
+    launched = place.start("launch", config)
+    place.note()
+    node = ros.fmu(config=str(config))
+    ros.until(lambda: str(node.trigger_configure()).endswith("SUCCESS"), "the mesh")
+    node.trigger_activate()
+    ros.matched(subscription)
+    ros.until(lambda: len(states) > 10, "samples of a mesh that runs")
+
+    place.run("pause", "one").wait()
+    missed.clear()
+    ros.until(lambda: len(missed) > 1, "a deadline that is missed again and again")
+    place.run("resume", "one").wait()
+    seen = len(states)
+    ros.until(lambda: len(states) > seen + 10, "samples after the pause")
+
     place.run("stop", "one").wait()
     assert launched.wait() == 130, launched.errors
 

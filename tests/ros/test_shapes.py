@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import shlex
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from tests.helpers import write_config
 from tests.planning import prepare
 from tests.ros.test_bag import messages_of
 from tests.ros.test_gateway_topics import WORLDS, plan_of
+from tests.ros.worlds_in_ros import GAZEBO_WORLDS, MUJOCO_WORLDS, record
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed; pip install '.[mujoco]'")
 
@@ -276,6 +280,18 @@ def test_odometry_of_a_body_is_how_its_sensors_move(tmp_path: Path) -> None:
             assert found == pytest.approx(measured, rel=1e-12, abs=1e-12)
     first = messages["/odom"][0][1].twist.twist.angular
     assert (first.x, first.y, first.z) == pytest.approx((1.0, 2.0, 3.0), rel=1e-14), "as in the keyframe"
+
+
+@pytest.mark.parametrize("worlds", [MUJOCO_WORLDS, GAZEBO_WORLDS], ids=["mujoco", "gazebo"])
+def test_recorded_shapes_have_values_of_worlds_of_each_engine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, worlds: Mapping[str, Any]
+) -> None:
+    """Gazebo itself is in `tests/physics/test_gazebo_classic.py`; here a program says what it would say."""
+    pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
+    double = Path(__file__).parents[1] / "physics" / "gazebo_double.py"
+    monkeypatch.setenv("FMU_MESH_GAZEBO", shlex.join([sys.executable, str(double), "nothing"]))
+
+    record(tmp_path, worlds)
 
 
 def into_axes(quaternion: list[float], vector: list[float]) -> list[float]:

@@ -1,20 +1,19 @@
-"""Ready shapes with real ROS: what rclpy sees of a world of MuJoCo, and the frame of messages of a single FMU."""
+"""Ready shapes with real ROS: what rclpy sees of worlds of MuJoCo, and the frame of messages of a single FMU."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import pytest
 
-from tests.helpers import FMUS, Place, write_config
+from tests.helpers import FMUS, Place
 from tests.ros.peers import need
-from tests.ros.ros_peer import Ros, ros_or_skip
-from tests.ros.test_gateway_topics import WORLDS
+from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
+from tests.ros.worlds_in_ros import MUJOCO_WORLDS, watch
 
 ros_or_skip()
 need("sensor_msgs")
-mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed; pip install '.[mujoco]'")
+pytest.importorskip("mujoco", reason="MuJoCo is not installed; pip install '.[mujoco]'")
 
 
 @pytest.fixture
@@ -24,46 +23,17 @@ def ros(place: Place, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
         yield ros
 
 
-def test_joints_and_frames_of_a_world_are_seen_in_ros(ros: Ros, place: Place) -> None:
-    need("tf2_msgs")
-    from geometry_msgs.msg import TwistStamped  # noqa: PLC0415 only where ROS is installed
-    from sensor_msgs.msg import JointState  # noqa: PLC0415 as above
-    from tf2_msgs.msg import TFMessage  # noqa: PLC0415 as above
+def test_joints_and_bodies_are_seen_in_ros_and_a_wrench_pushes(ros: Ros, place: Place) -> None:
+    need("nav_msgs")
 
-    peer = ros.peer()
-    joints, states = ros.collect(peer, JointState, "/joint_states")
-    frames, transforms = ros.collect(peer, TFMessage, "/tf")
-    speeds, twists = ros.collect(peer, TwistStamped, "/twist")
-    config = write_config(
-        place.folder,
-        name="world",
-        instances={"world": {"mujoco": str(WORLDS / "damped_pendulum.xml")}},
-        connections=(),
-        stop_time=3600.0,
-        simulation={"step_size": 0.01, "real_time_factor": 1.0},
-        ros={
-            "profile": "rclpy",
-            "topics": [{"joint_states": "world"}, {"tf": "world"}, {"twist": "world.damped_by_fmu"}],
-        },
-    )
-    place.start("launch", config)
-    place.note()
-    node = ros.fmu(config=str(config))
-    ros.until(lambda: str(node.trigger_configure()).endswith("SUCCESS"), "the mesh")
-    node.trigger_activate()
-    ros.matched(joints, frames, speeds)
-    ros.until(lambda: states and transforms and twists, "messages of each shape")
+    watch(ros, place, MUJOCO_WORLDS, frames=False)
 
-    assert list(states[-1].name) == ["engine", "fmu"]
-    assert len(states[-1].position) == len(states[-1].velocity) == len(states[-1].effort) == 2
-    assert states[-1].header.stamp.sec + states[-1].header.stamp.nanosec > 0
-    for own in transforms[-1].transforms:
-        rotation = own.transform.rotation
-        assert own.header.frame_id == "world"
-        norm = math.hypot(rotation.x, rotation.y, rotation.z, rotation.w)
-        assert abs(norm - 1.0) <= mujoco.mjMINVAL + math.ulp(1.0)
-    assert [own.child_frame_id for own in transforms[-1].transforms] == ["damped_by_engine", "damped_by_fmu"]
-    assert twists[-1].header.frame_id == "world"
+
+def test_frames_of_two_worlds_are_seen_in_ros(ros: Ros, place: Place) -> None:
+    need("nav_msgs")
+    built_types_or_skip()
+
+    watch(ros, place, MUJOCO_WORLDS, frames=True)
 
 
 def test_messages_of_a_single_fmu_have_their_frame(ros: Ros) -> None:

@@ -278,6 +278,43 @@ def test_reset_begins_again_at_first_point_with_equal_values(started: tuple[Simu
     assert (simulator.state, cube()) == (SimulationStates.PAUSED, first)
 
 
+@pytest.mark.parametrize(
+    "started", [{"topics": [{"topic": "/x", "variable": "world.cube.position_x"}]}], indirect=True, ids=["topic"]
+)
+def test_reset_is_a_jump_back_in_time_for_nodes_of_ros(started: tuple[Simulator, Launched, Any], ros: Ros) -> None:
+    from rclpy.clock import JumpThreshold  # noqa: PLC0415 only where ROS is installed
+    from rclpy.duration import Duration  # noqa: PLC0415 as above
+    from rclpy.parameter import Parameter  # noqa: PLC0415 as above
+    from std_msgs.msg import Float64  # noqa: PLC0415 as above
+
+    simulator, _launched, _peer = started
+    node = ros.peer("simulated", parameter_overrides=[Parameter("use_sim_time", value=True)])
+    clock, jumps = node.get_clock(), list[int]()
+    backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+    handle = clock.create_jump_callback(backward, post_callback=lambda jump: jumps.append(jump.delta.nanoseconds))
+    subscription, places = ros.collect(node, Float64, "/x")
+    ros.matched(subscription)
+    ros.until(lambda: node.count_publishers("/clock"), "a clock")
+
+    def stepped() -> list[float]:
+        """The samples of the 100 points that are stepped now, once `/clock` says that they are over."""
+        assert simulator("StepSimulation", steps=100).result.result == ResultCode.OK
+        last = simulator("GetEntityState", entity="world.cube").state.pose.position.x
+        ros.until(lambda: clock.now().nanoseconds == 100_000_000, "the time of the last point")
+        ros.until(lambda: places and places[-1].data == last, "the sample of the last point")
+        return [own.data for own in places[-100:]]
+
+    first = stepped()
+    assert jumps == []
+    assert simulator("ResetSimulation").result.result == ResultCode.OK
+    ros.until(lambda: jumps, "a jump")
+
+    assert jumps == [-100_000_000]
+    assert clock.now().nanoseconds == 0
+    assert stepped() == first
+    handle.unregister()
+
+
 @pytest.mark.parametrize("started", [{"factor": 1.0}], indirect=True)
 def test_state_is_told_and_mesh_pauses_during_a_long_step(started: tuple[Simulator, Launched, Any], ros: Ros) -> None:
     simulator, _launched, _peer = started

@@ -14,6 +14,8 @@ import pytest
 
 import fmu_mesh
 from tests.helpers import FMUS
+from tests.ros.peers import need
+from tests.ros.ros_peer import built_types_or_skip, ros_or_skip
 from tests.ros.test_bag import messages_of
 
 pytest.importorskip("mcap", reason="the package mcap is not installed; pip install '.[test]'")
@@ -172,6 +174,25 @@ def test_three_readers_find_complete_types_and_equal_messages(
         assert [plain(own) for own in messages] == [plain(own) for _, own in decoded[topic]], topic
 
 
+def test_ros_itself_reads_every_message(bag: Path, decoded: dict[str, list[tuple[int, Any]]]) -> None:
+    ros_or_skip()
+    need("nav_msgs", "visualization_msgs")
+    built_types_or_skip()
+    from mcap.reader import make_reader  # noqa: PLC0415 an optional dependency
+    from rclpy.serialization import deserialize_message  # noqa: PLC0415 only where ROS is installed
+
+    from fmu_mesh.ros_wire.rclpy_profile import message_class  # noqa: PLC0415 beside it
+
+    found: dict[str, list[Any]] = {}
+    with bag.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            read = deserialize_message(message.data, message_class(schema.name))
+            found.setdefault(channel.topic, []).append(plain(read))
+
+    assert found == {topic: [plain(own) for _, own in messages] for topic, messages in decoded.items()}
+
+
 def unknown_types(name: str, text: str) -> set[str]:
     """The types of fields in a definition that neither ROS has built in nor the text defines."""
     basic = r"bool|byte|char|u?int(8|16|32|64)|float(32|64)|w?string(<=\d+)?"
@@ -194,6 +215,8 @@ def plain(value: Any) -> Any:  # noqa: ANN401 a message, or a field of one
     if dataclasses.is_dataclass(value):
         names = (own.name for own in dataclasses.fields(value))
         return {name: plain(getattr(value, name)) for name in names if re.match("[a-z]", name)}  # no constants
+    if hasattr(value, "get_fields_and_field_types"):  # of rclpy
+        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if hasattr(value, "__slots__"):
         return {name: plain(getattr(value, name)) for name in value.__slots__}
     return [plain(own) for own in value]

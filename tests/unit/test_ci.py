@@ -55,3 +55,16 @@ def test_a_script_of_ci_leaves_nothing_out_without_a_reason(name: str) -> None:
     assert skipped
     assert all(re.match(r'"[^"]{5,}"', reason) for _, reason in skipped)
     assert "|| echo" not in text
+
+
+def test_tests_with_built_types_are_in_the_stage_that_builds_them() -> None:
+    text = (ROOT / ".ci" / "long").read_text(encoding="utf-8")
+    stage = text[text.index("\nros() {") :].partition("\n}")[0]
+    names = {name for group in re.findall(r"tests/ros/test_\{([^}]*)\}\.py", stage) for name in group.split(",")}
+
+    call = re.compile(r"^(?!def ).*\bbuilt_types_or_skip\(\)", re.MULTILINE)
+    files = (ROOT / "tests" / "ros").glob("test_*.py")
+    needed = {file.stem.removeprefix("test_") for file in files if call.search(file.read_text(encoding="utf-8"))}
+
+    assert "simulation_interfaces" in needed
+    assert needed <= names

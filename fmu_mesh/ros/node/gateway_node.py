@@ -1,13 +1,14 @@
 """The gateway of a mesh as a ROS lifecycle node: rclpy carries its topics, so every middleware of ROS works.
 
-`fmu_mesh.ros.gateway.gateway` carries the samples. Here are the profile for rclpy, and the parameters of the mesh as
-parameters of the node.
+`fmu_mesh.ros.gateway.gateway` carries the samples. Here are the profile for rclpy, what `fmu-mesh status` says of it,
+and the parameters of the mesh as parameters of the node.
 """
 
-# Threads: `gateway` runs the gateway and publishes; Zenoh calls its callbacks. The executor of rclpy makes the
-# transitions, looks four times a second whether the gateway has ended, takes messages, and sets parameters, for which
-# it waits for the mesh. The exit stacks undo what a transition did in the order in which the threads need it: first no
-# more looks, then the end of the thread, then the subscribers and the publishers that it used (ADR 0030, 0031).
+# Threads: `gateway` runs the gateway and publishes; Zenoh calls its callbacks, and `_answer`, which reads what the last
+# look has found. The executor of rclpy makes the transitions, looks four times a second whether the gateway has ended
+# and who else is in ROS, takes messages, and sets parameters, for which it waits for the mesh. The exit stacks
+# undo what a transition did in the order in which the threads need it: first no more looks and answers, then the end
+# of the thread, then the subscribers and the publishers that it used (ADR 0030, 0031).
 
 from __future__ import annotations
 
@@ -17,6 +18,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import zenoh
 from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
@@ -28,11 +31,14 @@ from ...ros_wire.topics import RosPlan
 from ...wire.client.mesh_client import MeshClient
 from ...wire.client.reaching import Meshes
 from ...wire.client.readings import Target
+from ...wire.session import undeclare_all
+from ...wire.values import json_encoding
+from ...wire.views import RosView
 from ..bags.playing import grid_of, running_configuration
 from ..gateway.gateway import Gateway
 from ..gateway.mapping import descriptions_of, resolve
 from ..gateway.simulation_services import SimulationServices
-from .rclpy_modules import steady_timer, watch_clock
+from .rclpy_modules import other_clocks, steady_timer, watch_clock
 from .simulation_server import SimulationServer
 
 __all__ = ["GatewayNode"]
@@ -59,6 +65,7 @@ class GatewayNode:
         self._interfaces: SimulationInterfacesConfig | None = None
         self._targets: dict[str, Target] = {}
         self._run = ""
+        self._view: RosView | None = None
         self._active = ExitStack()
 
     def configure(self) -> None:
@@ -120,9 +127,14 @@ class GatewayNode:
             thread.start()
             stack.callback(thread.join, _TIMEOUT_S)
             stack.callback(gateway.end)
-            timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread))
+            clock = plan.clock_points is not None
+            self._view = self._seen(profile, clock=clock)
+            key = f"{client.keys.mesh_key('ros')}/{client.session.zid()}"
+            answers = client.session.declare_queryable(key, lambda query: self._answer(key, query, gateway))
+            stack.callback(undeclare_all, [answers])
+            timer = steady_timer(self._node, _INTERVAL_S, lambda: self._look(thread, profile, clock=clock))
             stack.callback(self._node.destroy_timer, timer)
-            if plan.clock_points is not None:
+            if clock:
                 stack.callback(watch_clock(self._node, "`clock_rate: null` in the section `ros`"))
             self._active = stack.pop_all()
 
@@ -174,7 +186,21 @@ class GatewayNode:
                 return result(successful=False, reason=str(error))
         return result(successful=True)
 
-    def _look(self, carrying: threading.Thread) -> None:
+    def _look(self, carrying: threading.Thread, profile: RclpyProfile, *, clock: bool) -> None:
+        self._view = self._seen(profile, clock=clock)
         if not carrying.is_alive():
             self._log.info("the mesh has ended")
             self._node.trigger_deactivate()
+
+    def _seen(self, profile: RclpyProfile, *, clock: bool) -> RosView:
+        who = f"the node '{self._node.get_fully_qualified_name()}' is the gateway"
+        clocks = other_clocks(self._node) if clock else ()
+        return RosView("rclpy", (), connected=True, activity=who, other_clocks=clocks, topics=profile.topics())
+
+    def _answer(self, key: str, query: zenoh.Query, gateway: Gateway) -> None:
+        """On a thread of Zenoh: what `fmu-mesh status` says of this gateway."""
+        missed = {own.topic: own.missed for own in gateway.deadlines if own.missed}
+        assert self._view is not None  # there is one before the first query
+        view = replace(self._view, ignored=dict(gateway.ignored), missed=missed)
+        query.reply(key, msgspec.json.encode(view), encoding=json_encoding)
+        query.drop()

@@ -13,7 +13,7 @@ from ...ros_wire.rclpy_profile import RosNode, message_class, ros_module
 from ...ros_wire.topics import CLOCK_TOPIC
 from ..gateway.link import two_clocks
 
-__all__ = ["RosTypes", "steady_timer", "time_message", "watch_clock"]
+__all__ = ["RosTypes", "other_clocks", "steady_timer", "time_message", "watch_clock"]
 
 _INTERVAL_S = 1.0
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
@@ -63,14 +63,19 @@ def watch_clock(node: RosNode, setting: str) -> Callable[[], None]:
     reported: set[str] = set()
 
     def look() -> None:
-        names = Counter(
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for info in node.get_publishers_info_by_topic(CLOCK_TOPIC)
-        )
-        names[node.get_fully_qualified_name()] -= 1
-        for name in sorted({*+names} - reported):
-            reported.add(name)
-            other = "a program that gives no name" if _UNKNOWN in name else f"the node '{name}'"
-            node.get_logger().warning(two_clocks(other, setting))
+        for other in other_clocks(node):
+            if other not in reported:
+                reported.add(other)
+                node.get_logger().warning(two_clocks(other, setting))
 
     return partial(node.destroy_timer, steady_timer(node, _INTERVAL_S, look))
+
+
+def other_clocks(node: RosNode) -> tuple[str, ...]:
+    """Who else publishes `/clock`, in words, where ``node`` publishes it."""
+    infos = node.get_publishers_info_by_topic(CLOCK_TOPIC)
+    names = Counter(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos)
+    names[node.get_fully_qualified_name()] -= 1
+    return tuple(
+        "a program that gives no name" if _UNKNOWN in name else f"the node '{name}'" for name in sorted({*+names})
+    )
