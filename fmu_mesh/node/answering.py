@@ -15,6 +15,7 @@ from functools import partial
 import msgspec
 import zenoh
 
+from ..errors import MessageRefused
 from ..system.plan import NodePlan
 from ..system.start_values import why_not_settable
 from ..variables.model_description import Value, Variable
@@ -22,7 +23,7 @@ from ..variables.value_conversion import to_plain
 from ..variables.value_types import is_text
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, escape, unescape
-from ..wire.messages import SetValue
+from ..wire.messages import SetValue, decode_json
 from ..wire.values import (
     NO_ORIGIN,
     Origin,
@@ -198,43 +199,44 @@ class Answers:
         refuse: Callable[[str], None],
         pending: _Pending | None = None,
     ) -> None:
-        """Let the main thread set a variable between two steps, if the value that was sent is allowed.
+        """Let the main thread set variables between two steps, if all values that were sent are allowed.
 
-        The ``pending`` query, if it was sent with one, is answered with the point from which on the value holds.
+        The ``pending`` query, if they were sent with one, is answered with the point from which on they hold.
         """
-
-        def confirm(point: int, when: float | None) -> None:
-            grid, points = self._plan.grid, runner.plan.step_points
-            late = when is not None and point > grid.step_at(when, points) * points
-            answer = msgspec.json.encode(SetAnswer(key, point, grid.time(point), late))
-            if pending is not None:
-                pending.finish(partial(pending.query.reply, key, answer, encoding=json_encoding))
 
         def take() -> None:
             if self._before is not None:
                 self._before.append(take)
                 return
-            at, when = runner.point, origin.time
+            at, when, step = runner.point, origin.time, runner.step
             if pending is None and when is not None and when > runner.grid.latest(at, streamed=True):
                 self._post(partial(self._warn_of_time, runner, origin.who, when, at))
                 when = None  # nobody hears a refusal, and a command must not be lost
             try:
-                step = set_input(runner, name, value, when)
+                for own, (name, value) in values.items():
+                    step = set_input(runner, name, value, when)
+                    self._tell(SetValue(runner.name, name, to_plain(value), at, when, own, origin.who))
             except ValueRefused as refused:
                 self._post(partial(refuse, str(refused)))
             else:
-                self._tell(SetValue(runner.name, name, to_plain(value), at, when, key, origin.who))
-                self._post(partial(confirm, step * runner.plan.step_points, when))
+                if pending is not None:
+                    self._post(partial(self._confirm, runner, key, pending, step, when))
 
         key = str(sent.key_expr)
         try:
-            name, value, origin = self._checked_setting(runner, key, sent.payload, sent.attachment)
+            values, origin = self._checked_settings(runner, key, sent.payload, sent.attachment)
         except ValueRefused as refused:
             refuse(str(refused))
             return
         if pending is not None:
             self._pending.append(pending)
         self._inbox.post(take)
+
+    def _confirm(self, runner: Runner, key: str, pending: _Pending, step: int, when: float | None) -> None:
+        grid, points = self._plan.grid, runner.plan.step_points
+        late = when is not None and step > grid.step_at(when, points)
+        answer = msgspec.json.encode(SetAnswer(key, step * points, grid.time(step * points), late))
+        pending.finish(partial(pending.query.reply, key, answer, encoding=json_encoding))
 
     def _warn_of_time(self, runner: Runner, who: str, time: float, at: int) -> None:
         if who not in self._without_time and len(self._without_time) < _MOST_WARNED:
@@ -243,18 +245,37 @@ class Answers:
             text += f" {runner.grid.time(at):.12g} s: its values take effect at once. Does it run with use_sim_time?"
             self._log(LogLine(runner.name, "warning", "set", text, at))
 
-    def _checked_setting(
+    def _checked_settings(
         self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
-    ) -> tuple[str, Value, Origin]:
-        """What arrived for a variable: its name, the value, when it holds and who sent it.
+    ) -> tuple[dict[str, tuple[str, Value]], Origin]:
+        """What arrived for one variable or several: by key, name and value; and when they hold and who sent them.
 
         Raises:
-            ValueRefused: it is not allowed.
+            ValueRefused: one of them is not allowed.
         """
-        parts = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
-        if len(parts) != 2 or "*" in key:
+        kind, *names = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
+        if len(names) > 1 or "*" in key:
             raise ValueRefused(f"'{key}' is not the key of one variable")
-        kind, name = parts[0], unescape(parts[1])
+        data = payload.to_bytes() if payload is not None else b""
+        try:
+            sent = {unescape(names[0]): data} if names else decode_json(data, dict[str, msgspec.Raw])
+        except MessageRefused as error:
+            raise ValueRefused(f"'{key}' takes an object with a value for each variable ({error})") from error
+        values = {}
+        for name, value in sent.items():
+            variable = self._settable(runner, kind, name)
+            try:
+                own = decode_value(bytes(value), variable, finite=runner.plan.not_finite == "stop")
+            except ValueRefused as refused:
+                raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
+            values[f"{self._keys.instance(runner.name)}/{kind}/{escape(name)}"] = name, own
+        try:
+            return values, decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN
+        except ValueRefused as refused:
+            raise ValueRefused(f"'{runner.name}.{', '.join(sent)}': {refused}") from refused
+
+    def _settable(self, runner: Runner, kind: str, name: str) -> Variable:
+        """A variable that may be set, by the part of the key space that it is in."""
         variable = runner.instance.description.variable(name)
         if variable is None or kind_of(variable) != kind:
             clock = runner.instance.description.clock(name)
@@ -263,12 +284,7 @@ class Answers:
             runner.plan.check_settable(variable)
         except ValueRefused as refused:
             raise ValueRefused(f"'{runner.name}.{name}' {refused}") from refused
-        try:
-            origin = decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN
-            data, finite = payload.to_bytes() if payload is not None else b"", runner.plan.not_finite == "stop"
-            return name, decode_value(data, variable, finite=finite), origin
-        except ValueRefused as refused:
-            raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
+        return variable
 
 
 class _Pending:

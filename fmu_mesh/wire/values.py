@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -24,6 +25,7 @@ __all__ = [
     "decode_value",
     "encode_origin",
     "encode_value",
+    "encode_values",
     "json_encoding",
 ]
 
@@ -87,6 +89,11 @@ def encode_origin(time: float | None, who: str) -> bytes:
 def encode_value(value: Value) -> bytes:
     """A value as JSON; NaN and infinities are text as in FMI 3.0, because JSON does not have them; Binary is base64."""
     return msgspec.json.encode(to_plain(value))
+
+
+def encode_values(values: Mapping[str, Value]) -> bytes:
+    """Values of several variables of an instance by name, which take effect at the same point."""
+    return msgspec.json.encode({name: msgspec.Raw(encode_value(value)) for name, value in values.items()})
 
 
 def decode_value(data: bytes, variable: Variable, *, finite: bool = False) -> Value:

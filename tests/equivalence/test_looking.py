@@ -599,6 +599,9 @@ def test_a_value_that_was_put_changes_the_outputs(session: zenoh.Session) -> Non
         ("gain/param/k", "1 2", "it is no JSON value"),
         ("gain/param/z", "1", "has no variable 'z' under 'param'"),
         ("gain/param/*", "1", "is not the key of one variable"),
+        ("gain/param", "[1]", "takes an object with a value for each variable"),
+        ("gain/in", '{"u": 1}', "is connected to 'pendulum'"),
+        ("free/in", '{"u": 1, "v": 2}', "has no variable 'v' under 'in'"),
     ],
 )
 def test_a_refused_query_is_answered_with_the_reason(

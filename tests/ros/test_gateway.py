@@ -342,6 +342,39 @@ def test_a_joystick_that_dies_does_not_steer_for_ever(place: Place, ros: Ros) ->
     mesh.wait()
 
 
+def test_all_fields_of_a_message_take_effect_at_one_point(place: Place, ros: Ros) -> None:
+    points = Codec(MessageTypes("jazzy"), "geometry_msgs/msg/Point")
+    pair = {"topic": "/pair", "type": "geometry_msgs/msg/Point"}
+    config = write_config(
+        place.folder,
+        name="lab",
+        instances={"adder": {"fmu": "Adder"}, "gain": {"fmu": "Gain", "step_size": 0.02}},
+        connections=[],
+        stop_time=1e4,
+        simulation={"step_size": 1e-4, "real_time_factor": 1},
+        record={"file": "lab.csv", "variables": ["adder.u1", "adder.y"]},
+        ros={
+            "connect": [f"tcp/127.0.0.1:{ros.port}"],
+            "topics": [
+                {**pair, "fields": {"x": "adder.u1", "y": "adder.u2", "z": "gain.u"}},
+                {"topic": "/angle", "variable": "gain.y"},
+            ],
+        },
+    )
+
+    mesh = place.start("launch", config, "--no-progress")
+    wait_until(lambda: ros.floats("angle"), "the first output")
+    for number in map(float, range(1, 101)):
+        ros.session.put("pair", points.encode({"x": number, "y": -number, "z": number}))
+        wait_until(lambda: number in ros.floats("angle")[-1000:], "the message")  # noqa: B023  it waits here
+    assert place.run("stop", "lab").wait() == 0
+    mesh.wait()
+
+    rows = rows_of(place.folder / "lab.csv")
+    assert max(first for _, first, _ in rows) == 100.0
+    assert {total for *_, total in rows} == {0.0}
+
+
 @pytest.mark.parametrize("profile", ["ros2dds", "rmw_zenoh"])
 def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place, ros: Ros, profile: str) -> None:
     types = MessageTypes("jazzy")

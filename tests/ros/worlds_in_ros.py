@@ -177,14 +177,12 @@ def point_of(message: Any) -> int:  # noqa: ANN401 a message
 
 
 def assert_pushed(result: fmu_mesh.Result) -> None:
-    """The cube has got the force and the torque and kept them, and moves as Newton says.
-
-    They are inputs of their own, each of which takes effect at the next point, so one may be a point before the other.
-    """
+    """The cube has got the force and the torque at one point and kept them, and moves as Newton says."""
     force, torque = (result[f"{BODY}.{what}_z"] for what in ("force", "moment"))
     assert ({*force}, {*torque}) == ({0.0, FORCE}, {0.0, TORQUE})
+    assert np.all(np.diff(force) >= 0.0)
+    assert np.array_equal(force * TORQUE, torque * FORCE)
     for given, speed in ((force / MASS, "linear_velocity_z"), (torque / INERTIA, "angular_velocity_z")):
-        assert np.all(np.diff(given) >= 0.0)
         assert np.diff(result[f"{BODY}.{speed}"]) == pytest.approx(given[1:] * STEP_SIZE, rel=1e-6, abs=1e-12)
 
 

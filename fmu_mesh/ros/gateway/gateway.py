@@ -49,11 +49,11 @@ from ...ros_wire.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from ...simtime import TimeGrid
 from ...text import shown
 from ...wire.client.readings import latecomers
-from ...wire.keys import Keys
+from ...wire.keys import Keys, escape
 from ...wire.messages import decode_json
 from ...wire.refusals import Refusals
 from ...wire.session import Question, ask, undeclare_all
-from ...wire.values import Stamp, encode_origin, encode_value, json_encoding
+from ...wire.values import Stamp, encode_origin, encode_value, encode_values, json_encoding
 from ...wire.views import MeshInfo
 from .deadline import Deadline
 from .parameter_services import ParameterServices
@@ -272,14 +272,17 @@ class Gateway:
     # --- from ROS to the mesh
 
     def _open_input(self, topic: Topic) -> None:
-        keys = [self._keys.variable(port.instance, port.kind, port.variable.name) for port in topic.ports]
-        for key in keys:
+        subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types))
+        places: dict[str, dict[str, int]] = {}
+        for place, port in enumerate(topic.ports):
+            places.setdefault(f"{self._keys.instance(port.instance)}/{port.kind}", {})[port.variable.name] = place
+        for root, own in places.items():
+            key = root if len(own) > 1 else f"{root}/{escape(*own)}"
+            subscribed.inputs[key] = own
             if key not in self._publishers:
                 self._publishers[key] = self._mesh.declare_publisher(
                     key, encoding=json_encoding, congestion_control=zenoh.CongestionControl.BLOCK
                 )
-        subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types), keys)
-
         deadline = self._deadline(topic)
 
         def take(data: bytes) -> None:
@@ -300,10 +303,11 @@ class Gateway:
             subscribed.warn(f"a message of {len(data)} bytes is no '{message}' that can be used: {error}")
             return
         attachment = encode_origin(stamp / 1_000_000_000 if stamp is not None else None, subscribed.who)
-        for key, value in zip(subscribed.keys, values, strict=True):
-            if value is not None:
-                self._publishers[key].put(encode_value(value), attachment=attachment)
-                self.settle.sent(key)
+        for key, places in subscribed.inputs.items():
+            if sent := {name: value for name, at in places.items() if (value := values[at]) is not None}:
+                payload = encode_values(sent) if len(places) > 1 else encode_value(*sent.values())
+                self._publishers[key].put(payload, attachment=attachment)
+                self.settle.sent(key if len(places) == 1 else f"{key}/{escape(next(iter(sent)))}")
         fields = subscribed.disassembler.fields
         if fields.ignored:
             self.ignored[subscribed.disassembler.topic.name] = fields.ignored
@@ -366,12 +370,17 @@ class _WarnOnce:
 
 
 class _SubscribedTopic(_WarnOnce):
-    """A topic that the gateway subscribes to, and the keys of its variables."""
+    """A topic that the gateway subscribes to.
 
-    def __init__(self, disassembler: Disassembler, keys: list[str]) -> None:
+    Attributes:
+        inputs: by the key of a variable, or of all inputs of an instance if there are several: the variables, and the
+            place of the field of each in the topic.
+    """
+
+    def __init__(self, disassembler: Disassembler) -> None:
         super().__init__(disassembler.topic.name)
         self.disassembler = disassembler
-        self.keys = keys
+        self.inputs: dict[str, dict[str, int]] = {}
         self.who = f"ros {disassembler.topic.name}"
 
 
