@@ -41,7 +41,7 @@ Service = Callable[[Message, Callable[[Message], None]], None]
 """Called on a thread of Zenoh with a request and a function that sends the response, now or later, on any thread."""
 
 Call = Callable[[Message, float], Message]
-"""Sends a request and waits for its response, for so long in s.
+"""Sends a request and waits for its response, for so long in s. What the request does not say is 0 or empty.
 
 Raises:
     DeadlineExceeded: it has not come in time, or there is no such server.
@@ -108,9 +108,8 @@ class RmwZenoh(ZenohProfile):
             return False
 
         def call(request: Message, deadline_s: float) -> Message:
-            question = Question(
-                key, f"'{name}'", deadline_s, request_codec.encode(request), attachment=attached(0.0), once=True
-            )
+            payload = request_codec.encode(request_codec.empty() | request)
+            question = Question(key, f"'{name}'", deadline_s, payload, attachment=attached(0.0), once=True)
             try:
                 return response_codec.decode(ask(self._session, question, over))
             except CdrError as error:

@@ -360,7 +360,12 @@ NOT_RUN = [
     ),
     (
         "docs/ros-simulation.md",
-        "fmu-mesh router --listen tcp/127.0.0.1:7447       # or rmw_zenohd",
+        "mesh: controlled",
+        "it needs a simulator; tests/ros/test_ros_simulator.py runs this file",
+    ),
+    (
+        "docs/ros-simulation.md",
+        "fmu-mesh router --listen tcp/127.0.0.1:7447",
         "they run at the same time; tests/ros/test_ros_simulator.py runs them",
     ),
     (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from fmu_mesh.instances.registry import KINDS
@@ -21,8 +22,6 @@ class Published:
 
     def __init__(self, start_s: float | None = 0.0, **keys: Any) -> None:  # noqa: ANN401 keys of a topic
         need("rosbags")
-        import msgspec  # noqa: PLC0415
-
         written = {
             "ros_simulator": {"step": STEP},
             "topics": [

@@ -13,8 +13,19 @@ from typing import Any
 import pytest
 import yaml
 
+import fmu_mesh
 from fmu_mesh.ros_wire.simulation_types import SimulatorFeature
-from tests.helpers import FMUS, Launched, Place, assert_readable, row_count, rows_of, wait_until, write_config
+from tests.helpers import (
+    DEADLINE_S,
+    FMUS,
+    Launched,
+    Place,
+    assert_readable,
+    row_count,
+    rows_of,
+    wait_until,
+    write_config,
+)
 from tests.ros.peers import Peer, free_port, need
 from tests.ros.ros_peer import built_types_or_skip, environment, ros_or_skip
 
@@ -194,6 +205,22 @@ SPEED = {"topic": "speed", "type": FLOAT, "outputs": {"data": "velocity"}, "matc
 FORCE = {"topic": "force", "type": FLOAT, "inputs": {"data": "force"}}
 
 
+def test_reset_of_a_mesh_resets_its_simulator(place: Place, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FMU_MESH_RUNTIME_DIR", str(place.folder / "run"))
+    started(place, port)
+    outer = controlled(place.folder, section(port), stop_time=0.3)
+
+    with fmu_mesh.load(outer).start(paused=True) as run:
+        run.step(17)
+        assert run.reset().point == 0
+        run.resume()
+        run.wait(DEADLINE_S)
+
+    first, second = (rows_of(place.folder / name) for name in ("outer.csv", "outer-2.csv"))
+    assert first == second[:18]
+    assert len(second) == 31
+
+
 def test_larger_step_and_topics_without_stamps_are_exact(place: Place, port: int) -> None:
     started(place, port)
     slow = {**STATE, "outputs": {"twist.linear.x": "position"}}
@@ -292,6 +319,24 @@ def test_failures_of_a_simulator_name_instance_point_and_reason(place: Place, po
         said = failed(place, port, STATE, PUSH)
         assert "instance plant: no message of this point on '/lab/state'; waited 3 s for that at 0 s" in said
         assert "Otherwise give position, velocity start values" in said
+
+
+def test_lost_router_ends_the_run_with_the_name_of_the_instance(place: Place) -> None:
+    need("zenoh_ros2_sdk", "xxhash")
+    number = free_port()
+    router = place.start("router", "--listen", f"tcp/127.0.0.1:{number}")
+    wait_until(lambda: router.output, "the router")
+    (place.folder / "plant.py").write_text(PLANT)
+    outer = controlled(place.folder, section(number, STATE, PUSH, timeout=3.0), stop_time=10_000.0)
+
+    with another(number):
+        launched = place.start("launch", outer, "--no-progress")
+        wait_until(lambda: row_count(place.folder / "outer.csv") > 3, "some points")
+        router.signal(signal.SIGKILL)
+        assert launched.wait() == 3
+
+    assert "instance plant, point" in launched.message
+    assert "/lab/" in launched.message
 
 
 @pytest.mark.parametrize(

@@ -66,10 +66,8 @@ class ZenohConnection:
         )
         self._profile = RmwZenoh(self._session, RosPlan(types, node=node), section.domain or 0)
         self._arrived = threading.Event()
-
-    def publish(self, topic: Topic) -> Put:
-        """See `SimulatorConnection`."""
-        return self._profile.publish(topic)
+        self.publish = self._profile.publish
+        self.unheard = self._profile.unheard
 
     def subscribe(self, topic: Topic, take: Take) -> None:
         """See `SimulatorConnection`."""
@@ -88,10 +86,6 @@ class ZenohConnection:
         """See `SimulatorConnection`."""
         self._arrived.wait(timeout_s)
         self._arrived.clear()  # whoever waits looks into its queue next
-
-    def unheard(self) -> list[str]:
-        """See `SimulatorConnection`."""
-        return self._profile.unheard()
 
     def close(self) -> None:
         """See `SimulatorConnection`."""
@@ -135,7 +129,8 @@ class RclpyConnection:
 
         def call(request: Message, deadline_s: float) -> Message:
             end, sent, asked = time.monotonic() + deadline_s, 0.0, list[Any]()
-            message = self._serialization.deserialize_message(request_codec.encode(request), service.Request)
+            data = request_codec.encode(request_codec.empty() | request)
+            message = self._serialization.deserialize_message(data, service.Request)
             while (now := time.monotonic()) < end:
                 if not client.service_is_ready():
                     if asked and not repeats:

@@ -40,11 +40,7 @@ _HEARD_S = 2.0
 _LOOK_S = 0.1
 _PAUSE_S = 2.0
 
-_NEEDED = {
-    SimulatorFeature.SIMULATION_STATE_PAUSE: "SIMULATION_STATE_PAUSE",
-    SimulatorFeature.STEP_SIMULATION_SINGLE: "STEP_SIMULATION_SINGLE",
-}
-_OPTIONAL = "ResetSimulation"
+_FEATURES = "GetSimulatorFeatures"
 
 
 class RosSimulatorInstance:
@@ -60,23 +56,16 @@ class RosSimulatorInstance:
         self._values: dict[str, Value] = {
             variable.name: variable.start for variable in self.description.variables if variable.start is not None
         }
-        self._per_step = 1
         self._stepping = False
-        self._connection = self._connected()
+        self._inputs: list[tuple[Assembler, Put, list[str]]] = []
+        self._outputs: list[OutputTopic] = []
         self._open = ExitStack()
-        self._open.callback(self._connection.close)
         try:
-            self._inputs: list[tuple[Assembler, Put, list[str]]] = []
-            self._outputs: list[OutputTopic] = []
-            self._declare()
-            self._calls: dict[str, Call] = {
-                kind: self._client(kind) for kind in ("SetSimulationState", "StepSimulation", _OPTIONAL)
-            }
-            # The last one: with DDS, whoever answers it has heard of all others.
-            self._calls["GetSimulatorFeatures"] = self._client("GetSimulatorFeatures")
-            self._check_features()
-        except BaseException:
+            self._connect()
+        except BaseException as error:
             self.close()
+            if isinstance(error, ConfigurationError):  # no router; no ROS here, or one that lacks a type
+                raise LoadFailed(error.message, instance=self.name, hint=error.hint or self._hint) from error
             raise
 
     def enter_initialization(
@@ -91,7 +80,7 @@ class RosSimulatorInstance:
             topic.begin(silent=start_values.keys() >= {*topic.variables})
         self._time.begin(self._own.start_time if self._own.start_time is not None else 0.0 if self._resets else None)
         if self._resets:
-            self._ask(_OPTIONAL, {"scope": 0}, InitializationFailed)
+            self._ask("ResetSimulation", {"scope": 0}, InitializationFailed)
         self._take_outputs(0, InitializationFailed)
         missing = [name for topic in self._outputs for name in topic.variables if name not in self._values]
         if missing:
@@ -154,39 +143,34 @@ class RosSimulatorInstance:
 
     # --- the connection
 
-    def _connected(self) -> SimulatorConnection:
-        kind = RclpyConnection if self._own.profile == "rclpy" else ZenohConnection
-        try:
-            return kind(self._own, self._topics.types, ros_name(self.name))
-        except ConfigurationError as error:  # no router, or no ROS here
-            raise LoadFailed(error.message, instance=self.name, hint=error.hint or self._hint) from error
-
-    def _declare(self) -> None:
-        for topic, own in self._topics.topics:
-            if own.inputs:
-                names = [port.variable.name for port in topic.ports]
-                assembler = Assembler(topic, self._topics.types)
-                self._inputs.append((assembler, self._connection.publish(topic), names))
-            else:
-                output = OutputTopic(topic, own, self._topics.types, self._time)
-                self._connection.subscribe(topic, output.take)
-                self._outputs.append(output)
-
-    def _client(self, kind: str) -> Call:
-        name = absolute(service_name(kind), self._own.namespace)
-        return self._connection.client(name, f"simulation_interfaces/srv/{kind}", repeats=kind.startswith("Get"))
-
-    def _check_features(self) -> None:
-        """Ask what the simulator can do.
+    def _connect(self) -> None:
+        """Declare everything, and ask what the simulator can do.
 
         Raises:
             LoadFailed: there is none, or it cannot be paused and stepped.
         """
-        offered = {int(number) for number in self._ask("GetSimulatorFeatures", {}, LoadFailed)["features"]["features"]}
+        kind = RclpyConnection if self._own.profile == "rclpy" else ZenohConnection
+        self._connection: SimulatorConnection = kind(self._own, self._topics.types, ros_name(self.name))
+        self._open.callback(self._connection.close)
+        for topic, own in self._topics.topics:
+            if own.inputs:
+                put, names = self._connection.publish(topic), [port.variable.name for port in topic.ports]
+                self._inputs.append((Assembler(topic, self._topics.types), put, names))
+            else:
+                output = OutputTopic(topic, own, self._topics.types, self._time)
+                self._connection.subscribe(topic, output.take)
+                self._outputs.append(output)
+        # The last client asks first: with DDS, whoever answers it has heard of all that was declared before.
+        self._calls: dict[str, Call] = {}
+        for service in ("SetSimulationState", "StepSimulation", "ResetSimulation", _FEATURES):
+            name, type_ = absolute(service_name(service), self._own.namespace), f"simulation_interfaces/srv/{service}"
+            self._calls[service] = self._connection.client(name, type_, repeats=service == _FEATURES)
+        offered = {int(number) for number in self._ask(_FEATURES, {}, LoadFailed)["features"]["features"]}
         self._multiple = SimulatorFeature.STEP_SIMULATION_MULTIPLE in offered
         self._resets = SimulatorFeature.SIMULATION_RESET in offered
-        offered |= {SimulatorFeature.STEP_SIMULATION_SINGLE} if self._multiple else set()
-        if lacking := [text for number, text in _NEEDED.items() if number not in offered]:
+        step = SimulatorFeature.STEP_SIMULATION_MULTIPLE if self._multiple else SimulatorFeature.STEP_SIMULATION_SINGLE
+        needed = (SimulatorFeature.SIMULATION_STATE_PAUSE, step)
+        if lacking := [feature.name for feature in needed if feature not in offered]:
             text = f"{self._own} does not offer {listed(lacking)}, so it cannot be stepped at communication points"
             raise LoadFailed(text, instance=self.name)
 
@@ -204,8 +188,6 @@ class RosSimulatorInstance:
         accepted: tuple[ResultCode, ...] = (ResultCode.OK,),
     ) -> Message:
         """The response of a service; ``failure`` if there is none, or if its result is not one of these."""
-        if kind == "GetSimulatorFeatures":
-            request = {"structure_needs_at_least_one_member": 0}
         try:
             response = self._calls[kind](request, self._own.timeout)
         except MeshLost as error:

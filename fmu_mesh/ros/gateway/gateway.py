@@ -57,8 +57,7 @@ from ...wire.values import Stamp, encode_origin, encode_value, encode_values, js
 from ...wire.views import MeshInfo
 from .deadline import Deadline
 from .parameter_services import ParameterServices
-from .settling import Settling
-from .simulation_services import SimulationServices
+from .simulation_services import Settling, SimulationServices
 
 __all__ = ["Gateway", "open_profiles"]
 

@@ -7,10 +7,15 @@ come: here as queries of Zenoh, in `fmu_mesh.ros.node.simulation_server` through
 # Threads: requests are answered on several threads at once, because one of them may wait for a long step while others
 # ask for the state, or pause. Two steps at once would add up to another one than either asked for, so the second is
 # refused (`_stepping`). The mesh itself decides on everything else, and its answer is the result (ADR 0030).
+#
+# `Settling`: `sent` is called on the thread of the gateway, `__call__` on that of a service. It lets the gateway do a
+# job: all messages before it are carried then. A node takes what is put and answers queries in the order in which they
+# come, so its answer says that it has all values (ADR 78).
 
 from __future__ import annotations
 
 import math
+import queue
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -23,7 +28,7 @@ import zenoh
 
 from ... import __version__
 from ...config.ros_section import SimulationInterfacesConfig
-from ...errors import FmuMeshError
+from ...errors import DeadlineExceeded, FmuMeshError
 from ...ros_wire.cdr import Codec, Message
 from ...ros_wire.definitions import MessageTypes
 from ...ros_wire.rmw_zenoh import RmwZenoh
@@ -41,15 +46,17 @@ from ...wire.client.mesh_client import MeshClient
 from ...wire.client.readings import Reading, Target
 from ...wire.client.waiting import begun_again
 from ...wire.keys import Keys
+from ...wire.session import Question, ask
 from ...wire.views import Command, MeshState
 from .service_threads import ServiceThreads
 
-__all__ = ["SIMULATION_THREADS", "SimulationServices"]
+__all__ = ["SIMULATION_THREADS", "Settling", "SimulationServices"]
 
 SIMULATION_THREADS = 4
 """Requests that are answered at once: one step, and others meanwhile."""
 
 _ANSWER_S = 10.0
+_CARRIED_S = 10.0
 _LONGEST_STEP_S = 3600.0
 _LOOKS = 20
 _FLAGS = re.compile(r"\(\?[aiLmsux]+\)")
@@ -293,3 +300,40 @@ class SimulationServices:
                 return readings
         text = f"the outputs of '{targets[0].name.rpartition('.')[0]}' were not read at one point: pause the simulation"
         raise _Refusal(ResultCode.OPERATION_FAILED, f"{text}, or record all of them")
+
+
+class Settling:
+    """Called without arguments, it waits until the nodes have all values of earlier messages.
+
+    Args:
+        mesh: a session that reaches the mesh.
+        post: lets the gateway do a job after all that it has to do already.
+
+    Raises:
+        DeadlineExceeded: (the call) they do not have them in time.
+    """
+
+    def __init__(self, mesh: zenoh.Session, post: Callable[[Callable[[], None]], None]) -> None:
+        self._mesh = mesh
+        self._post = post
+        self._keys: dict[str, str] = {}
+
+    def sent(self, key: str) -> None:
+        """Note that a value was put on the key of a variable."""
+        self._keys[key.rpartition("/")[0]] = key  # one question for each instance is enough
+
+    def __call__(self) -> None:
+        """See the class."""
+        carried: queue.SimpleQueue[list[str]] = queue.SimpleQueue()
+
+        def take() -> None:
+            keys, self._keys = self._keys, {}
+            carried.put(list(keys.values()))
+
+        self._post(take)
+        try:
+            keys = carried.get(timeout=_CARRIED_S)
+        except queue.Empty:
+            raise DeadlineExceeded("the gateway to ROS is too busy to carry the messages before this step") from None
+        for key in keys:
+            ask(self._mesh, Question(key, f"the instance of '{key}'", _CARRIED_S))
