@@ -360,7 +360,8 @@ class MeshClient:
 
     @cached_property
     def _command_key(self) -> zenoh.KeyExpr:
-        return self.session.declare_keyexpr(self.keys.mesh_key("command"))
+        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.mesh_key("command"))
+        return key
 
     def _view(
         self, key: str, kind: type[View], who: str, payload: bytes | None = None, attachment: bytes | None = None
