@@ -46,8 +46,9 @@ docs: $(VENV)/.installed-docs ## the site, with the reference of the library: bu
 	@PATH="$(BIN):$$PATH" $(BIN)/zensical build --strict --clean >build/site.log 2>&1; code=$$?; cat build/site.log; \
 	if [ $$code -ne 0 ] || grep -q '^griffe: ' build/site.log; then exit 1; fi
 
-bench: $(VENV)/.installed-test ## us and the peers on this machine: one table (about 20 minutes)
+bench: $(VENV)/.installed-test ## us and the peers on this machine, and topics of ROS (about 25 minutes)
 	@$(BIN)/python -m benchmarks
+	@$(BIN)/python -m benchmarks.ros_topics
 
 fmus: $(VENV)/.installed-plot ## rebuild the example FMUs from fmus/src (needs a C compiler)
 	@$(BIN)/python fmus/build.py

@@ -46,6 +46,7 @@ _LOOK_S = 5.0
 BLOCKS = {
     "jobs": "benchmarks",
     "far": "benchmarks.far",
+    "ros topics": "benchmarks.ros_topics",
     "recording": "benchmarks.recording",
     "formats": "benchmarks.formats",
     "scale": "benchmarks.scale",

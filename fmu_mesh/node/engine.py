@@ -41,8 +41,8 @@ __all__ = ["BurstEngine", "Engine", "PlainEngine", "Windows", "make_engine"]
 # * A wake-up is lost, because its sender was killed: each sleep has a limit, then everything is looked at anew.
 # * An FMU changes the floating-point mode or a signal handler of the process: the mode is looked at after each step,
 #   as that is two additions; all else every 50 ms (`_STATE_CHECK_S`), as that is 10 us.
-# * Python writes a table while the burst uses it: it cannot, because `refit` and `_follow` run on the main thread,
-#   between two calls of `node_run`, or for a member whose step the burst has just given to Python.
+# * Python writes a table while the burst uses it: it cannot, because `refit` and `follow_inputs` run on the main
+#   thread, between two calls of `node_run`, or for a member whose step the burst has just given to Python.
 #
 # Tried and given up: one call from Python for each step (as much time as a small FMU takes), loops that llvmlite
 # compiled (170 MB, up to 20 ms for each node, and no faster; ADR 57), a grant that is asked for at each window (ADR
@@ -103,6 +103,9 @@ class Engine(ABC):
     @abstractmethod
     def refit(self, runner: Runner) -> None:
         """On the main thread, between steps: the runner steps in another way from the next step on."""
+
+    def follow_inputs(self, runner: Runner) -> None:  # noqa: B027  an engine whose steps ask the runner needs nothing
+        """On the main thread, between steps: inputs over time of the runner change in other steps than before."""
 
     def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
@@ -313,15 +316,15 @@ class BurstEngine(Engine):
         made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
         self._kept[runner.name] = [made, bases, own]  # what the table points to
         ctypes.pointer(before)[0] = made
-        self._follow(runner)
+        self.follow_inputs(runner)
 
-    def _follow(self, runner: Runner) -> None:
+    def follow_inputs(self, runner: Runner) -> None:
         """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""
-        timed = runner.instance
+        timed, member = runner.instance, runner.table
         if isinstance(timed, TimedInputs):
-            self._tracks[runner.name] = [timed.tracks]  # what the table points to
-            member = runner.table
-            member.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
+            if timed.tracks or member.n_tracks:
+                self._tracks[runner.name] = [timed.tracks]  # what the table points to
+                member.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
             member.python_at, member.tracks_from = timed.python_at, timed.tracks_from
 
     def _complete(self, unit: int, runner: Runner, result: int) -> None:
@@ -335,7 +338,7 @@ class BurstEngine(Engine):
                 for source in runner.sources:
                     source.transfer.step_text(step)
                 runner.instance.do_step(step)
-                self._follow(runner)
+                self.follow_inputs(runner)
             else:
                 if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
                     for source in runner.sources:

@@ -137,7 +137,10 @@ class TimedInputs(AroundNativeSteps):
         # The value that it has fallen back to is as if it had been sent, and would be newer than one with a past time.
         self._trajectories[name].add(max(when, now) if name in self.late else when, value)
         self._last.came(name, step)
-        self.python_at = self._step
+        # A line changes in each step from now on. A value that holds changes nothing before its own step, unless its
+        # input has been calculated ahead.
+        is_needed_now = self._trajectories[name].linear or name in self._tracked
+        self.python_at = min(self.python_at, self._step if is_needed_now else step)
         return step
 
     def follows(self, name: str) -> bool:
@@ -252,7 +255,7 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
     if isinstance(runner.instance, TimedInputs) and (time is not None or runner.instance.follows(name)):
         runner.instance.reached(runner.step)
         step = runner.instance.add(name, value, time)
-        runner.refit()
+        runner.follow_inputs()
         return step
     runner.instance.set_values({name: value})
     return runner.step

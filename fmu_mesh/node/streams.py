@@ -43,7 +43,7 @@ _MAX_WAITING_VALUES = 1 << 20
 """Somebody may subscribe to all 60,000 variables of an FMU: their rows would need gigabytes."""
 
 _MOST_DECLARED: Final = 1 << 12
-"""Keys that stay declared, each of which takes longer than the one before. Others count as subscribed."""
+"""Keys that stay declared; each takes longer than the one before. Those beyond them count as subscribed."""
 
 PRIORITY = zenoh.Priority.DATA_LOW
 """Frames and grants must not wait behind samples for subscribers."""

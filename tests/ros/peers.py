@@ -21,7 +21,7 @@ import pytest
 
 from tests.helpers import DEADLINE_S, wait_until
 
-__all__ = ["Peer", "bridge", "domain", "free_port", "need", "ros_settings"]
+__all__ = ["Peer", "bridge", "bridge_binary", "domain", "free_port", "need", "ros_settings"]
 
 FOLDER = Path(__file__).parent
 BRIDGE = "fmu-mesh-ros2dds"

@@ -100,7 +100,10 @@ def test_a_question_that_is_sent_once_is_not_repeated(once: bool) -> None:  # no
 
 
 @pytest.mark.parametrize("once", [True, False])
-def test_many_questions_leave_the_publishers_of_session_alone(once: bool, tmp_path: Path) -> None:  # noqa: FBT001
+def test_many_questions_leave_the_publishers_of_session_alone(
+    once: bool,  # noqa: FBT001  a parameter of the test
+    tmp_path: Path,
+) -> None:
     at, received = (f"unixsock-stream/{tmp_path}/tool.sock",), list[bytes]()
     with open_session(Wiring(listen=at)) as mesh, open_session(Wiring(mode="client", connect=at)) as tool:
 

@@ -124,7 +124,7 @@ def test_when_the_last_subscriber_has_gone_no_variable_is_wanted() -> None:
     assert not streams._wanted
 
 
-def test_more_questions_than_keys_may_stay_declared_find_too_much_and_never_too_little() -> None:
+def test_more_questions_than_declared_keys_find_too_much_never_too_little() -> None:
     names = [f"{number}.x" for number in range(10_000)]
     session = Session([Keys("fmu_mesh", "lab").variable("unit", "local", name) for name in names[::2]])
     streams = streams_of(names, session)
@@ -147,7 +147,7 @@ def pair(tmp_path: Path) -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
         yield node, tool
 
 
-def test_no_value_that_is_sent_to_an_input_is_lost_while_it_looks(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
+def test_no_value_for_an_input_is_lost_while_it_looks(pair: tuple[zenoh.Session, zenoh.Session]) -> None:
     node, tool = pair
     received: list[int] = []
     node.declare_subscriber(f"{ROOT}/in/*", lambda sample: received.append(int(sample.payload.to_bytes())))

@@ -94,6 +94,21 @@ def test_with_hold_it_is_taken_when_its_time_has_come(hold: Steps) -> None:
     assert hold.go(5) == [5.0, 5.0, 5.0, 9.0, 9.0]
 
 
+def test_a_value_that_holds_needs_python_in_its_own_step_only(hold: Steps) -> None:
+    hold.go(1)
+
+    hold.inputs.add("u", 9.0, 1.5)
+    hold.inputs.add("u", 8.0, 1.3)
+
+    assert hold.inputs.python_at == 3
+    assert hold.go(2) == [5.0, 5.0]
+    assert hold.inputs.python_at == 3
+    assert hold.go(1) == [8.0]
+    assert hold.inputs.python_at == 5
+    hold.inputs.add("u", 7.0, None)
+    assert hold.go(3) == [7.0, 9.0, 9.0]
+
+
 def test_values_count_by_their_times_and_not_by_their_arrival(hold: Steps) -> None:
     hold.inputs.add("u", 3.0, 1.3)
     hold.inputs.add("u", 2.0, 1.15)
