@@ -134,6 +134,7 @@ def test_type_hashes_are_those_of_the_generator_of_ros() -> None:
             assert types.type_hash(name) == hashes[name], name
 
 
+@pytest.mark.parametrize("started", [{"factor": 1.0}], indirect=True, ids=["paced"])
 def test_mesh_is_paused_stepped_played_and_quit_from_ros(started: tuple[Simulator, Launched, Any]) -> None:
     simulator, launched, _peer = started
 
@@ -254,6 +255,7 @@ def got(vector: Any) -> list[float]:  # noqa: ANN401 a message
     return [getattr(vector, letter) for letter in "wxyz" if hasattr(vector, letter)]
 
 
+@pytest.mark.parametrize("started", [{"factor": 1.0}], indirect=True, ids=["paced"])
 def test_reset_begins_again_at_first_point_with_equal_values(started: tuple[Simulator, Launched, Any]) -> None:
     simulator, _launched, _peer = started
 
@@ -366,6 +368,7 @@ def test_steps_that_are_not_paced_are_faster_than_real_time_factor(
     assert simulator("GetEntityState", entity="world.cube").state.header.stamp.sec == 1, "playing is paced again"
 
 
+@pytest.mark.parametrize("started", [{"factor": 1.0}], indirect=True, ids=["paced"])
 def test_action_steps_with_feedback_and_can_be_cancelled(started: tuple[Simulator, Launched, Any], ros: Ros) -> None:
     from rclpy.action import ActionClient  # noqa: PLC0415 only where ROS is installed
     from simulation_interfaces.action import SimulateSteps  # noqa: PLC0415 only where it is built

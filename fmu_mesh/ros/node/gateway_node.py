@@ -79,9 +79,8 @@ class GatewayNode:
         if (namespace := self._node.get_namespace()) != "/":  # such as that of `__ns`
             section = replace(section, namespace=namespace)
         loaded = replace(loaded, config=replace(loaded.config, ros=section))
-        endpoints = [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
         with ExitStack() as stack:
-            client = stack.enter_context(Meshes(endpoints, _TIMEOUT_S)).named(loaded.config.mesh)
+            client = stack.enter_context(Meshes(self._endpoints(), _TIMEOUT_S)).named(loaded.config.mesh)
             info = client.info()
             infos = {name: client.instance_info(name) for name in info.instances}
             findings = loaded.findings()
@@ -114,7 +113,9 @@ class GatewayNode:
             stack.callback(profile.close)
             names = {topic.profile for topic in plan.topics} or {"ros2dds"}
             profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
-            gateway = Gateway(plan, client.session, client.keys, grid_of(info))
+            # A session of its own: answers to the other one would queue behind the samples of a mesh that is fast.
+            own = stack.enter_context(Meshes(self._endpoints(), _TIMEOUT_S)).named(client.keys.mesh)
+            gateway = Gateway(plan, own.session, client.keys, grid_of(info))
             stack.callback(gateway.close)
             gateway.open(profiles, _TIMEOUT_S)
             if self._interfaces is not None:
@@ -152,6 +153,9 @@ class GatewayNode:
         """Clean up; returns True, because nothing is left running."""
         self.cleanup()
         return True
+
+    def _endpoints(self) -> list[str]:
+        return [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
 
     def _declare_parameters(self, client: MeshClient, plan: RosPlan, stack: ExitStack) -> None:
         """Declare the parameters of the mesh as parameters of the node, with their current values."""
