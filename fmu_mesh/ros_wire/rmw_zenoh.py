@@ -87,7 +87,8 @@ class RmwZenoh(ZenohProfile):
 
     def client(self, name: str, kind: str) -> Call:
         """Declare a client of the service ``name``; a request is sent once, when there is a server."""
-        key, here = self._key(name, kind), set[str]()
+        here = set[str]()
+        key = self._session.declare_keyexpr(self._key(name, kind))  # as `Question` wants it
         request_codec = Codec(self._types, f"{kind}_Request")
         response_codec = Codec(self._types, f"{kind}_Response")
         attached = self._attached(self._announce("SC", name, kind, Qos()))
