@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ..errors import ConfigurationError, Interrupted
-from ..ros.gateway.gateway import Gateway, open_profiles
-from ..ros.gateway.link import RosLink, open_ros
+from ..ros.gateway.gateway import Gateway
+from ..ros.gateway.link import RosLink, open_profiles, open_ros
 from ..ros.gateway.mapping import resolve
 from ..ros_wire.topics import RosPlan
 from ..system.plan import MASTER

@@ -30,20 +30,17 @@ from __future__ import annotations
 import logging
 import queue
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import zenoh
 
-from ...config.mesh import RosConfig
 from ...errors import MeshLost, MessageRefused
 from ...ros_wire.assembling import Assembler, Disassembler
 from ...ros_wire.cdr import CdrError, Codec
 from ...ros_wire.definitions import CLOCK
-from ...ros_wire.profile import Profile, Put, Ros2Dds, Take, ZenohProfile
-from ...ros_wire.rmw_zenoh import RmwZenoh
+from ...ros_wire.profile import Profile, Put, Take
 from ...ros_wire.stamp import to_stamp
 from ...ros_wire.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from ...simtime import TimeGrid
@@ -56,10 +53,9 @@ from ...wire.session import Question, ask, undeclare_all
 from ...wire.values import Stamp, encode_origin, encode_value, encode_values, json_encoding
 from ...wire.views import MeshInfo
 from .deadline import Deadline
-from .parameter_services import ParameterServices
-from .simulation_services import Settling, SimulationServices
+from .simulation_services import Settling
 
-__all__ = ["Gateway", "open_profiles"]
+__all__ = ["Gateway"]
 
 log = logging.getLogger(__name__)
 
@@ -69,28 +65,6 @@ _REPEAT_S = 1.0
 """How often `/clock` is repeated while it stands still, for new subscribers, and lost samples are reported."""
 
 Event = Callable[[], None]
-
-
-@contextmanager
-def open_profiles(  # noqa: PLR0913, PLR0917  one gateway and its surroundings
-    section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys, settle: Event
-) -> Iterator[dict[str, ZenohProfile]]:
-    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the services.
-
-    ``settle`` waits until the mesh has all values that came before.
-    """
-    profiles: dict[str, ZenohProfile] = {}
-    with ExitStack() as stack:
-        for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
-            profile = RmwZenoh(ros, plan, section.domain) if name == "rmw_zenoh" else Ros2Dds(ros, plan.types)
-            profiles[name] = profile
-            stack.callback(profile.close)
-            if isinstance(profile, RmwZenoh):
-                stack.enter_context(ParameterServices(plan, mesh, keys).served_by(profile))
-                if section.interfaces is not None:
-                    services = SimulationServices(section.interfaces, plan.types, mesh, keys, settle)
-                    stack.enter_context(services.served_by(profile, plan.namespace))
-        yield profiles
 
 
 class Gateway:

@@ -1,4 +1,4 @@
-"""The link of a gateway to ROS: whether a bridge or router is there, and who else publishes `/clock`.
+"""The link of a gateway to ROS: its session and profiles, whether a bridge or router is there, who else has `/clock`.
 
 Owns a thread that watches the link, warns of each change once, and keeps the answer to `…/mesh/ros`. Nothing waits for
 this thread. A router does not pass tokens on between peers. So where the gateway is a peer, a second session, a client,
@@ -17,7 +17,8 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -26,14 +27,18 @@ from msgspec.structs import replace
 
 from ...config.mesh import RosConfig
 from ...errors import FmuMeshError
-from ...ros_wire.profile import ZenohProfile, topic_in
+from ...ros_wire.profile import Ros2Dds, ZenohProfile, topic_in
+from ...ros_wire.rmw_zenoh import RmwZenoh
+from ...ros_wire.topics import RosPlan
 from ...wire.keys import Keys, escape, unescape
 from ...wire.session import Wiring, close_session, is_of_this_host, open_session, undeclare_all
 from ...wire.values import json_encoding
 from ...wire.views import RosView
 from .deadline import Deadline
+from .parameter_services import ParameterServices
+from .simulation_services import SimulationServices
 
-__all__ = ["RosLink", "open_ros", "two_clocks"]
+__all__ = ["RosLink", "open_profiles", "open_ros", "two_clocks"]
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +81,28 @@ def open_ros(section: RosConfig, folder: Path) -> tuple[bool, zenoh.Session]:
         session = open_session(replace(client, connect=(at, *endpoints), patience_s=_OWN_S))
         router.close()
         return False, session
+
+
+@contextmanager
+def open_profiles(  # noqa: PLR0913, PLR0917  one gateway and its surroundings
+    section: RosConfig, ros: zenoh.Session, plan: RosPlan, mesh: zenoh.Session, keys: Keys, settle: Callable[[], None]
+) -> Iterator[dict[str, ZenohProfile]]:
+    """Open the profiles of a plan by name, that of the section first, and with rmw_zenoh the services.
+
+    ``settle`` waits until the mesh has all values that came before.
+    """
+    profiles: dict[str, ZenohProfile] = {}
+    with ExitStack() as stack:
+        for name in dict.fromkeys((section.profile, *(topic.profile for topic in plan.topics))):
+            profile = RmwZenoh(ros, plan, section.domain) if name == "rmw_zenoh" else Ros2Dds(ros, plan.types)
+            profiles[name] = profile
+            stack.callback(profile.close)
+            if isinstance(profile, RmwZenoh):
+                stack.enter_context(ParameterServices(plan, mesh, keys).served_by(profile))
+                if section.interfaces is not None:
+                    services = SimulationServices(section.interfaces, plan.types, mesh, keys, settle)
+                    stack.enter_context(services.served_by(profile, plan.namespace))
+        yield profiles
 
 
 def two_clocks(other: str, setting: str) -> str:
