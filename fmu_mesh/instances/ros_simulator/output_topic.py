@@ -15,7 +15,6 @@ from collections import deque
 from ...ros_wire.assembling import Disassembler
 from ...ros_wire.cdr import CdrError
 from ...ros_wire.definitions import MessageTypes
-from ...ros_wire.profile import Take
 from ...ros_wire.stamp import nanoseconds
 from ...ros_wire.topics import Topic
 from ...variables.model_description import Value
@@ -56,7 +55,6 @@ class OutputTopic:
     Attributes:
         name: of the topic.
         variables: of its fields.
-        take: takes a message, on any thread.
         values: of the message of the last point, by variable.
     """
 
@@ -70,11 +68,14 @@ class OutputTopic:
         self._disassembler = Disassembler(topic, types)
         # As a history in ROS: a simulator may publish while it is paused. Only those that are counted are all needed.
         self._waiting: deque[bytes] = deque(maxlen=topic.qos.depth)
-        self.take: Take = self._waiting.append
         self._at = -1  # the step that the values are of; before the first message, none
         self._is_silent = False
         self._in_order = False  # a message was used, so what follows it in the topic is no older one
         self._newest = ""
+
+    def take(self, data: bytes) -> None:
+        """On any thread: take a message. (rclpy asks for the signature of a callback; `append` has none.)"""
+        self._waiting.append(data)
 
     def begin(self, *, silent: bool) -> None:
         """Forget all messages so far; ``silent`` says that there is none for point 0."""
