@@ -74,8 +74,8 @@ class OutputTopic:
         self._newest = ""
 
     def take(self, data: bytes) -> None:
-        """On any thread: take a message. (rclpy asks for the signature of a callback; `append` has none.)"""
-        self._waiting.append(data)
+        """On any thread: take a message."""
+        self._waiting.append(data)  # whose signature rclpy would not find
 
     def begin(self, *, silent: bool) -> None:
         """Forget all messages so far; ``silent`` says that there is none for point 0."""
