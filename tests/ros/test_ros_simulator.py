@@ -91,7 +91,7 @@ def started(place: Place, port: int, step_size: float = STEP_SIZE, **ros: Any) -
         name="lab",
         instances={"plant": {"python": "plant.py:Plant"}},
         connections=(),
-        stop_time=100.0,
+        stop_time=1000.0,
         simulation={"step_size": step_size},
         ros={
             "profile": "rmw_zenoh",
