@@ -417,7 +417,7 @@ def real(ros: dict[str, str], **orders: Any) -> Iterator[Peer]:  # noqa: ANN401 
         yield peer
 
 
-@pytest.mark.parametrize("interpreter", [None, sys.executable], ids=["own", "another"])
+@pytest.mark.parametrize("interpreter", [None, sys.executable], ids=["own", "named"])
 def test_simulator_in_rclpy_gives_the_result_of_one_mesh(
     place: Place, ros: dict[str, str], interpreter: str | None
 ) -> None:

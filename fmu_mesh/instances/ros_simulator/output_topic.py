@@ -22,8 +22,6 @@ from .simulator_section import SimulatorTopicConfig
 
 __all__ = ["OutputTopic", "SimulatorTime", "WrongMessage"]
 
-_MOST_WAITING = 1 << 16
-
 
 class WrongMessage(Exception):
     """A message cannot be used, or shows that the simulator is not where it should be; the text says why."""
@@ -68,7 +66,8 @@ class OutputTopic:
         self._every = own.every
         self._time = time
         self._disassembler = Disassembler(topic, types)
-        self._waiting: deque[bytes] = deque()
+        # As a history in ROS: a simulator may publish while it is paused. Only those that are counted are all needed.
+        self._waiting: deque[bytes] = deque(maxlen=topic.qos.depth)
         self._at = -1  # the step that the values are of; before the first message, none
         self._is_silent = False
         self._in_order = False  # a message was used, so what follows it in the topic is no older one
@@ -76,8 +75,7 @@ class OutputTopic:
 
     def take(self, data: bytes) -> None:
         """On any thread: take a message."""
-        if len(self._waiting) <= _MOST_WAITING:
-            self._waiting.append(data)
+        self._waiting.append(data)  # whose signature rclpy would not find
 
     def begin(self, *, silent: bool) -> None:
         """Forget all messages so far; ``silent`` says that there is none for point 0."""
@@ -90,8 +88,9 @@ class OutputTopic:
         Raises:
             WrongMessage: a message is none of this type, or the simulator is beyond this step.
         """
-        if len(self._waiting) > _MOST_WAITING:
-            raise WrongMessage(f"{_MOST_WAITING:,} messages on '{self.name}' wait: is the simulator running by itself?")
+        if self._match == "count" and len(self._waiting) == self._waiting.maxlen:
+            text = f"{self._waiting.maxlen:,} messages on '{self.name}' wait, and more are lost"
+            raise WrongMessage(f"{text}: raise `depth` of the topic, if the simulator does not run by itself")
         wanted = step - step % self._every
         while self._waiting and (self._match == "newest" or self._at < wanted):
             try:
@@ -109,9 +108,8 @@ class OutputTopic:
 
     def missing(self) -> str:
         """In words what has not come."""
-        return f"no message of this point on '{self.name}'" + (
-            f"; the newest is {self._newest}" if self._newest else ""
-        )
+        newest = f"; the newest is {self._newest}" if self._newest else ""
+        return f"no message of this point on '{self.name}'{newest}"
 
     def _step_of(self, stamp: int, step: int) -> int:
         """The step of a message that has come in ``step`` with a stamp in ns."""

@@ -90,7 +90,7 @@ class SimulatorTopicConfig(Base, frozen=True, kw_only=True):
     frame_id: Annotated[str, Meta(description="frame_id of every header in the messages of inputs.")] = ""
     reliability: Annotated[Reliability, Meta(description="Reliability in ROS.")] = "reliable"
     durability: Annotated[Durability, Meta(description="Durability in ROS.")] = "volatile"
-    depth: Annotated[int, Meta(ge=1, le=100_000, description="History depth.")] = 1000
+    depth: Annotated[int, Meta(ge=1, le=100_000, description="History depth: messages that wait at most.")] = 1000
 
 
 class RosSimulatorConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="ros_simulator"):
