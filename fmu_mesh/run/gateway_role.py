@@ -43,14 +43,17 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
     with RunProcess(config.mesh, run.run) as process:
         stack = process.stack
         at, lease_s = _master_at(run, process), config.timeouts.link
-        mesh = open_session(Wiring(mode="client", connect=at, patience_s=patience_s, lease_s=lease_s))
+        client = Wiring(mode="client", connect=at, patience_s=patience_s, lease_s=lease_s)
+        # Two, because answers would queue behind the samples of a fast mesh.
+        mesh, asking = open_session(client), open_session(client)
         stack.callback(close_session, mesh)
+        stack.callback(close_session, asking)
         as_peer, ros = open_ros(section, process.folder)
         stack.callback(close_session, ros)
         keys = Keys(config.zenoh.key_prefix, config.mesh)
         gateway = Gateway(ros_plan, mesh, keys, run.plan.grid)
-        profiles = stack.enter_context(open_profiles(section, ros, ros_plan, mesh, keys, gateway.settle))
-        link = RosLink(section, ros, mesh, keys, profiles, clock=ros_plan.clock_points is not None, as_peer=as_peer)
+        profiles = stack.enter_context(open_profiles(section, ros, ros_plan, asking, keys, gateway.settle))
+        link = RosLink(section, ros, asking, keys, profiles, clock=ros_plan.clock_points is not None, as_peer=as_peer)
         stack.callback(link.close)
         link.open(gateway.ignored, gateway.deadlines)
         stack.callback(gateway.close)
