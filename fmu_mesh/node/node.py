@@ -559,12 +559,17 @@ class Node:
         profile = self._profiler.profile() if self._profiler is not None and error is None else None
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
         # After the last samples: the master routes them to clients, and ends when it has all reports.
-        self._membership.report(report, timeout_s, self._has_no_master, priority=PRIORITY)
+        self._membership.report(report, timeout_s, self._is_cut_off, priority=PRIORITY)
 
     def _tell_set(self, value: SetValue) -> None:
         """Tell the recorder which value another program has set."""
         if RECORDER in dict(self._plan.windows):
             self._put_set(encode_json(SET, value, value.point))
+
+    def _is_cut_off(self) -> bool:
+        """Whether no answer of the master can come: it is gone, or the link to its host has been silent too long."""
+        silent_s = self._clock() - self._heard if self._heard else 0.0
+        return (silent_s > self._plan.timeouts.link and not self._membership.master_runs) or self._has_no_master()
 
     def _has_no_master(self) -> bool:
         return self._token_went and self._membership.master_is_gone

@@ -21,7 +21,7 @@ import pytest
 import yaml
 
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.system.plan import RECORDER
+from fmu_mesh.system.plan import MASTER, RECORDER
 from tests.all_systems import SYSTEMS, written_system
 from tests.helpers import BY_STREAMS, FMUS, Launched, Place, row_count, wait_until
 from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_apart, two_hosts
@@ -100,10 +100,29 @@ def until_more_rows(mesh: Apart, times: int = 1) -> float:
     return time.monotonic() - begun
 
 
+UNREACHED = """
+import sys
+
+def refuse(event, arguments):
+    frame = sys._getframe(1) if event == "socket.connect" and isinstance(arguments[1], tuple) else None
+    while frame is not None:
+        if frame.f_locals.get("peer") == "{}":
+            raise ConnectionRefusedError
+        frame = frame.f_back
+
+sys.addaudithook(refuse)
+"""
+"""In each process: the door for row streams of one participant cannot be reached; Zenoh, which is no Python, can."""
+
+
 @contextmanager
-def running(folder: Path, name: str, zenoh: Mapping[str, bool], link_s: float = 30.0) -> Iterator[Apart]:
-    """A system that runs for `LASTS_S`, with some rows written."""
+def running(
+    folder: Path, name: str, zenoh: Mapping[str, bool], link_s: float = 30.0, *, unreached: str = ""
+) -> Iterator[Apart]:
+    """A system that runs for `LASTS_S`, with some rows written; the door of one participant may be ``unreached``."""
     with two_hosts(folder) as hosts:
+        if unreached:
+            (folder / "shared" / "sitecustomize.py").write_text(UNREACHED.format(unreached), encoding="utf-8")
         configs = [
             written_system(
                 name, host.folder / "own-clone" / CONFIG.parent, lasts_s=LASTS_S, zenoh=zenoh, timeouts={"link": link_s}
@@ -111,7 +130,8 @@ def running(folder: Path, name: str, zenoh: Mapping[str, bool], link_s: float = 
             for host in hosts
         ]
         nodes = [node for node in prepare(configs[0]).nodes if node != RECORDER]
-        mesh = Apart(hosts, configs[0], started_apart(hosts, CONFIG, nodes))
+        environment = {"PYTHONPATH": "/mnt"} if unreached else {}
+        mesh = Apart(hosts, configs[0], started_apart(hosts, CONFIG, nodes, environment=environment))
         wait_until(lambda: row_count(mesh.result) > 1 or not mesh.launched[0].running, "some rows")
         yield mesh
 
@@ -262,18 +282,28 @@ def test_a_stop_during_a_cut_ends_all_processes(tmp_path: Path, zenoh: Mapping[s
 
 
 @NEEDS_HOSTS
-@pytest.mark.parametrize("zenoh", [{}, BY_ZENOH], ids=["streams", "zenoh"])
-def test_a_cut_that_is_too_long_is_named_with_both_ends(tmp_path: Path, zenoh: Mapping[str, bool]) -> None:
-    with running(tmp_path, MAIN, zenoh, link_s=2.0) as mesh:
+@pytest.mark.parametrize(
+    ("zenoh", "unreached"), [({}, ""), (BY_ZENOH, ""), ({}, MASTER)], ids=["streams", "zenoh", "master-by-zenoh"]
+)
+def test_a_cut_that_is_too_long_is_named_with_both_ends(
+    tmp_path: Path, zenoh: Mapping[str, bool], unreached: str
+) -> None:
+    with running(tmp_path, MAIN, zenoh, link_s=2.0, unreached=unreached) as mesh:
         link_is(mesh.hosts[1], "down")
         begun = time.monotonic()
 
         assert [one.wait() for one in mesh.launched] == [4, 4, 4], mesh.story()
 
-        assert time.monotonic() - begun < 2.0 + SILENT_S + 2.0
+        assert time.monotonic() - begun < 2.0 + SILENT_S + 2.0, mesh.story()
         for one in mesh.launched:
             assert re.search(r"link.*node 'delay'|node 'delay'.*link", one.message), mesh.story()
             assert re.search(r"the master|node 'pendulum'", one.message), mesh.story()
+        told = (
+            ["WARNING: the master and node 'delay' cannot reach each other: their rows go by Zenoh"]
+            if unreached
+            else []
+        )
+        assert re.findall("WARNING: .*cannot reach.*", mesh.launched[0].errors) == told
 
 
 @NEEDS_HOSTS
