@@ -8,7 +8,7 @@ engines. It knows no kind.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar, cast
@@ -177,13 +177,6 @@ class InstanceSection:
             description: the model description.
             findings: where the findings go.
         """
-
-    def check_step(self, place: str, step_size: float, findings: Findings) -> None:
-        """Add a finding if an instance cannot take steps of ``step_size`` s; otherwise as `check`."""
-
-    def doubts(self) -> Iterator[tuple[str, str, str]]:
-        """What works and may not be meant: each the path of a key in this section, what is found, and what to do."""
-        yield from ()
 
     def summary(self, description: ModelDescription) -> str:
         """In a few words what computes the model, for the page of `fmu-mesh check`."""

@@ -262,8 +262,11 @@ def _instances(
         not_finite = loaded.config.not_finite(config)
         start_values = resolve_start_values(name, config, descriptions[name], findings, finite=not_finite == "stop")
         config.check(f"instances.{name}", descriptions[name], findings)
-        if math.isfinite(base) and base > 0.0:
-            config.check_step(f"instances.{name}", step_points * base, findings)
+        fixed, own = descriptions[name].fixed_step_size, step_points * base
+        is_fmu = descriptions[name].fmi_version != ""
+        if fixed is not None and not is_fmu and 0.0 < own < math.inf and not steps_between(0.0, own, fixed):
+            found = f"{own:.12g} s, no whole multiple of the {fixed:.12g} s that one step in '{name}' takes"
+            findings.add(f"instances.{name}.step_size", found, "a multiple of it")
         instances[name] = SystemInstance(
             name=name,
             fmu=str(loaded.resolve(config.path)) if config.path else "",
@@ -377,8 +380,8 @@ def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findin
         if (doubt := description.doubt_about_step(step)) is not None:
             expected = f"`step_size: {description.step_size or step:.12g}`, in `simulation` or for '{name}' alone"
             findings.add(f"instances.{name}.step_size", f"{doubt}; '{name}' may compute wrong values", expected)
-        for path, found, expected in section.doubts():
-            findings.add(f"instances.{name}.{path}", found, expected)
+        if description.not_repeatable is not None:
+            findings.add(place, description.not_repeatable, "")
         silent = [clock.name for clock in description.clocks if clock.never_ticks]
         if silent:
             found = f"triggered input clocks of '{name}' never tick, because clocks cannot be connected yet"

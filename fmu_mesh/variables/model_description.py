@@ -173,7 +173,9 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     Attributes:
         kind: a `Kind` of FMU, or in one word what the model is: physics_engine, controller, ...
         library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
-        fixed_step_size: that of its solver in s, if it has a fixed one (FMI 3.0, 4.3.1, fixedInternalStepSize).
+        fixed_step_size: that of its solver in s, if it has a fixed one (FMI 3.0, 4.3.1, fixedInternalStepSize). An FMU
+            may take other steps, with a warning; for what is no FMU they are refused.
+        not_repeatable: why two runs may differ, for a warning of `check`; None: they do not.
         states: the names of its continuous states, if it declares their derivatives (FMI 2.0, 2.2.8; FMI 3.0, 2.4.8).
     """
 
@@ -203,6 +205,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     problems: tuple[str, ...] = ()
     library: str | None = None
     fixed_step_size: float | None = None
+    not_repeatable: str | None = None
     states: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -48,10 +49,13 @@ def endpoint_of(launched: Launched) -> str:
 
 def ports(place: Place) -> list[str]:
     """The TCP and UDP ports of all processes that run here."""
+    found = []
+    for process in place.processes():
+        with suppress(psutil.NoSuchProcess):  # it has just ended
+            found += process.net_connections(kind="inet")
     return [
         f"{connection.laddr.ip}:{connection.laddr.port}"
-        for process in place.processes()
-        for connection in process.net_connections(kind="inet")
+        for connection in found
         if connection.status == psutil.CONN_LISTEN or not connection.raddr
     ]
 

@@ -382,7 +382,7 @@ def test_check_warns_of_a_topic_whose_newest_message_counts(place: Place) -> Non
     done = place.run("check", config)
 
     assert done.wait() == 0
-    assert "instances.plant.topics[0].match: the newest message on 'speed': the result may differ" in done.output
+    assert "instances.plant.ros_simulator: the newest message on speed: two runs may differ" in done.output
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to another user")

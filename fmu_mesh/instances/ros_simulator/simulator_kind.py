@@ -32,7 +32,7 @@ class RosSimulatorKind(Kind[RosSimulatorConfig]):
 
         if section.interpreter is not None:
             check_version(section.interpreter)
-        return SimulatorTopics.of(section).description
+        return SimulatorTopics.of(section).description(section.ros_simulator.step)
 
     def content(self, path: Path) -> str:
         """Empty: there is no file."""

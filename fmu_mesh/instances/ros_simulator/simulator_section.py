@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import msgspec
@@ -22,7 +21,6 @@ from ...config.instance_sections import (
     StepSize,
 )
 from ...config.ros_section import Durability, Reliability
-from ...simtime import steps_between
 from ...variables.model_description import ModelDescription
 
 __all__ = ["RosSimulatorConfig", "SimulatorConfig", "SimulatorTopicConfig"]
@@ -124,20 +122,6 @@ class RosSimulatorConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_f
             findings.add(f"{place}.ros_simulator.start_time", f"{own.start_time:g}", "a time >= 0 in s")
         if self.interpreter is not None and own.profile != "rclpy":
             findings.add(f"{place}.interpreter", f"with the profile {own.profile}", "the profile rclpy")
-
-    def check_step(self, place: str, step_size: float, findings: Findings) -> None:
-        """Add a finding if a step of this instance is no whole number of steps of the simulator."""
-        step = self.ros_simulator.step
-        if step > 0.0 and not steps_between(0.0, step_size, step):
-            found = f"{step_size:.12g} s, no whole multiple of the {step:.12g} s in `ros_simulator.step`"
-            findings.add(f"{place}.step_size", found, "a multiple of the step of the simulator")
-
-    def doubts(self) -> Iterator[tuple[str, str, str]]:
-        """Topics of outputs for which nothing says which message belongs to a point."""
-        for number, own in enumerate(self.topics):
-            if own.outputs and own.match == "newest":
-                found = f"the newest message on '{own.topic}': the result may differ from run to run"
-                yield f"topics[{number}].match", found, "stamp or count, where the simulator can be relied on for it"
 
     def summary(self, description: ModelDescription) -> str:
         """Where the simulator is."""

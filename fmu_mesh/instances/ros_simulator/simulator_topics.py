@@ -5,6 +5,7 @@ A field says which type its variable has. What cannot be read from messages, or 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 
@@ -66,9 +67,10 @@ class SimulatorTopics(msgspec.Struct, frozen=True):
             raise LoadFailed("; ".join(str(found).removeprefix(f"{_SECTION}: ") for found in findings))
         return cls(types, topics)
 
-    @property
-    def description(self) -> ModelDescription:
-        """The variables of all topics."""
+    def description(self, step_s: float) -> ModelDescription:
+        """The variables of all topics of a simulator whose own steps take ``step_s``."""
+        newest = [own.topic for _, own in self.topics if own.outputs and own.match == "newest"]
+        doubt = f"the newest message on {listed(newest)}: two runs may differ. Use stamp or count where you can"
         return ModelDescription(
             model_name="ros_simulator",
             model_identifier="ros_simulator",
@@ -78,6 +80,8 @@ class SimulatorTopics(msgspec.Struct, frozen=True):
             variables=tuple(port.variable for topic, _ in self.topics for port in topic.ports),
             description="simulator in ROS 2",
             generation_tool="simulation_interfaces",
+            fixed_step_size=step_s if 0.0 < step_s < math.inf else None,
+            not_repeatable=doubt if newest else None,
         )
 
 
