@@ -268,7 +268,7 @@ class Answers:
                 own = decode_value(bytes(value), variable, finite=runner.plan.not_finite == "stop")
             except ValueRefused as refused:
                 raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
-            values[f"{self._keys.instance(runner.name)}/{kind}/{escape(name)}"] = name, own
+            values[key if names else f"{key}/{escape(name)}"] = name, own
         try:
             return values, decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN
         except ValueRefused as refused:

@@ -114,8 +114,8 @@ class NodeServer:
             changed = partial(self._jobs.put, self._search)
             grid, declared = self._plan.grid, self._declared
             self._streams.append(InstanceStreams(runner, self._session, self._keys, grid, changed, declared))
-            for kind in ("in", "param"):
-                key = f"{self._keys.instance(runner.name)}/{kind}/**"  # of each variable, and of several at once
+            for root in (self._keys.variables(runner.name, "in"), self._keys.variables(runner.name, "param")):
+                key = f"{root}/**"  # of each variable, and of several at once
                 # On the thread that reads the link: what is put is a job before a query that came after it.
                 take = Callback(partial(self._answers.put_arrived, runner), indirect=False)
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))

@@ -53,7 +53,11 @@ class Keys(msgspec.Struct, frozen=True):
 
     def variable(self, instance: str, kind: VariableKind, variable: str) -> str:
         """Key of the value of one variable."""
-        return f"{self.root}/{instance}/{kind}/{escape(variable)}"
+        return f"{self.variables(instance, kind)}/{escape(variable)}"
+
+    def variables(self, instance: str, kind: VariableKind) -> str:
+        """Key on which several variables of an instance are set at one point; their own keys begin with it."""
+        return f"{self.root}/{instance}/{kind}"
 
     def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros"]) -> str:
         """A queryable of the master; `ros` begins the keys of the gateways to ROS."""

@@ -248,7 +248,7 @@ class Gateway:
         subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types))
         places: dict[str, dict[str, int]] = {}
         for place, port in enumerate(topic.ports):
-            places.setdefault(f"{self._keys.instance(port.instance)}/{port.kind}", {})[port.variable.name] = place
+            places.setdefault(self._keys.variables(port.instance, port.kind), {})[port.variable.name] = place
         for root, own in places.items():
             key = root if len(own) > 1 else f"{root}/{escape(*own)}"
             subscribed.inputs[key] = own
