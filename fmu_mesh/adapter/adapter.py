@@ -251,7 +251,8 @@ class FMIAdapter:
         """Add a value to the trajectory of an input: it is valid from ``time`` (caller's clock) on.
 
         Times may come in any order and lie any time ahead. Of several values for one time the last one counts. A past
-        time is accepted: its value holds from the next step on, unless a value with a later time is already used.
+        time, also one before the start, is accepted: its value holds from the next step on, unless a value with a later
+        time is already used.
 
         Raises:
             CallRefused: the adapter is closed, or the name, the type or the time is wrong.
@@ -275,7 +276,7 @@ class FMIAdapter:
             return
         when = self._on_fmu_clock(instant)
         if name not in self._trajectories:
-            self._begin_trajectory(name, initial=True)
+            self._begin_trajectory(name, initial=when > self._clock.resolution(0.0))
         self._trajectories[name].add(when, converted)
 
     def set_parameter_value(self, name: str, value: Value) -> None:

@@ -291,9 +291,8 @@ def test_a_gateway_that_somebody_else_ends_is_lost(place: Place) -> None:
     launched.child("gateway").terminate()
 
     assert launched.wait() == 4
-    said = launched.errors.splitlines()
-    assert "the gateway to ROS | fmu-mesh: SIGTERM was received" in said
-    assert "the gateway to ROS was lost: its process was asked to end by a signal" in said[-1]
+    said = launched.errors.splitlines()[-1]
+    assert "the gateway to ROS was lost: its process was asked to end by a signal" in said
     place.assert_nothing_left()
 
 

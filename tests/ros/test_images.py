@@ -195,12 +195,16 @@ def test_images_flow_both_ways_in_real_ros(ros: Ros, place: Place) -> None:
     ros.until(lambda: str(node.trigger_configure()).endswith("SUCCESS"), "the mesh")
     node.trigger_activate()
     ros.matched(pictures, scans, grids, masks, raster)
-    masks.publish(Image(data=MASK))
-    raster.publish(Image(data=[9, 8, 7, 255]))
 
-    ros.until(lambda: images and bytes(images[-1].data) == MASK[::-1], "the image")
-    ros.until(lambda: levels and list(levels[-1].data) == [255, 7, 8, 9], "the levels")
+    def turned() -> bool:
+        masks.publish(Image(data=MASK))  # again: only one of the two ends may have found the other
+        raster.publish(Image(data=[9, 8, 7, 255]))
+        image = images and bytes(images[-1].data) == MASK[::-1]
+        return bool(image and levels and list(levels[-1].data) == [255, 7, 8, 9])
+
+    ros.until(turned, "the image and the levels")
     assert (images[-1].width, images[-1].encoding, images[-1].header.frame_id) == (4, "mono8", "lens")
+    ros.until(lambda: clouds, "the point cloud")
     assert bytes(clouds[-1].data) == POINTS
     assert [own.name for own in clouds[-1].fields] == ["x", "y"]
 

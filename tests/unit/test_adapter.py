@@ -304,6 +304,17 @@ def test_late_value_holds_from_next_step_unless_later_one_is_in_use() -> None:
     assert (newer, older) == ([2.0], [2.0])
 
 
+def test_a_value_from_before_the_start_holds_although_it_comes_late(gain: FMIAdapter) -> None:
+    gain.set_initial_value("u", 2.0)
+    gain.exit_initialization_mode(10.0)
+    initial = inputs_seen(gain, 1)
+
+    gain.set_input_value("u", 9.0, 3.0)
+    gain.set_input_value("u", 8.0, 4.0)
+
+    assert (initial, inputs_seen(gain, 2)) == ([2.0], [3.0, 3.0])
+
+
 def test_a_trajectory_forgets_what_is_past(gain: FMIAdapter) -> None:
     gain.exit_initialization_mode(0.0)
     for k in range(2000):
