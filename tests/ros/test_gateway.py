@@ -220,7 +220,8 @@ def test_gateway_that_dies_ends_run_with_its_name_and_what_was_recorded(place: P
 
 
 def test_a_gateway_that_was_stopped_too_long_ends_the_run_by_name(place: Place, ros: Ros) -> None:
-    mesh = place.start("launch", configured(place, ros, factor=1, stop_time=600.0), "--no-progress")
+    config = configured(place, ros, factor=1, stop_time=600.0, timeouts={"link": 5.0})
+    mesh = place.start("launch", config, "--no-progress")
     wait_until(lambda: len(ros.floats("angle")) > 20, "samples")
     [gateway] = place.processes("gateway")
     links = len(mesh.child("master").net_connections(kind="unix"))
