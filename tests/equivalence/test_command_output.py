@@ -8,8 +8,9 @@ import pty
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -169,8 +170,13 @@ def test_a_quiet_command_still_tells_errors(place: Place) -> None:
     assert place.run("check", write_config(place.folder), "-q").output == ""
 
 
-def on_a_terminal(place: Place, *arguments: str | Path, **environment: str) -> bytes:
-    """All that a command writes to a terminal."""
+def on_a_terminal(
+    place: Place,
+    *arguments: str | Path,
+    environment: Mapping[str, str] = MappingProxyType({}),
+    looked: Callable[[bytes], object] = len,
+) -> bytes:
+    """All that a command writes to a terminal; ``looked`` is called with what it has written, whenever that is more."""
     own, other = pty.openpty()
     with subprocess.Popen(
         [sys.executable, "-m", "fmu_mesh", *map(str, arguments)],
@@ -184,6 +190,7 @@ def on_a_terminal(place: Place, *arguments: str | Path, **environment: str) -> b
         written = b""
         while data := _read(own):
             written += data
+            looked(written)
         assert process.wait(DEADLINE_S) == 0, written
     os.close(own)
     return written
@@ -207,18 +214,22 @@ def messages_of(place: Place) -> Path:
 def test_no_color_leaves_no_escape_sequence_on_a_terminal(
     place: Place, environment: Mapping[str, str], *, escapes: bool
 ) -> None:
-    written = on_a_terminal(place, "launch", messages_of(place), **environment)
+    written = on_a_terminal(place, "launch", messages_of(place), environment=environment)
 
     assert b"warning: whoever can reach this host" in written
     assert (b"\x1b" in written) == escapes
 
 
 def test_no_color_makes_top_print_plain_tables(place: Place) -> None:
-    config = write_config(place.folder, stop_time=6.0, simulation=PACED)
-    place.start("launch", config, "-q")
+    config = write_config(place.folder, stop_time=3600.0, simulation=PACED)
+    launched = place.start("launch", config, "-q")
     place.run("wait")
 
-    written = on_a_terminal(place, "top", "--interval", "0.1", NO_COLOR="1")
+    def stop_after_two(written: bytes) -> None:
+        if launched.running and written.count(b"pair: running") > 1:
+            place.run("stop")
+
+    written = on_a_terminal(place, "top", "--interval", "0.1", environment={"NO_COLOR": "1"}, looked=stop_after_two)
 
     assert written.count(b"pair: running") > 1
     assert b"\x1b" not in written

@@ -20,7 +20,7 @@ need("sensor_msgs")
 
 URDF = '<robot name="arm"><link name="base"/></robot>\n'
 JOINTS = "sensor_msgs/msg/JointState"
-WIDTH, HEIGHT = 640, 480
+WIDTH, HEIGHT = 160, 120  # in fragments, but so few that no buffer of a loaded host loses one
 
 
 class Robot:
