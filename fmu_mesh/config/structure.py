@@ -12,6 +12,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
+from inspect import cleandoc
 from types import NoneType
 from typing import Any
 
@@ -122,9 +123,11 @@ def json_schema(config_type: type[msgspec.Struct]) -> dict[str, object]:
 
 
 def _without_kinds(config: dict[str, Any], definitions: dict[str, Any]) -> None:
-    """Remove the tag of the instance sections: the program adds it after it has read a file."""
+    """Remove the tag of the instance sections, which the program adds after it has read a file, and indentation."""
     del config["properties"]["instances"]["additionalProperties"]["discriminator"]
     for section in definitions.values():
+        if "description" in section:
+            section["description"] = cleandoc(section["description"])  # msgspec does it from 0.23 on
         if section["properties"].pop(KIND, None) is not None:
             section["required"].remove(KIND)
 
