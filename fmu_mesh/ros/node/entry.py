@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rclpy.try_shutdown()
         return ConfigurationError.exit_code
     try:
-        with _autostart(node, executor):
+        with _autostart(node, executor), _ctrl_c_is_never_told():
             rclpy.spin(node, executor)
     except (KeyboardInterrupt, executors.ExternalShutdownException):
         pass
@@ -200,6 +200,22 @@ def _deadline(what: str, exit_code: int) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+@contextmanager
+def _ctrl_c_is_never_told() -> Iterator[None]:
+    """Says nothing of a Ctrl-C in a callback of the garbage collector, where Python drops it; rclpy ends ROS then."""
+    told = sys.unraisablehook
+
+    def tell(dropped: Any) -> None:  # noqa: ANN401 its type is private to Python
+        if not isinstance(dropped.exc_value, KeyboardInterrupt):
+            told(dropped)
+
+    sys.unraisablehook = tell
+    try:
+        yield
+    finally:
+        sys.unraisablehook = told
 
 
 @contextmanager
