@@ -112,7 +112,7 @@ def json_schema(config_type: type[msgspec.Struct]) -> dict[str, object]:
     config["properties"]["connections"]["items"] = {
         "anyOf": [_SHORT_CONNECTION, config["properties"]["connections"]["items"]]
     }
-    _without_kinds(config, definitions)
+    _as_in_a_file(config, definitions)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": SCHEMA_ID,
@@ -122,7 +122,7 @@ def json_schema(config_type: type[msgspec.Struct]) -> dict[str, object]:
     }
 
 
-def _without_kinds(config: dict[str, Any], definitions: dict[str, Any]) -> None:
+def _as_in_a_file(config: dict[str, Any], definitions: dict[str, Any]) -> None:
     """Remove the tag of the instance sections, which the program adds after it has read a file, and indentation."""
     del config["properties"]["instances"]["additionalProperties"]["discriminator"]
     for section in definitions.values():
