@@ -98,6 +98,7 @@ class KeyOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     field: str | None = None
     factor: float = 1.0
     offset: float = 0.0
+    map: dict[str, PlainValue] = {}
     blocks: bool = False
 
     def __str__(self) -> str:
@@ -239,6 +240,11 @@ class _Resolving(msgspec.Struct):
         if variable.causality == "independent":
             add(f"{path}.from", f"'{entry.source}', the time", "another variable; each value has its time")
         self._check_factors(entry, variable, path)
+        if entry.map and entry.encoding in ("cdr", "float64"):
+            add(f"{path}.map", f"a map with `encoding: {entry.encoding}`", "json or text")
+        units = self.variables, self.unit_of, self.findings
+        change = unit_change(entry.unit, variable, path, *units, outwards=True) or Linear()
+        both = change.then(Linear(entry.factor, entry.offset))
         if len(self.findings) == before:
             yield KeyOutput(
                 variable=variable.name,
@@ -249,8 +255,9 @@ class _Resolving(msgspec.Struct):
                 encoding=entry.encoding,
                 type=entry.type,
                 field=entry.field,
-                factor=entry.factor,
-                offset=entry.offset,
+                factor=both.factor,
+                offset=both.offset,
+                map=dict(entry.map),
                 blocks=entry.congestion == "block",
             )
 
@@ -321,7 +328,7 @@ class _Resolving(msgspec.Struct):
             self.findings.add(
                 f"{path}.encoding", f"float64 for the {variable.type_name} '{variable.name}'", "a Float64"
             )
-        if changes and isinstance(entry, KeyInputConfig) and entry.map:
+        if changes and entry.map:
             self.findings.add(f"{path}.map", "a map, and factor and offset", "one of the two")
 
     def _map(self, entry: KeyInputConfig, variable: Variable, path: str) -> dict[str, PlainValue]:
