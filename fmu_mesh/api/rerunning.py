@@ -8,6 +8,7 @@ every float is the same as before, however long each process takes.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,6 +109,7 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     path = Path(result)
     first = Result.read(path)
     metadata, values = _metadata_of(path, first)
+    keys = first.metadata.get("keys")
     if not allow_code:
         check_owner(path, f"'{path}'")
     output = Path(options.output) if options.output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
@@ -124,6 +126,7 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     plan = mesh.plan(
         real_time_factor=0.0,
         paused=bool(values) or last_point is not None,
+        keys_from=path.parent / keys if keys is not None else os.devnull,
         allow_code=allow_code,
         on_notice=on_notice,
     )
@@ -138,6 +141,7 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
 def _metadata_of(path: Path, result: Result) -> tuple[RunMetadata, list[SetValue]]:
     entries = dict(result.metadata)
     values = entries.pop(_SET, [])
+    entries.pop("keys", None)
     if "configuration" not in entries:
         beside = f"The file '{path.name}.json' beside it says it." if path.suffix.lower() != ".parquet" else None
         raise ConfigurationError(f"'{path}' does not say how it was made", hint=beside)

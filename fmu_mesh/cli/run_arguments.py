@@ -159,7 +159,7 @@ PARSERS: Parsers = {
             "instead of what CONFIG says, for all runs",
             options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
         ),
-        options("allow_code"),
+        options("keys_from", "allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
     ),

@@ -89,7 +89,7 @@ CONFIGURED = (
             "connect",
         ),
     ),
-    options("allow_code"),
+    options("keys_from", "allow_code"),
 )
 """The argument CONFIG, and the flags that replace what CONFIG says."""
 

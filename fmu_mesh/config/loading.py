@@ -48,7 +48,7 @@ _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
 _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
 
 _PLACEHOLDERS: Final[dict[str, Plain]] = {
-    "connections": {"from": "", "to": ""},
+    "connections": {KIND: "connection", "from": "", "to": ""},
     "record": {"file": None},
     r"record(\[\d+\])?\.variables": "",
     r"scenario\.events": {"at": math.inf, "set": {}},
@@ -243,21 +243,22 @@ def _text(path: Path, findings: Findings) -> str:
 
 
 def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[str, Plain]:
-    """``data`` with every connection in the long form. An invalid one is a finding and gets empty ends."""
+    """``data`` with every connection in the long form, and its kind. A wrong one is a finding and gets empty ends."""
     connections = data.get("connections")
     if not isinstance(connections, list):
         return data
     written: list[Plain] = []
     for index, connection in enumerate(connections):
         if isinstance(connection, dict):
-            written.append(connection)
+            with_key = "key_output" if "from" in connection else "key_input"
+            written.append({**connection, KIND: with_key if "key" in connection else "connection"})
             continue
         ends = [end.strip() for end in connection.split(_ARROW)] if isinstance(connection, str) else []
         if len(ends) == 2 and all(ends):
-            written.append({"from": ends[0], "to": ends[1]})
+            written.append({KIND: "connection", "from": ends[0], "to": ends[1]})
         else:
             findings.add(f"connections[{index}]", shown(connection), _SHORT_FORM, _arrow_meant(connection))
-            written.append({"from": "", "to": ""})
+            written.append(_PLACEHOLDERS["connections"])
     return {**data, "connections": written}
 
 
@@ -397,7 +398,11 @@ def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
             return []
         pairs = zip(value, places_of_items, strict=True)
         kept = [placeholder if place in wrong else _without(item, wrong, place) for item, place in pairs]
-        return [{**_mapping(placeholder), **item} if isinstance(item, dict) else item for item in kept]
+        filling = _mapping(placeholder)
+        return [
+            {**filling, **item} if isinstance(item, dict) and item.get(KIND) == filling.get(KIND) else item
+            for item in kept
+        ]
     return value
 
 

@@ -14,7 +14,8 @@ import msgspec
 from msgspec import Meta
 
 from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
-from fmu_mesh.config.instance_sections import InstanceSection, PhysicsSection
+from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection
+from fmu_mesh.config.key_sections import KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
 from fmu_mesh.config.scenario_section import ScenarioConfig
 
@@ -120,7 +121,7 @@ class LimitsConfig(Base, frozen=True, kw_only=True):
     description_bytes: Annotated[int, Meta(ge=1, description="Largest modelDescription.xml, in bytes.")] = 64 * 2**20
 
 
-class ConnectionConfig(Base, frozen=True, kw_only=True):
+class ConnectionConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="connection"):
     """One connection from an output to an input; the short form is `a.y -> b.u`."""
 
     source: Annotated[
@@ -330,7 +331,10 @@ class Config(Base, frozen=True, kw_only=True):
             "null: every instance without a group has a node of its own."
         ),
     ] = None
-    connections: Annotated[list[ConnectionConfig], Meta(description="From which output to which input values go.")] = []
+    connections: Annotated[
+        list[ConnectionConfig | KeyInputConfig | KeyOutputConfig],
+        Meta(description="From which output to which input values go; at one end there may be a Zenoh key."),
+    ] = []
     initialization: InitializationConfig = InitializationConfig()
     record: Annotated[
         RecordConfig | list[RecordConfig],
@@ -355,6 +359,15 @@ class Config(Base, frozen=True, kw_only=True):
     ] = False
     ros: Annotated[RosConfig | None, Meta(description="Topics for ROS 2; null: none.")] = None
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """By the name of each input with a connection, right or wrong: the source instance, or the key in words."""
+        return {
+            one.target: f"key {one.key}" if isinstance(one, KeyInputConfig) else one.source.partition(".")[0]
+            for one in self.connections
+            if not isinstance(one, KeyOutputConfig)
+        }
 
     @property
     def records(self) -> dict[str, RecordConfig]:

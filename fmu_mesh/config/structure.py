@@ -123,8 +123,9 @@ def json_schema(config_type: type[msgspec.Struct]) -> dict[str, object]:
 
 
 def _as_in_a_file(config: dict[str, Any], definitions: dict[str, Any]) -> None:
-    """Remove the tag of the instance sections, which the program adds after it has read a file, and indentation."""
+    """Remove the tags of sections, which the program adds after it has read a file, and indentation."""
     del config["properties"]["instances"]["additionalProperties"]["discriminator"]
+    del config["properties"]["connections"]["items"]["anyOf"][1]["discriminator"]
     for section in definitions.values():
         if "description" in section:
             section["description"] = cleandoc(section["description"])  # msgspec does it from 0.23 on

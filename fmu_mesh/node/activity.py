@@ -17,6 +17,7 @@ from ..wire.views import InstanceStatus
 from ..wire.ways import Ways
 from .engine import Engine
 from .inputs import TimedInputs
+from .key_ends import KeyEnds
 from .stepping import Runner
 
 __all__ = ["Activity"]
@@ -42,15 +43,16 @@ class Activity:
         self._clock = AwakeClock()
         self._engine: Engine | None = None
         self._keeper: StreamKeeper | None = None
+        self._keys: KeyEnds | None = None
         self._under_way: tuple[str, int, float] | None = None
 
     def enter(self, state: str) -> None:
         """From now on the node is in this state."""
         self.state = state
 
-    def serve(self, runners: Mapping[str, Runner]) -> None:
-        """All instances are loaded."""
-        self.runners = runners
+    def serve(self, runners: Mapping[str, Runner], keys: KeyEnds) -> None:
+        """All instances are loaded; these are the keys at ends of their connections."""
+        self.runners, self._keys = runners, keys
 
     def steps_with(self, engine: Engine, ways: Ways, keeper: StreamKeeper | None) -> None:
         """The instances are at their first point, and this engine steps them; the keeper is that of its row streams."""
@@ -81,6 +83,7 @@ class Activity:
             refused=self._refusals.count,
             timed_out=late,
             running_time=time.monotonic() - self._started if engine is not None else 0.0,
+            keys=self._keys.statuses(name) if self._keys is not None else (),
         )
 
     def look_at_steps(self) -> StepFailed | None:
@@ -120,7 +123,9 @@ class Activity:
         current = self._engine.current if self._engine is not None else None
         if current is None:
             cut = self._keeper.cut_in_words(self._plan.node) if self._keeper is not None else ()
-            return "; ".join((f"waiting at point {runner.point} for {runner.waits_for}", *cut))
+            key = self._keys.waits_for(runner.name) if self._keys is not None and not any(runner.lacking) else None
+            what = f"a value of {key}" if key is not None else runner.waits_for
+            return "; ".join((f"waiting at point {runner.point} for {what}", *cut))
         if current is not runner:
             return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"
         now = self._clock()

@@ -6,7 +6,8 @@ Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from types import MappingProxyType
 from typing import Literal
 
@@ -18,13 +19,16 @@ from ..instances.call_guard import Guarded
 from ..instances.contract import Instance, KeepsState, LogMessage
 from ..instances.input_trajectory import Trajectory
 from ..instances.instance_wrapper import AroundNativeSteps
+from ..results.keys_file import recorded_values
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.input_timeouts import InputTimeout, LastValues
+from ..system.live_keys import KeyValue
 from ..system.plan import InstancePlan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
 from ..variables.model_description import Value
+from ..variables.value_conversion import to_value
 from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
 from .stepping import Runner
@@ -48,6 +52,8 @@ class TimedInputs(AroundNativeSteps):
 
     Args:
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
+        linear: the inputs that are linear in any case.
+        recorded: what has come by keys in an earlier run, in the order of its points.
         warn: called with the first fallback of each input.
 
     Attributes:
@@ -57,15 +63,20 @@ class TimedInputs(AroundNativeSteps):
         tracks_from: the own step of the first of these values.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  all that may give values
         self,
         instance: Instance,
         interpolation: Literal["hold", "linear"],
         courses: Mapping[str, Course] = MappingProxyType({}),
         timeouts: Sequence[InputTimeout] = (),
         warn: Callable[[LogMessage], None] = lambda _message: None,
+        *,
+        linear: AbstractSet[str] = frozenset(),
+        recorded: Iterable[KeyValue] = (),
     ) -> None:
         super().__init__(instance)
+        self._recorded = iter(recorded)
+        self._next = next(self._recorded, None)
         self._last = LastValues(timeouts, courses, instance.description)
         self._warn, self._unwarned = warn, {own.variable: own for own in timeouts}
         self.late: dict[str, int] = {}
@@ -77,6 +88,7 @@ class TimedInputs(AroundNativeSteps):
         self._set_in_step = instance.set_in_step if isinstance(instance, Guarded) else instance.set_values
         self._courses = courses
         self._linear = interpolation == "linear"
+        self._linear_names = linear
         self._trajectories: dict[str, Trajectory] = {}
         self._used: dict[str, Value] = {}
         self._grid: TimeGrid  # from `start` on
@@ -126,7 +138,8 @@ class TimedInputs(AroundNativeSteps):
         if name not in self._trajectories:
             variable = self.description.variable(name)
             is_input = variable is not None and variable.causality == "input"
-            linear = self._linear and variable is not None and is_input and is_float(variable.type)
+            real = variable is not None and is_input and is_float(variable.type)
+            linear = real and (self._linear or name in self._linear_names)
             trajectory = Trajectory(linear=linear)
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
@@ -151,6 +164,13 @@ class TimedInputs(AroundNativeSteps):
     def _set_changes(self, step: int) -> None:
         """Set what changes in own step ``step``."""
         time = self._time(step)
+        while self._next is not None and self._next[1] <= step * self._points:
+            name = self._next[0].partition(".")[2]
+            variable = self.description.variable(name)
+            assert variable is not None  # the plan has it
+            self._step = step
+            self.add(name, to_value(self._next[3], variable), self._next[2])
+            self._next = next(self._recorded, None)
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
         if self._last.sent:
             changes |= self._fall_back(step, time)
@@ -195,7 +215,8 @@ class TimedInputs(AroundNativeSteps):
             and self._courses[name].first_step <= step
         ]
         others = [change for name, change in changes.items() if name not in soon]
-        sent = min(self._next_sent(step), self._last.next(step))
+        recorded = self._next[1] // self._points if self._next is not None else ENDLESS
+        sent = min(self._next_sent(step), self._last.next(step), recorded)
         end = min([*others, sent, step + _AHEAD])
         self.tracks, self._tracked, self.tracks_from = [], [], step
         if not soon or end - step < _SOON:
@@ -227,13 +248,18 @@ def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid, warn: Cal
     """The instance as its plan wants it: with what a scenario prescribes, and with inputs that follow times.
 
     Raises:
-        ConfigurationError: a table of the scenario cannot be read, or has changed since the run was planned.
+        ConfigurationError: a table of the scenario, or the values of keys of an earlier run, cannot be read, or have
+            changed since the run was planned.
     """
     interpolation = plan.section.interpolation
-    if interpolation is None and not plan.scenario and not plan.timeouts:
+    if interpolation is None and not plan.scenario and not plan.timeouts and not plan.keys_in:
         return instance
     courses = courses_of(plan.scenario, instance.description, grid, plan.step_points)
-    return TimedInputs(instance, interpolation or "hold", courses, plan.timeouts, warn)
+    linear = {own.variable for own in plan.keys_in if own.linear}
+    recorded = recorded_values(plan.recorded_keys, plan.name) if plan.recorded_keys is not None else ()
+    return TimedInputs(
+        instance, interpolation or "hold", courses, plan.timeouts, warn, linear=linear, recorded=recorded
+    )
 
 
 def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:

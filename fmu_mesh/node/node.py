@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 
 import zenoh
@@ -38,6 +38,7 @@ from ..errors import (
 from ..instances.contract import Instance, LogMessage
 from ..rings.host_memory import ONE_CORE, HostMemory
 from ..rings.row_streams import RowStreams
+from ..system.live_keys import KeyValue
 from ..system.plan import MASTER, RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver, SourceRows, of_text
 from ..wire.inbox import Inbox, Message
@@ -50,6 +51,7 @@ from ..wire.messages import (
     GRANT,
     HEADER,
     INITIAL,
+    KEYS,
     PROGRESS,
     RESET,
     SET,
@@ -318,11 +320,12 @@ class Node:
         told = {name: counter for name, counter in self._own_memory.progress.items() if name in targets}
         known = {"ring": self._memory.progress, "stream": told}
         ways_of = {name: ways.way(node, name) if name != node else "ring" for name, _ in self._plan.windows}
-        return [
+        nodes = [
             (name, counters[name], window)
             for name, window in self._plan.windows
             if name in (counters := known.get(ways_of[name], {}))
         ]
+        return [*nodes, *self.server.keys.windows]
 
     def _open_streams(self, meeting: Meeting, mirrors: Mapping[int, SourceRows]) -> None:
         """Use the sockets to those that were met; from now on each side notices if the other is silent."""
@@ -393,6 +396,7 @@ class Node:
             if self._token_went and not self._membership.master_runs:
                 self._end_without_master()
             self._membership.check_silence(self._clock() - self._heard)
+            self.server.keys.check(self._memory.grant.value, self._clock())
 
     def _end_early(self, engine: Engine, asked: TerminationRequested | NotFinite) -> None:
         """An FMU ends the simulation: its unit stops stepping, and the master ends the run at its point."""
@@ -561,10 +565,11 @@ class Node:
         # After the last samples: the master routes them to clients, and ends when it has all reports.
         self._membership.report(report, timeout_s, self._is_cut_off, priority=PRIORITY)
 
-    def _tell_set(self, value: SetValue) -> None:
-        """Tell the recorder which value another program has set."""
+    def _tell_set(self, value: SetValue | Sequence[KeyValue]) -> None:
+        """Tell the recorder which value another program has set, or which have come by keys."""
         if RECORDER in dict(self._plan.windows):
-            self._put_set(encode_json(SET, value, value.point))
+            kind, point = (SET, value.point) if isinstance(value, SetValue) else (KEYS, value[-1][1])
+            self._put_set(encode_json(kind, value, point))
 
     def _is_cut_off(self) -> bool:
         """Whether no answer of the master can come: it is gone, or the link to its host has been silent too long."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 
@@ -17,6 +17,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from ..errors import FmuError
+from ..system.live_keys import KeyValue
 from ..system.plan import NodePlan
 from ..wire.inbox import Inbox
 from ..wire.keys import SUBSCRIBED, Keys
@@ -26,6 +27,7 @@ from ..wire.values import json_encoding
 from ..wire.views import LogLine
 from .activity import Activity
 from .answering import Answers, Job
+from .key_ends import KeyEnds
 from .stepping import Runner
 from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams
 
@@ -62,7 +64,10 @@ class NodeServer:
 
     Args:
         on_hang: called on the server thread if a step does not return in time.
-        tell: tells the recorder, if there is one, which value was set; on the main thread.
+        tell: tells the recorder, if there is one, which value was set, or which have come by keys; on the main thread.
+
+    Attributes:
+        keys: the Zenoh keys at ends of connections.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
@@ -72,12 +77,12 @@ class NodeServer:
         inbox: Inbox,
         activity: Activity,
         on_hang: Callable[[FmuError], None],
-        tell: Callable[[SetValue], None],
+        tell: Callable[[SetValue | Sequence[KeyValue]], None],
     ) -> None:
         self._on_hang = on_hang
         self._plan = plan
         self._session = session
-        self._keys = Keys(plan.key_prefix, plan.mesh)
+        self._names = Keys(plan.key_prefix, plan.mesh)
         self._inbox = inbox
         self._activity = activity
         self._streams: list[InstanceStreams] = []
@@ -86,6 +91,7 @@ class NodeServer:
         self._next_search = 0.0
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self.keys = KeyEnds(plan, session, inbox.post, self.log_message, tell)
         self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log, tell)
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
@@ -109,12 +115,13 @@ class NodeServer:
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
         """From now on values can be read and set, and streams can be subscribed."""
-        self._activity.serve(runners)
+        self.keys.serve(runners)
+        self._activity.serve(runners, self.keys)
         for runner in runners.values():
             changed = partial(self._jobs.put, self._search)
             grid, declared = self._plan.grid, self._declared
-            self._streams.append(InstanceStreams(runner, self._session, self._keys, grid, changed, declared))
-            for root in (self._keys.variables(runner.name, "in"), self._keys.variables(runner.name, "param")):
+            self._streams.append(InstanceStreams(runner, self._session, self._names, grid, changed, declared))
+            for root in (self._names.variables(runner.name, "in"), self._names.variables(runner.name, "param")):
                 key = f"{root}/**"  # of each variable, and of several at once
                 # On the thread that reads the link: what is put is a job before a query that came after it.
                 take = Callback(partial(self._answers.put_arrived, runner), indirect=False)
@@ -122,12 +129,13 @@ class NodeServer:
 
     @property
     def is_followed(self) -> bool:
-        """Whether some streams have subscribers."""
-        return any(streams.is_active for streams in self._streams)
+        """Whether somebody gets rows by samples: some streams have subscribers, or rows go to keys."""
+        return self.keys.publishes or any(streams.is_active for streams in self._streams)
 
     def stepped(self) -> None:
-        """Give new rows to the streams that have subscribers."""
-        for streams in self._streams:
+        """Give new rows to the streams that have subscribers, and to keys."""
+        self.keys.publish_now()
+        for streams in (*self.keys.lossy, *self._streams):
             if (batch := streams.collect(self._waiting_rows)) is not None:
                 self._waiting_rows += len(batch[1])
                 self._jobs.put(partial(self._publish_rows, batch))
@@ -135,6 +143,7 @@ class NodeServer:
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
         self._answers.begin()
+        self.keys.begin()
         looked = threading.Event()
 
         def look() -> None:
@@ -164,6 +173,7 @@ class NodeServer:
         undeclare_all(self._entities, self._status_publishers.values(), self._log_publishers.values())
         for streams in self._streams:
             streams.close()
+        self.keys.close()
 
     # --- the thread
 
@@ -184,7 +194,8 @@ class NodeServer:
 
     def _tick(self, now: float) -> None:
         self._answers.turn(now)
-        for streams in self._streams:
+        self.keys.look(now)
+        for streams in (*self.keys.lossy, *self._streams):
             if dropped := streams.take_dropped():
                 text = f"{dropped} points were not published: the run is faster than samples can be sent"
                 self._publish_log(LogLine(streams.runner.name, "warning", "stream", text, streams.runner.point))
@@ -200,7 +211,7 @@ class NodeServer:
         session = self._session
         try:
             for name in (instance.name for instance in self._plan.instances):
-                root = self._keys.instance(name)
+                root = self._names.instance(name)
                 self._entities.append(session.liveliness().declare_token(root))
                 take = self._inbox.refusals.answering(partial(self._answer, name), self._jobs.put)
                 self._entities.append(session.declare_queryable(f"{root}/**", take))
@@ -230,7 +241,7 @@ class NodeServer:
         self._jobs.put(said.set)
         said.wait(_LAST_WORDS_S)
         if heard:
-            next(iter(self._session.get(self._keys.mesh_key("status"), timeout=_LAST_WORDS_S)), None)
+            next(iter(self._session.get(self._names.mesh_key("status"), timeout=_LAST_WORDS_S)), None)
 
     def _search(self) -> None:
         """Go on looking for new subscribers: Zenoh reports only the first one of an instance, and when all are gone."""

@@ -24,7 +24,7 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
-__all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "VariableKeys", "kind_of"]
+__all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "RowsFor", "VariableKeys", "kind_of"]
 
 # Threads: the main thread calls `update`, `collect` and reads `_active`; the thread of the server calls `look`,
 # `look_at` and `publish`, and owns `_wanted` and `_search`; a thread of Zenoh calls `changed`, which only puts a job.
@@ -67,17 +67,17 @@ class Picked(NamedTuple):
     Attributes:
         part: the array of the ring that has them.
         elements: their elements there.
-        keys: of each variable its key, the number of its elements, and its shape.
+        keys: of each variable its key, or what else it is for, the number of its elements, and its shape.
     """
 
     ring: Ring
     part: int
     elements: NDArray[np.intp]
-    keys: list[tuple[zenoh.KeyExpr, int, tuple[int, ...]]]
+    keys: list[tuple[Any, int, tuple[int, ...]]]
 
 
-Batch = tuple["InstanceStreams", NDArray[np.intp], list[tuple[Picked, NDArray[Any]]]]
-"""Streams, own steps, and their rows."""
+Batch = tuple["RowsFor", NDArray[np.intp], list[tuple[Picked, NDArray[Any]]]]
+"""Who publishes them, own steps, and their rows."""
 
 
 def kind_of(variable: Variable) -> VariableKind | None:
@@ -114,7 +114,58 @@ class VariableKeys:
                 yield key, variable
 
 
-class InstanceStreams:
+class RowsFor:
+    """Hands the rows of one instance to whoever publishes the values of some of its variables."""
+
+    def __init__(self, runner: Runner) -> None:
+        self.runner = runner
+        self._dropped = self._next = 0
+        self._active: Mapping[str, Any] = {}
+        self._picked: list[Picked] = []
+
+    def _pick(self, wanted: Mapping[str, Any]) -> None:
+        """On the main thread, between steps: from now on read these variables, which are in rings."""
+        if not self._active:
+            self._next = self.runner.step
+        self._active = wanted
+        rings = [ring for ring in (self.runner.outputs, self.runner.watched) if ring is not None]
+        self._picked = [picked for ring in rings for picked in _picked(ring, wanted)]
+
+    @property
+    def is_active(self) -> bool:
+        """On the main thread: whether `collect` has something to do."""
+        return bool(self._active)
+
+    def collect(self, waiting_rows: int) -> Batch | None:
+        """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
+        end, watched = self.runner.step + 1, self.runner.watched
+        first = max(self._next, end - (watched.rows if watched is not None else end))
+        if not self._active or first >= end:
+            return None
+        self._dropped += first - self._next
+        self._next = end
+        watched = self.runner.watched
+        kept = min(self.runner.outputs.rows, watched.rows if watched is not None else end)
+        self._dropped += max(0, end - kept - first)
+        first = max(first, end - kept)  # older rows are overwritten
+        if waiting_rows > min(MAX_WAITING_ROWS, _MAX_WAITING_VALUES // len(self._active)):
+            self._dropped += end - first
+            return None
+        steps = np.arange(first, end)
+        rows = [(own, own.ring.parts[own.part][np.ix_(steps & own.ring.mask, own.elements)]) for own in self._picked]
+        return self, steps, rows
+
+    def publish(self, steps: NDArray[np.intp], blocks: list[tuple[Picked, NDArray[Any]]]) -> None:
+        """Publish what `collect` returned."""
+        raise NotImplementedError
+
+    def take_dropped(self) -> int:
+        """Number of rows that were dropped since the last call."""
+        dropped, self._dropped = self._dropped, 0
+        return dropped
+
+
+class InstanceStreams(RowsFor):
     """The streams of one instance.
 
     One publisher for all variables tells whether somebody may listen. Only then `look` finds out to what, so that
@@ -132,17 +183,13 @@ class InstanceStreams:
         changed: Callable[[], None],
         declared: dict[str, zenoh.KeyExpr],
     ) -> None:
-        self.runner = runner
+        super().__init__(runner)
         self._session = session
         self._keys = VariableKeys(keys, runner)
         self._declared = declared
-        self._dropped = 0
         self._grid = grid
-        self._next = 0
         self._wanted: dict[str, zenoh.KeyExpr] = {}
         self._search: tuple[list[str], Iterator[str | None]] | None = None
-        self._active: dict[str, zenoh.KeyExpr] = {}
-        self._picked: list[Picked] = []
         self._publisher = session.declare_publisher(
             self._keys.every, priority=PRIORITY, allowed_destination=zenoh.Locality.REMOTE
         )
@@ -223,35 +270,7 @@ class InstanceStreams:
         watched = tuple(name for name in active if name not in self.runner.outputs.layout)
         if {*watched} != {*(self.runner.watched.layout.names if self.runner.watched is not None else ())}:
             self.runner.watch(watched)
-        if not self._active:
-            self._next = self.runner.step
-        self._active = active
-        rings = [ring for ring in (self.runner.outputs, self.runner.watched) if ring is not None]
-        self._picked = [picked for ring in rings for picked in _picked(ring, active)]
-
-    @property
-    def is_active(self) -> bool:
-        """On the main thread: whether `collect` has something to do."""
-        return bool(self._active)
-
-    def collect(self, waiting_rows: int) -> Batch | None:
-        """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
-        end, watched = self.runner.step + 1, self.runner.watched
-        first = max(self._next, end - (watched.rows if watched is not None else end))
-        if not self._active or first >= end:
-            return None
-        self._dropped += first - self._next
-        self._next = end
-        watched = self.runner.watched
-        kept = min(self.runner.outputs.rows, watched.rows if watched is not None else end)
-        self._dropped += max(0, end - kept - first)
-        first = max(first, end - kept)  # older rows are overwritten
-        if waiting_rows > min(MAX_WAITING_ROWS, _MAX_WAITING_VALUES // len(self._active)):
-            self._dropped += end - first
-            return None
-        steps = np.arange(first, end)
-        rows = [(own, own.ring.parts[own.part][np.ix_(steps & own.ring.mask, own.elements)]) for own in self._picked]
-        return self, steps, rows
+        self._pick(active)
 
     def publish(self, steps: NDArray[np.intp], blocks: list[tuple[Picked, NDArray[Any]]]) -> None:
         """On the server's thread: publish what `collect` returned."""
@@ -271,17 +290,12 @@ class InstanceStreams:
                     put(key, encode_value(nested(row[first : first + size], shape)), attachment=stamp)
                     first += size
 
-    def take_dropped(self) -> int:
-        """Number of rows that were dropped since the last call."""
-        dropped, self._dropped = self._dropped, 0
-        return dropped
-
     def close(self) -> None:
         """Undeclare the publisher."""
         undeclare_all([self._listener, self._publisher])
 
 
-def _picked(ring: Ring, keys: Mapping[str, zenoh.KeyExpr]) -> Iterator[Picked]:
+def _picked(ring: Ring, keys: Mapping[str, Any]) -> Iterator[Picked]:
     for number, part in enumerate(ring.layout.parts):
         found = [(keys[column.name], ring.layout.place(column.name)) for column in part.columns if column.name in keys]
         if found:

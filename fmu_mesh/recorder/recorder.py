@@ -46,6 +46,7 @@ from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
 from ..simtime import ENDLESS
+from ..system.live_keys import KeyValue
 from ..system.plan import RECORDER, Link, NodePlan
 from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
@@ -58,6 +59,7 @@ from ..wire.messages import (
     GRANT,
     HEADER,
     INITIAL,
+    KEYS,
     LAST,
     PROGRESS,
     RESET,
@@ -264,6 +266,9 @@ class Recorder:
         if kind == SET:
             self._files.note(to_builtins(decode_json(data[HEADER.size :], SetValue)))
             return
+        if kind == KEYS:
+            self._files.keep(decode_json(data[HEADER.size :], list[KeyValue]))
+            return
         source = self._sources.get(number)
         if source is None or source.link.source_node != sender:
             raise MessageRefused(f"there is no link {number} from it to the recorder")
@@ -331,7 +336,7 @@ class Recorder:
                 if left <= 0 or not self._rows_are_missing():
                     return
                 message = self._inbox.wait(left)
-            if message is not None and message[1] in (FRAME, LAST, SET):
+            if message is not None and message[1] in (FRAME, LAST, SET, KEYS):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:

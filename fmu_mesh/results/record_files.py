@@ -13,6 +13,7 @@ import os
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, open_alone, unwritable
 from ..simtime import TimeGrid
+from ..system.live_keys import KeyValue
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
 from .formats import reading, required_format
 from .growth import GrowthWatch, ReadColumn
+from .keys_file import KeysFile, keys_beside
 from .recording import Recording, ResultFile
 
 __all__ = ["ReadColumn", "RecordFiles", "open_result", "open_results", "rows_left", "what_is_kept"]
@@ -86,6 +89,7 @@ class RecordFiles:
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
+        self._keys = KeysFile(files[0].path) if files else None
         self._files = [
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)
             for number, file in enumerate(files)
@@ -120,11 +124,28 @@ class RecordFiles:
         """
         if self._growth is not None:
             self._growth.look(first, end)
+        if self._keys is not None:
+            self._keep(self._keys.begin)
         self._each(lambda own: own.write(first, end))
 
     def note(self, entry: Mapping[str, Any]) -> None:
         """Add what happened to the metadata of all files; the errors are those of `write`."""
         self._each(lambda own: own.file.note(entry))
+
+    def keep(self, values: Sequence[KeyValue]) -> None:
+        """Keep values that have come by keys, beside the first file; the errors are those of `write`."""
+        if self._keys is not None:
+            self._keep(partial(self._keys.add, values))
+
+    def _keep(self, write: Callable[[], str | None]) -> None:
+        first = self._files[0].file.path
+        try:
+            name = write()
+        except OSError as error:
+            raise unwritable(keys_beside(first), error) from error
+        if name is not None:
+            for own in self._files:
+                own.file.note({"keys": os.path.relpath(first.with_name(name), own.file.path.parent)})
 
     def flush(self) -> None:
         """Give all rows to the operating system; the errors are those of `write`."""
@@ -132,6 +153,8 @@ class RecordFiles:
 
     def close(self) -> None:
         """Close all files. Nothing happens if they are closed. The errors are those of `write`."""
+        if self._keys is not None:
+            self._keys.close()
         self._raise_first([(own, own.close()) for own in self._files])
 
     def _each(self, call: Callable[[_RecordFile], None]) -> None:

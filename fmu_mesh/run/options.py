@@ -48,6 +48,10 @@ class VariantOptions(CallOptions, frozen=True, kw_only=True):
     window: Annotated[int | Literal["auto"] | None, Option(None, "--window", "N", "simulation.window")] = None
     start_values: StartValues = None
     config_values: Annotated[Values, Option("values of any keys by their path", "--set-config", "KEY=VALUE")] = None
+    keys_from: Annotated[
+        File,
+        Option("take the values of keys from this result of an earlier run, and no others", "--keys-from", "RESULT"),
+    ] = None
     allow_code: AllowCode = False
     on_notice: OnNotice = None
 

@@ -25,12 +25,14 @@ from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
 from ..instances.registry import check_showing, claims, content, describe, expected_model
 from ..results.formats import check_record, warn_of_endings
+from ..results.keys_file import KEYS_ENDING, keys_beside, recorded_keys
+from ..ros_wire.key_messages import check_messages
 from ..system.plan import make_plan
 from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
 from ..system.run_metadata import configuration_of
 from ..system.scenario import Scenario
-from ..system.system import build
+from ..system.system import ResolvedSystem, build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
 from ..variables.value_types import PlainValue
@@ -39,7 +41,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "planned", "planned_reset"]
+__all__ = ["KnownModels", "planned", "planned_reset", "without_keys"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -168,7 +170,11 @@ def planned(
         path = loaded.resolve(own.path) if own.path else Path()
         return known.claims(path, own, descriptions[name], loaded.config.limits)
 
-    system = build(loaded, descriptions, findings, scenario, claimed, obstacles, partial(check_record, loaded))
+    checked = partial(check_record, loaded)
+    system = build(loaded, descriptions, findings, scenario, claimed, obstacles, checked, base_unit_of)
+    check_messages(loaded.config, system, obstacles)
+    if options.keys_from is not None:
+        system = _repeated(system, Path(options.keys_from))
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
@@ -218,6 +224,23 @@ def _without_start_values(run: RunPlan) -> object:
         )
         for name, node in run.plan.nodes.items()
     }
+
+
+def _repeated(system: ResolvedSystem, result: Path) -> ResolvedSystem:
+    """The system with the values of keys of an earlier run, and without keys of its own."""
+    known = result.name.endswith(KEYS_ENDING) or not result.is_file() or str(result) == os.devnull
+    recorded = recorded_keys(result if known else keys_beside(result))
+    alone = {name: replace(own, keys_out=()) for name, own in system.instances.items()}
+    return replace(system, instances=alone, recorded_keys=recorded)
+
+
+def without_keys(run: RunPlan) -> RunPlan:
+    """The plan without keys at ends of connections, for a program that sets inputs itself: they are free."""
+    system = run.plan.system
+    free = {name: replace(own, keys_in=(), keys_out=()) for name, own in system.instances.items()}
+    if free == system.instances:
+        return run
+    return replace(run, plan=make_plan(replace(system, instances=free), contents=run.contents))
 
 
 def _scenario(

@@ -24,7 +24,15 @@ from typing import Literal, NamedTuple
 from msgspec.structs import replace
 
 from ..config.mesh import TimeoutsConfig
-from ..errors import FmuError, FmuMeshError, Interrupted, NotFinite, ProtocolBroken, TerminationRequested
+from ..errors import (
+    ConfigurationError,
+    FmuError,
+    FmuMeshError,
+    Interrupted,
+    NotFinite,
+    ProtocolBroken,
+    TerminationRequested,
+)
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import KeptModels
@@ -124,6 +132,7 @@ class RepeatedRuns:
                 that were recorded before are kept.
         """
         try:
+            _check_keys(run.plan)
             if self._around.open_instance is None:
                 self._process.check(run.plan, run.contents)
             with closing(RowWriter(open_files(), GrowthWatch(run.plan))) as writer:
@@ -395,6 +404,19 @@ class _Run:
             runner.follow(native.MemberTable())
         self._runners.clear()
         self._engine = None
+
+
+def _check_keys(plan: Plan) -> None:
+    """Refuse a run in one process whose inputs get the values of keys: it has no session of Zenoh.
+
+    Raises:
+        ConfigurationError: there is such an input, and no earlier run to take its values from.
+    """
+    fed = {name: own.keys_in for name, own in plan.system.instances.items() if own.keys_in}
+    for name, keys in fed.items() if plan.system.recorded_keys is None else ():
+        what = f"'{name}.{keys[0].variable}' gets its values by the key '{keys[0].key}'"
+        hint = "Run it in processes, or take the values of an earlier run with `keys_from=...`."
+        raise ConfigurationError(f"{what}, which needs processes with Zenoh", hint=hint)
 
 
 def _in_one_node(plan: Plan, files: int) -> Plan:

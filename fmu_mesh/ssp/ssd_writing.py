@@ -214,6 +214,7 @@ class _Writer:
     def _connection(self, parent: XmlNode, connection: Connection) -> None:
         index = int(connection.path.removeprefix("connections[").rstrip("]"))
         config = self._system.config.connections[index]
+        assert isinstance(config, ConnectionConfig)
         self._check_ends(connection)
         attributes = {
             "startElement": self._names.elements[connection.source_instance],

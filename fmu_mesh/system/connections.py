@@ -13,6 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.key_sections import KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.system.value_map import checked_items, resolve_map
 from fmu_mesh.text import listed, nearest, with_article
@@ -104,13 +105,15 @@ class Connection(msgspec.Struct, frozen=True):
 
 
 def resolve_connections(
-    configs: Sequence[ConnectionConfig], variables: Variables, findings: Findings
+    configs: Sequence[ConnectionConfig | KeyInputConfig | KeyOutputConfig], variables: Variables, findings: Findings
 ) -> tuple[Connection, ...]:
     """All connections whose ends exist and fit; the others are findings."""
     connections: list[Connection] = []
     sources: dict[str, tuple[str, ConnectionConfig]] = {}
     for index, config in enumerate(configs):
         path = f"connections[{index}]"
+        if not isinstance(config, ConnectionConfig):
+            continue  # a key at one end: `live_keys`
         if not config.source and not config.target:
             findings.add(path, "no ends", "instance.output -> instance.input")
             continue

@@ -74,7 +74,7 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     connections = (*explicit, *coupled_connections(engines, variables, explicit, ignored))
     driven = {f"{c.target_instance}.{c.target.name}": _FREE for c in connections}
     # Also the target of a connection whose source does not exist.
-    driven |= {connection.target: _FREE for connection in config.connections}
+    driven |= dict.fromkeys(config.sources, _FREE)
     for name, engine in engines.items():
         for actuator in engine.actuators:
             if actuator.enabled:

@@ -6,7 +6,7 @@ Owns the synchronization model (docs/architecture.md) as data. The plan is a pur
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
@@ -26,6 +26,7 @@ from .initialization_plan import InitializationPlan, Loop, check_loops, plan_ini
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
+from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
@@ -54,6 +55,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         finite: those of ``outputs`` that end the run where they are not finite.
         not_finite: what it means; `record` also allows to set such values.
         timeouts: what its inputs do without a value.
+        keys_in: the variables that get the values of keys; ``keys_out``: those whose values go to keys.
+        recorded_keys: where the values of keys come from instead.
     """
 
     name: str
@@ -74,6 +77,9 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     finite: tuple[str, ...] = ()
     not_finite: Literal["stop", "record"] = "stop"
     timeouts: tuple[InputTimeout, ...] = ()
+    keys_in: tuple[KeyInput, ...] = ()
+    keys_out: tuple[KeyOutput, ...] = ()
+    recorded_keys: RecordedKeys | None = None
 
     @property
     def input_row(self) -> Layout:
@@ -82,8 +88,9 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def sources(self) -> dict[str, str]:
-        """The source instance of each input that is connected, or of which an element is."""
-        return {self.inputs.column(own.target).name: feed.source for feed in self.feeds for own in feed.columns}
+        """What feeds each input that is connected, or of which an element is: an instance, or a key in words."""
+        fed = {self.inputs.column(own.target).name: feed.source for feed in self.feeds for own in feed.columns}
+        return fed | {own.variable: f"key {own.key}" for own in self.keys_in}
 
     def check_settable(self, variable: Variable) -> None:
         """Check that a variable may be set between two steps.
@@ -242,7 +249,7 @@ def make_plan(
     initialization = plan_initialization(system, connections)
     descriptions = {name: own.description for name, own in system.instances.items()}
     check_loops(initialization, connections, descriptions, findings)
-    outputs = _output_layouts(system, connections)
+    outputs = system.output_layouts(connections)
     points = window_of(system.config.simulation.window if window is None else window, outputs.values())
     plan = Plan(
         system=system,
@@ -273,6 +280,7 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
                     fmu="",
                     section=instance.section.agreed(),
                     scenario=tuple(schedule.agreed() for schedule in instance.scenario),
+                    recorded_keys=None,
                 )
                 for instance in node.instances
             ),
@@ -303,7 +311,10 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
-        shared = any(name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles)
+        waits = any(own.wait for name in members for own in system.instances[name].keys_in)
+        shared = waits or any(
+            name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles
+        )
         links_in = tuple(link for link in links if link.target_node == node)
         nodes[node] = NodePlan(
             mesh=config.mesh,
@@ -314,7 +325,9 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
-            batch=1 if shared else max(1, plan.window // 16),  # a cycle over several nodes waits for each row
+            batch=1
+            if shared
+            else max(1, plan.window // 16),  # a cycle over several nodes, or another program, waits for each row
             memory=memory,
             rings=tuple(
                 places[name]
@@ -349,21 +362,6 @@ def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ..
     return units
 
 
-def _output_layouts(system: ResolvedSystem, connections: Iterable[Connection]) -> dict[str, Layout]:
-    """Connected outputs and recorded variables of each instance, in the order of its model description."""
-    instances = system.instances
-    wanted: dict[str, set[str]] = {name: set() for name in instances}
-    for c in connections:
-        if not c.initial_only:
-            wanted[c.source_instance].add(c.source.name)
-    for instance, variable in system.recorded:
-        wanted[instance].add(system.base_of(instance, variable))
-    return {
-        name: Layout.of(variable for variable in own.description.variables if variable.name in wanted[name])
-        for name, own in instances.items()
-    }
-
-
 def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> InstancePlan:
     stepped = [c for c in plan.connections if c.target_instance == instance.name and not c.initial_only]
     initial = [c for c in plan.connections if c.target_instance == instance.name and c.initial_only]
@@ -396,6 +394,9 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         finite=checked if instance.not_finite == "stop" else (),
         not_finite=instance.not_finite,
         timeouts=instance.timeouts,
+        keys_in=instance.keys_in,
+        keys_out=instance.keys_out,
+        recorded_keys=plan.system.recorded_keys if instance.keys_in else None,
     )
 
 

@@ -181,7 +181,7 @@ def scenario_files(loaded: LoadedConfig, system: ResolvedSystem) -> dict[str, st
 def configuration_of(loaded: LoadedConfig) -> dict[str, Any]:
     """The values of a configuration file that says what this configuration says, with every key; JSON can hold them."""
     data: dict[str, Any] = msgspec.to_builtins(loaded.config, enc_hook=str)
-    for section in data["instances"].values():
+    for section in (*data["instances"].values(), *data["connections"]):
         section.pop(KIND, None)  # it follows from the keys
     finite: dict[str, Any] = _finite(data)
     return finite

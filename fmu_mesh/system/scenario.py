@@ -19,12 +19,13 @@ from ..config.findings import Findings
 from ..config.scenario_section import ScenarioSource, ScenarioValues
 from ..errors import Finding
 from ..simtime import TimeGrid
-from ..text import listed, shown, with_article
+from ..text import listed, shown
 from ..variables.model_description import Value, Variable
-from ..variables.units import BaseUnit, Linear, conversion
+from ..variables.units import BaseUnit, Linear
 from ..variables.value_conversion import FINITE, ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue, is_float
 from .connections import Variables, offered, resolve_variable
+from .given_units import changed, type_in_words, unit_change
 from .schedule import Course, Schedule, SeriesFile
 from .series_files import SeriesRefused, columns_of, content_of, course_of, read_series
 from .start_values import why_not_settable
@@ -248,10 +249,10 @@ class _Resolving(msgspec.Struct):
         automatic = "linear" if can_be_linear and variable.variability == "continuous" else "hold"
         linear = (automatic if given.interpolation == "auto" else given.interpolation) == "linear"
         if linear and not can_be_linear:
-            found = f"linear for '{reference}', {_what(variable)}"
+            found = f"linear for '{reference}', {type_in_words(variable)}"
             self.findings.add(f"{path}.interpolation", found, "hold; inputs of type Real may be linear")
             return None
-        change = self._unit(given.unit, variable, path)
+        change = unit_change(given.unit, variable, path, self.variables, self.scenario.unit_of, self.findings)
         if change is None or not self._keys_fit(given, path):
             return None
         if given.file is None:
@@ -347,43 +348,13 @@ class _Resolving(msgspec.Struct):
     ) -> PlainValue | None:
         """A value in the unit of the variable; None after a finding."""
         try:
-            return to_plain(to_value(_changed(plain, change), variable))
+            return to_plain(to_value(changed(plain, change), variable))
         except ValueRefused as refused:
             found = f"{shown(plain)}{where} for the {variable.type_name} '{variable.name}'"
             if refused.out_of_range:
                 found = f"{shown(plain)}{where} for '{variable.name}', which is out of its range"
             self.findings.add(path, found, refused.expected, refused.suggestion)
             return None
-
-    def _unit(self, unit: str | None, variable: Variable, path: str) -> Linear | None:
-        """What brings values into the unit of a variable; None after a finding."""
-        if unit is None or unit == variable.unit:
-            return _UNCHANGED
-        if not is_float(variable.type):
-            self.findings.add(f"{path}.unit", f"a unit for '{variable.name}', {_what(variable)}", "no unit here")
-            return None
-        base = self._base_unit(unit)
-        if base is None:
-            self.findings.add(f"{path}.unit", f"the unknown unit '{unit}'", f"a unit such as {variable.unit or 'N.m'}")
-        elif variable.base_unit is None:
-            what = f"its model does not define '{variable.unit}'" if variable.unit else "it has no unit"
-            found = f"'{unit}' for '{variable.name}', which cannot be converted: {what}"
-            self.findings.add(f"{path}.unit", found, "values in the unit of the variable, and no unit here")
-        else:
-            change = conversion(base, variable.base_unit, relative=variable.relative_quantity)
-            if change is not None:
-                return change
-            found = f"'{unit}' ({base}) for '{variable.name}' in {variable.unit} ({variable.base_unit})"
-            self.findings.add(f"{path}.unit", found, "a unit of the same dimension")
-        return None
-
-    def _base_unit(self, unit: str) -> BaseUnit | None:
-        """A unit as a model of this mesh defines it, or by its usual name."""
-        for own in self.variables.values():
-            for variable in (own or {}).values():
-                if variable.unit == unit and variable.base_unit is not None:
-                    return variable.base_unit
-        return self.scenario.unit_of(unit)
 
     # --- the run
 
@@ -419,16 +390,3 @@ class _Resolving(msgspec.Struct):
         elif not entry.variable.settable_before_start:
             found = f"a value of '{name}' at the start, {entry.variable.role} that cannot be set before the start"
             self.findings.add(entry.path, found, f"values after {self.grid.start_time:g} s")
-
-
-def _changed(plain: PlainInput, change: Linear) -> PlainInput:
-    if change.identity:
-        return plain
-    if isinstance(plain, list):
-        return [_changed(one, change) for one in plain]
-    is_number = isinstance(plain, int | float) and not isinstance(plain, bool)
-    return change.factor * plain + change.offset if is_number else plain
-
-
-def _what(variable: Variable) -> str:
-    return f"{with_article(variable.causality)} of type {variable.type_name}"

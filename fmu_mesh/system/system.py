@@ -7,7 +7,8 @@ model descriptions are arguments: this module knows neither FMPy nor Zenoh.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from functools import partial
 from typing import Literal
 
@@ -26,7 +27,9 @@ from fmu_mesh.system.connections import Connection, Variables, resolve_connectio
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.input_timeouts import InputTimeout
+from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import check_extrapolation
+from fmu_mesh.system.live_keys import KeyInput, KeyOutput, RecordedKeys, resolve_keys
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
@@ -34,6 +37,7 @@ from fmu_mesh.system.schedule import Schedule
 from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
+from fmu_mesh.variables.units import BaseUnit
 from fmu_mesh.variables.value_conversion import ValueRefused, to_plain, to_value
 
 __all__ = ["Connection", "ResolvedSystem", "SystemInstance", "build"]
@@ -51,6 +55,7 @@ class SystemInstance(msgspec.Struct, frozen=True):
         node: name of its node (process): its group, that of its cycle (`group: auto`), or its own name.
         not_finite: what an output that is NaN or infinite means.
         timeouts: what its inputs do without a value.
+        keys_in: the variables that get the values of keys; ``keys_out``: those whose values go to keys.
     """
 
     name: str
@@ -62,6 +67,8 @@ class SystemInstance(msgspec.Struct, frozen=True):
     scenario: tuple[Schedule, ...] = ()
     not_finite: Literal["stop", "record"] = "stop"
     timeouts: tuple[InputTimeout, ...] = ()
+    keys_in: tuple[KeyInput, ...] = ()
+    keys_out: tuple[KeyOutput, ...] = ()
 
 
 class ResolvedSystem(msgspec.Struct, frozen=True):
@@ -73,6 +80,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         warnings: findings that do not prevent a run, such as connections between different units.
         scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
         topics: those in ROS.
+        recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
     """
 
     config: Config
@@ -83,6 +91,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     warnings: tuple[Finding, ...] = ()
     scenario_files: dict[str, str] = {}
     topics: tuple[MeshTopic, ...] = ()
+    recorded_keys: RecordedKeys | None = None
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
@@ -96,6 +105,22 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         """The variable of a column or of an end of a connection, which may be an element of an array, as `y[1,2]`."""
         variable = self.instances[instance].description.variable_of(name)
         return variable.name if variable is not None else name
+
+    def output_layouts(self, connections: Iterable[Connection]) -> dict[str, Layout]:
+        """What is read of each instance after a step: connected outputs, and what is recorded or goes to keys.
+
+        In the order of its model description.
+        """
+        wanted = {name: {sent.variable for sent in own.keys_out} for name, own in self.instances.items()}
+        for c in connections:
+            if not c.initial_only:
+                wanted[c.source_instance].add(c.source.name)
+        for instance, variable in self.recorded:
+            wanted[instance].add(self.base_of(instance, variable))
+        return {
+            name: Layout.of(variable for variable in own.description.variables if variable.name in wanted[name])
+            for name, own in self.instances.items()
+        }
 
     @property
     def result_file(self) -> str | None:
@@ -111,6 +136,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     claims: ClaimsOf = lambda _name: {},
     obstacles: Findings | None = None,
     check_record: CheckRecord = lambda *_: None,
+    unit_of: Callable[[str], BaseUnit | None] = lambda _name: None,
 ) -> ResolvedSystem:
     """Resolve every name of a configuration.
 
@@ -124,6 +150,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
         obstacles: where findings go that prevent a run on this host, and not its plan, such as a missing package; None:
             to the others. An error has them, too.
         check_record: what the format of each result file says about it; its findings are obstacles.
+        unit_of: the meaning of a unit by its usual name; None if it is not known.
 
     Raises:
         ConfigurationError: there are findings; it has all of them.
@@ -149,11 +176,13 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
         obstacles.explain(collected.places)
     of_files = collected if obstacles is None else obstacles
     records = resolve_records(loaded, variables, grid, collected, of_files, check_record)
-    sources = {c.target: c.source.partition(".")[0] for c in config.connections}  # also those of wrong connections
-    sources |= {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
+    connected = {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
+    keys_in, keys_out = resolve_keys(config, variables, connected, unit_of, collected)
+    sources = config.sources | connected  # also those of wrong connections
+    free = {f"{name}.{own.variable}" for name, inputs in keys_in.items() for own in inputs}
     base = grid.step_size if grid is not None else 1.0
     timeouts = {
-        name: tuple(_timeouts(own, config, sources, base, collected))
+        name: tuple(_timeouts(own, config, sources.keys() - free, base, collected))
         for name, own in instances.items()
         if config.instances[name].inputs
     }
@@ -180,6 +209,8 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
                 replace(one, every=(name, one.variable) in timed) for one in prescribed.schedules.get(name, ())
             ),
             timeouts=timeouts.get(name, ()),
+            keys_in=keys_in.get(name, ()),
+            keys_out=keys_out.get(name, ()),
         )
         for name, own in instances.items()
     }
@@ -280,7 +311,7 @@ def _instances(
 
 
 def _timeouts(
-    instance: SystemInstance, config: Config, sources: Mapping[str, str], base: float, findings: Findings
+    instance: SystemInstance, config: Config, sources: AbstractSet[str], base: float, findings: Findings
 ) -> Iterator[InputTimeout]:
     """What the inputs of an instance do without a value; ``sources`` has those that are connected."""
     inputs = {v.name: v for v in instance.description.with_causality("input")}

@@ -1,16 +1,17 @@
 """The messages of the synchronization, as bytes.
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
-four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), in an ABORT an `ErrorReport` as
-JSON, in a SET a `SetValue` as JSON, for the recorder, in a RESET a `NewStart` as JSON. LAST says that no more rows of a
-link come, because the run has ended early. Every decoder checks sizes before it reads anything, and raises only
-`MessageRefused`.
+four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), and in these as JSON: in an ABORT an
+`ErrorReport`, in a RESET a `NewStart`, and for the recorder in a SET a `SetValue`, and in a KEYS values that have come
+by keys. LAST says that no more rows of a link come, because the run has ended early. Every decoder checks sizes before
+it reads anything, and raises only `MessageRefused`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
+from collections.abc import Sequence
 from typing import Final, TypeVar
 
 import msgspec
@@ -18,6 +19,7 @@ import msgspec
 from ..errors import ErrorReport, MessageRefused
 from ..files import decoded_json
 from ..system.input_timeouts import InputTimeout
+from ..system.live_keys import KeyValue
 from ..variables.value_types import PlainValue
 from .time_profile import NodeProfile
 
@@ -29,6 +31,7 @@ __all__ = [
     "GRANT",
     "HEADER",
     "INITIAL",
+    "KEYS",
     "LAST",
     "MAX_MESSAGE_SIZE",
     "PROGRESS",
@@ -55,6 +58,7 @@ ALIVE: Final = 10
 """Only in a row stream: its sender lives."""
 
 RESET: Final = 11
+KEYS: Final = 12
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
@@ -117,8 +121,8 @@ def sealed(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-def encode_json(kind: int, content: ErrorReport | NewStart | SetValue, point: int = 0) -> bytes:
-    """An ABORT, RESET or SET message."""
+def encode_json(kind: int, content: ErrorReport | NewStart | SetValue | Sequence[KeyValue], point: int = 0) -> bytes:
+    """An ABORT, RESET, SET or KEYS message."""
     return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
 
 

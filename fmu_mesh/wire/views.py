@@ -20,6 +20,8 @@ __all__ = [
     "ConnectionView",
     "InstanceInfo",
     "InstanceStatus",
+    "KeyStatus",
+    "KeyView",
     "LogLine",
     "MeshInfo",
     "MeshState",
@@ -92,6 +94,47 @@ class ConnectionView(msgspec.Struct, frozen=True):
         return {"stream": "row stream", "zenoh": "Zenoh"}.get(self.way or "", "")
 
 
+class KeyView(msgspec.Struct, frozen=True):
+    """One Zenoh key at an end of a connection, in `info`.
+
+    Attributes:
+        direction: `in`: the values of the key are for the variable; `out`: those of the variable go to the key.
+        rule: when a value takes effect, or when there is one, in words.
+    """
+
+    key: str
+    direction: Literal["in", "out"]
+    variable: str
+    encoding: str
+    rule: str
+
+
+class KeyStatus(msgspec.Struct, frozen=True):
+    """What has come by a key, or gone to it, in `status`.
+
+    Attributes:
+        received: number of samples; for an output, of those that were published.
+        replaced: those that a newer one replaced before the next point.
+        refused: those that are no value for the variable.
+        late: those that came after their time.
+        disordered: those for an earlier time than the one before them.
+        lost: those that were too many at once.
+        rate: samples per second of wall-clock time.
+        age: wall-clock time since the last one in s; None before the first.
+    """
+
+    key: str
+    variable: str
+    received: int = 0
+    replaced: int = 0
+    refused: int = 0
+    late: int = 0
+    disordered: int = 0
+    lost: int = 0
+    rate: float = 0.0
+    age: float | None = None
+
+
 class InstanceInfo(msgspec.Struct, frozen=True):
     """Answer of `…/<instance>/info`."""
 
@@ -112,6 +155,7 @@ class InstanceInfo(msgspec.Struct, frozen=True):
     host: str
     problems: tuple[str, ...]
     clocks: tuple[Clock, ...] = ()
+    keys: tuple[KeyView, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.variables), 'variable')}, {counted(len(self.connections), 'connection')}"
@@ -130,6 +174,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         running_time: wall-clock time since the first point in s.
         refused: messages that its process refused: malformed ones, and those of unknown senders.
         timed_out: the inputs without a value for longer than their timeout, and the points of their last values.
+        keys: what has come by keys of connections, and gone to them.
     """
 
     instance: str
@@ -144,6 +189,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     running_time: float = 0.0
     refused: int = 0
     timed_out: dict[str, int] = {}
+    keys: tuple[KeyStatus, ...] = ()
 
     def rates_since(self, before: InstanceStatus | None) -> tuple[float, float, float]:
         """Points per second, and the shares of the time in steps and waiting, since an earlier status.

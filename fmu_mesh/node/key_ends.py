@@ -1,0 +1,130 @@
+"""The Zenoh keys at ends of connections of one node: what they limit, and what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import zenoh
+from zenoh.handlers import Callback
+
+from ..rings.host_memory import Counter, HostMemory
+from ..system.live_keys import KeyValue
+from ..system.memory_map import map_memory
+from ..system.plan import NodePlan
+from ..wire.session import undeclare_all
+from ..wire.views import KeyStatus, LogLine
+from .engine import Windows
+from .key_inputs import KeyFeed
+from .key_outputs import KeyOutputs
+from .stepping import Runner
+
+__all__ = ["KeyEnds"]
+
+
+class KeyEnds:
+    """The keys of the instances of one node.
+
+    Call sequence on the main thread: `serve`, then `begin` at point 0, then `check` and `publish_now` after steps; at
+    the end `close`. A run that repeats an earlier one has no keys.
+
+    Args:
+        post: lets the main thread do something, from any thread.
+        log: publishes a log message; from any thread.
+        tell: tells the recorder, if there is one, which values have come.
+
+    Attributes:
+        lossy: the outputs that another thread publishes.
+    """
+
+    def __init__(
+        self,
+        plan: NodePlan,
+        session: zenoh.Session,
+        post: Callable[[Callable[[], None]], None],
+        log: Callable[[LogLine], None],
+        tell: Callable[[Sequence[KeyValue]], None],
+    ) -> None:
+        self.lossy: list[KeyOutputs] = []
+        self._plan = plan
+        self._session = session
+        self._around = post, log, tell
+        self._feeds: list[KeyFeed] = []
+        self._subscribers: list[zenoh.Subscriber[Any]] = []
+        self._blocking: list[tuple[KeyOutputs, Counter]] = []
+
+    def serve(self, runners: Mapping[str, Runner]) -> None:
+        """Subscribe and declare publishers; what comes from now on is used from point 0 on."""
+        live = [runner for runner in runners.values() if runner.plan.recorded_keys is None]
+        waiting = {
+            f"{own.key} > {runner.name}.{own.variable}" for runner in live for own in runner.plan.keys_in if own.wait
+        }
+        blocking = {runner.name for runner in live if any(own.blocks for own in runner.plan.keys_out)}
+        # A counter for each that limits the node, in memory of its own: only this thread uses it.
+        map_, _ = map_memory([self._plan.node, *waiting, *blocking], {})
+        counters = HostMemory.private(map_, self._plan.node).progress
+        for runner in live:
+            for own in runner.plan.keys_in:
+                counter = counters.get(f"{own.key} > {runner.name}.{own.variable}")
+                self._feeds.append(feed := KeyFeed(own, runner, counter, *self._around))
+                take = Callback(feed.arrived, indirect=False)
+                self._subscribers.append(self._session.declare_subscriber(own.key, take))
+            if any(not own.blocks for own in runner.plan.keys_out):
+                self.lossy.append(KeyOutputs(runner, self._session, None))
+            if runner.name in blocking:
+                counter = counters[runner.name]
+                self._blocking.append((KeyOutputs(runner, self._session, counter), counter))
+
+    def begin(self) -> None:
+        """At point 0: use what has come before, and publish the first values."""
+        for feed in self._feeds:
+            feed.begin()
+        for outputs in (*self.lossy, *(own for own, _ in self._blocking)):
+            outputs.begin()
+        self.publish_now()
+
+    @property
+    def windows(self) -> Windows:
+        """How far the node may be ahead: of the values that its steps wait for, and of outputs that block."""
+        limits = [(feed.words, feed.counter, 1) for feed in self._feeds if feed.counter is not None]
+        return limits + [(f"the keys of '{own.runner.name}'", counter, own.window) for own, counter in self._blocking]
+
+    @property
+    def publishes(self) -> bool:
+        """Whether rows go to keys."""
+        return bool(self.lossy or self._blocking)
+
+    def publish_now(self) -> None:
+        """Publish the rows that may not be lost; waits for who is slow."""
+        for outputs, _ in self._blocking:
+            outputs.publish_now()
+
+    def waits_for(self, name: str) -> str | None:
+        """What the next step of an instance waits for, in words; None if it is no key."""
+        return next((f.words for f in self._feeds if f.runner.name == name and f.holds(f.runner.point + 1)), None)
+
+    def check(self, granted: int, now: float) -> None:
+        """Look whether the values that steps up to the point ``granted`` need have come in time; ``now`` is in s.
+
+        Raises:
+            DeadlineExceeded: one has not.
+        """
+        for feed in self._feeds:
+            feed.check(granted, now, self._plan.timeouts.step)
+
+    def look(self, now: float) -> None:
+        """On the thread of the server: tell of keys that nobody has published for the time of a start."""
+        for feed in self._feeds:
+            feed.look(now, self._plan.timeouts.start)
+
+    def statuses(self, name: str) -> tuple[KeyStatus, ...]:
+        """What `status` says of the keys of an instance; from any thread."""
+        outputs = (own for own in (*self.lossy, *(own for own, _ in self._blocking)) if own.runner.name == name)
+        feeds = (feed.status for feed in self._feeds if feed.runner.name == name)
+        return (*feeds, *(status for own in outputs for status in own.statuses))
+
+    def close(self) -> None:
+        """Undeclare everything."""
+        undeclare_all(self._subscribers)
+        for outputs in (*self.lossy, *(own for own, _ in self._blocking)):
+            outputs.close()

@@ -1,0 +1,212 @@
+"""Zenoh keys that feed inputs: values of other programs, each at its point.
+
+Owns when a value takes effect, and for which value a step waits. Payloads are `fmu_mesh.node.key_payloads`; how a step
+gets its value is `fmu_mesh.node.inputs`, as for values that are set.
+"""
+
+# Threads: one of Zenoh calls `_Feed.arrived`, which counts a sample, puts it into a deque and posts `_take` once. The
+# main thread calls `_take` between two steps, and everything that changes an input. The thread of the server calls
+# `look` and `status`, which read numbers that somebody else writes in one assignment.
+#
+# What may go wrong, and what then happens:
+# * A flood. On arrival only the newest value counts, so there is at most one at each point; of values with times
+#   `_MOST_WAITING` may wait. What is more is counted and lost, and the sender is never held back: it may be a stranger.
+#   `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
+# * Silence. A step that waits ends with the deadline of a step. Else the input holds, or falls back (`timeout`).
+# * A step must not wait inside an instance: the main thread would not see the end of the run. So a key that is waited
+#   for limits the node as the window of another node does, by a counter that only the main thread raises.
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import zenoh
+from msgspec.structs import replace
+
+from ..errors import DeadlineExceeded, MeshLost
+from ..rings.host_memory import Counter
+from ..system.live_keys import KeyInput, KeyValue
+from ..variables.value_conversion import to_plain
+from ..wire.values import ValueRefused
+from ..wire.views import KeyStatus, LogLine
+from .inputs import set_input
+from .key_payloads import KeyReader
+from .stepping import Runner
+
+__all__ = ["KeyFeed"]
+
+_MOST_WAITING: Final = 1 << 16
+_MOST_AT_ONCE: Final = 64
+
+
+class KeyFeed:
+    """One key for one variable.
+
+    Args:
+        counter: one more than the last point at which a step may begin, if steps wait for the key.
+        post: lets the main thread do something, from any thread.
+        log: publishes a log message; from any thread.
+        tell: tells the recorder, if there is one, which values have come.
+
+    Attributes:
+        words: the key and its variable, for messages.
+    """
+
+    def __init__(  # noqa: PLR0913, PLR0917  one key and its surroundings
+        self,
+        own: KeyInput,
+        runner: Runner,
+        counter: Counter | None,
+        post: Callable[[Callable[[], None]], None],
+        log: Callable[[LogLine], None],
+        tell: Callable[[Sequence[KeyValue]], None],
+    ) -> None:
+        variable = runner.instance.description.variable(own.variable)
+        assert variable is not None  # the plan has it
+        self.runner, self.counter = runner, counter
+        self.words = f"'{own.key}', which feeds '{runner.name}.{own.variable}'"
+        self._own, self._post, self._log, self._tell = own, post, log, tell
+        self._reader = KeyReader(own, variable, finite=runner.plan.not_finite == "stop")
+        self._only_newest = own.time == "arrival" and not own.wait
+        self._waiting: deque[zenoh.Sample] = deque()
+        self._posted = self._begun = False
+        self._counts = KeyStatus(own.key, own.variable)
+        self._received = self._replaced = self._lost = 0
+        self._first_at = self._last_at = 0.0
+        self._told: set[str] = set()
+        self._shift: float | None = None  # simulation time minus that of the values
+        self._newest: float | None = None
+        self._used = 0
+        self._declared_at = time.monotonic()
+        self._blocked: tuple[int, float] | None = None
+
+    def arrived(self, sample: zenoh.Sample) -> None:
+        """On a thread of Zenoh."""
+        self._last_at = time.monotonic()
+        self._first_at = self._first_at or self._last_at
+        self._received += 1
+        if self._only_newest and self._waiting:
+            self._replaced += 1
+            self._waiting[-1] = sample
+        elif len(self._waiting) < _MOST_WAITING:
+            self._waiting.append(sample)
+        else:
+            self._lost += 1
+        if not self._posted:
+            self._posted = True
+            self._post(self._take)
+
+    def begin(self) -> None:
+        """At point 0: use what has come before."""
+        self._begun = True
+        self._take()
+
+    def _take(self) -> None:
+        """On the main thread, between two steps."""
+        self._posted = False
+        values: list[KeyValue] = []
+        for _ in range(min(len(self._waiting), _MOST_AT_ONCE) if self._begun else 0):
+            try:
+                values.append(self._use(self._waiting.popleft()))
+            except ValueRefused as refused:
+                self._counts = replace(self._counts, refused=self._counts.refused + 1)
+                self._say("refused", f"is refused: {refused}. More are only counted in `status`")
+        if values:
+            self._tell(values)
+        if self._lost and "lost" not in self._told:
+            self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
+            if self._own.wait:
+                text = f"a value of {self.words} is lost, because {_MOST_WAITING} wait for their points"
+                raise MeshLost(text, **self._place(), hint="Its publisher has to wait for this run.")
+        if self._waiting and self._begun and not self._posted:
+            self._posted = True
+            self._post(self._take)
+
+    def _use(self, sample: zenoh.Sample) -> KeyValue:
+        """Let a value take effect at its time."""
+        runner, own = self.runner, self._own
+        grid, points, at = runner.grid, runner.plan.step_points, runner.point
+        value, said, is_simulated = self._reader.read(sample)
+        if said is None:
+            when = grid.time(self._used * points) if own.wait else None
+        else:
+            if self._shift is None:
+                self._shift = self._first_shift(said, is_simulated=is_simulated)
+            when = said + self._shift + own.delay
+        step = set_input(runner, own.variable, value, when)
+        self._used += 1
+        if when is not None:
+            self._look_at_time(when, late=step > grid.step_at(when, points))
+            if self.counter is not None and when >= grid.start_time - grid.rounding(when):
+                reached = grid.step_at(when, points)
+                reached -= grid.time(reached * points) > when + grid.rounding(when)  # the last step that begins by then
+                self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
+        return f"{runner.name}.{own.variable}", at, when, to_plain(value)
+
+    def _first_shift(self, said: float, *, is_simulated: bool) -> float:
+        grid = self.runner.grid
+        if self._own.origin is not None:
+            return grid.start_time - self._own.origin
+        return 0.0 if is_simulated else grid.time(self.runner.point) - said
+
+    def _look_at_time(self, when: float, *, late: bool) -> None:
+        if late and not self._own.wait:
+            self._counts = replace(self._counts, late=self._counts.late + 1)
+            self._say("late", "has come after its time, and takes effect at once. Is its `delay` too short?")
+        if self._newest is not None and when < self._newest:
+            self._counts = replace(self._counts, disordered=self._counts.disordered + 1)
+            self._say("disordered", "is for an earlier time than the one before it; it replaces no later value")
+        self._newest = when if self._newest is None else max(when, self._newest)
+
+    def holds(self, point: int) -> bool:
+        """Whether a step may not go to a point because a value has not come."""
+        return self.counter is not None and point > self.counter.value
+
+    def check(self, granted: int, now: float, limit_s: float) -> None:
+        """Look whether a value that a step up to the point ``granted`` needs has come in ``limit_s``; ``now`` is in s.
+
+        Raises:
+            DeadlineExceeded: it has not.
+        """
+        point = self.runner.point
+        if not self.holds(min(point + 1, granted, self.runner.grid.last_point)):
+            self._blocked = None
+        elif self._blocked is None or self._blocked[0] != point:
+            self._blocked = point, now
+        elif (waited_s := now - self._blocked[1]) > limit_s:
+            newest = f"; the last one was for {self._newest:.9g} s" if self._newest is not None else ""
+            text = f"no value for this point has come in {waited_s:.1f} s by the key {self.words}{newest}"
+            hint = "Is its publisher running, and connected? `timeouts.step` is the longest wait."
+            raise DeadlineExceeded(text, **self._place(), hint=hint)
+
+    def look(self, now: float, limit_s: float) -> None:
+        """On the thread of the server: tell if nobody has published the key in ``limit_s``."""
+        if not self._received and now - self._declared_at > limit_s:
+            self._say("silent", f"has not come in {limit_s:g} s: does somebody publish this key, on this network?")
+
+    @property
+    def status(self) -> KeyStatus:
+        """What has come; from any thread."""
+        received, now = self._received, time.monotonic()
+        rate = (
+            (received - 1) / (self._last_at - self._first_at)
+            if received > 1 and self._last_at > self._first_at
+            else 0.0
+        )
+        age = now - self._last_at if received else None
+        return replace(self._counts, received=received, replaced=self._replaced, lost=self._lost, rate=rate, age=age)
+
+    def _say(self, what: str, text: str) -> None:
+        """Warn once of each kind of trouble."""
+        if what not in self._told:
+            self._told.add(what)
+            line = f"a value of {self.words}, {text}"
+            self._log(LogLine(self.runner.name, "warning", "key", line, self.runner.point))
+
+    def _place(self) -> dict[str, Any]:
+        point = self.runner.point
+        at = {"point": point, "time": self.runner.grid.time(point)}
+        return {"instance": self.runner.name, "variable": self._own.variable, **at}

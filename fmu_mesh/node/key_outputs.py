@@ -1,0 +1,113 @@
+"""Values of outputs under Zenoh keys for other programs.
+
+Those that may be lost are published by the thread of the server, as streams are. Where the file says `block`, the main
+thread publishes them between two steps: the run waits for who is slow, and no row is overwritten before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from ..rings.host_memory import Counter
+from ..system.live_keys import KeyOutput
+from ..variables.model_description import Value, Variable
+from ..variables.value_types import nested
+from ..wire.session import undeclare_all
+from ..wire.views import KeyStatus
+from .key_payloads import key_writer
+from .stepping import Runner
+from .streams import PRIORITY, Picked, RowsFor
+
+__all__ = ["KeyOutputs"]
+
+_NOTHING: Final = object()
+
+
+class KeyOutputs(RowsFor):
+    """The keys with values of one instance: those that block, or all others.
+
+    Args:
+        counter: if they block, one more than the last point that is published: the node is never far ahead of it.
+    """
+
+    def __init__(self, runner: Runner, session: zenoh.Session, counter: Counter | None) -> None:
+        super().__init__(runner)
+        self.counter = counter
+        self.window = max(1, runner.outputs.rows // 2) * runner.plan.step_points
+        self._sinks: dict[str, list[_Sink]] = {}
+        for own in runner.plan.keys_out:
+            variable = runner.instance.description.variable(own.variable)
+            if own.blocks == (counter is not None) and variable is not None:
+                self._sinks.setdefault(own.variable, []).append(_Sink(own, variable, session))
+
+    def begin(self) -> None:
+        """On the main thread, at point 0: from now on each point counts."""
+        self._pick(self._sinks)
+
+    def publish(self, steps: NDArray[np.intp], blocks: list[tuple[Picked, NDArray[Any]]]) -> None:
+        """Publish what `collect` returned, point by point."""
+        lists = [(picked.keys, block.tolist()) for picked, block in blocks]
+        for offset, point in enumerate((steps * self.runner.plan.step_points).tolist()):
+            time_s = self.runner.grid.time(point)
+            for keys, rows in lists:
+                row, first = rows[offset], 0
+                for sinks, size, shape in keys:
+                    value = nested(row[first : first + size], shape)
+                    first += size
+                    for sink in sinks:
+                        sink.publish(value, point, time_s)
+            if self.counter is not None:
+                self.counter.raise_to(point + 1)
+
+    def publish_now(self) -> None:
+        """On the main thread: publish all rows, and wait for who is slow."""
+        if self.counter is not None and (batch := self.collect(0)) is not None:
+            self.publish(*batch[1:])
+
+    @property
+    def statuses(self) -> Iterator[KeyStatus]:
+        """What `status` says of these keys; from any thread."""
+        return (sink.status for sinks in self._sinks.values() for sink in sinks)
+
+    def close(self) -> None:
+        """Undeclare the publishers."""
+        undeclare_all(sink.publisher for sinks in self._sinks.values() for sink in sinks)
+
+
+class _Sink:
+    """One key of one variable."""
+
+    def __init__(self, own: KeyOutput, variable: Variable, session: zenoh.Session) -> None:
+        self._own, self._session = own, session
+        self._write, encoding = key_writer(own, variable)
+        congestion = zenoh.CongestionControl.BLOCK if own.blocks else zenoh.CongestionControl.DROP
+        self.publisher = session.declare_publisher(
+            own.key, encoding=encoding, congestion_control=congestion, priority=PRIORITY
+        )
+        self._last: object = _NOTHING
+        self._slot = -1
+        self._count = 0
+        self._first_at = self._last_at = 0.0
+
+    def publish(self, value: Value, point: int, time_s: float) -> None:
+        """Publish a value, if one is due at this point."""
+        if (slot := point // self._own.every) == self._slot or (self._own.on == "change" and value == self._last):
+            return
+        self._slot, self._last = slot, value
+        self.publisher.put(self._write(value, point, time_s), timestamp=self._session.new_timestamp())
+        self._last_at = time.monotonic()
+        self._first_at = self._first_at or self._last_at
+        self._count += 1
+
+    @property
+    def status(self) -> KeyStatus:
+        """See `KeyOutputs.statuses`."""
+        took_s = self._last_at - self._first_at
+        rate, age = (self._count - 1) / took_s if took_s > 0.0 else 0.0, time.monotonic() - self._last_at
+        return KeyStatus(self._own.key, self._own.variable, self._count, rate=rate, age=age if self._count else None)
