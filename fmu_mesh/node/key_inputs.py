@@ -206,13 +206,9 @@ class KeyFeed:
     @property
     def status(self) -> KeyStatus:
         """What has come; from any thread."""
-        received, now = self._received, time.monotonic()
-        rate = (
-            (received - 1) / (self._last_at - self._first_at)
-            if received > 1 and self._last_at > self._first_at
-            else 0.0
-        )
-        age = now - self._last_at if received else None
+        received, took_s = self._received, self._last_at - self._first_at
+        rate = (received - 1) / took_s if took_s > 0.0 else 0.0
+        age = time.monotonic() - self._last_at if received else None
         return replace(self._counts, received=received, replaced=self._replaced, lost=self._lost, rate=rate, age=age)
 
     def _say(self, what: str, text: str) -> None:
