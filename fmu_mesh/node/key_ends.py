@@ -59,7 +59,7 @@ class KeyEnds:
         waiting = {
             f"{own.key} > {runner.name}.{own.variable}" for runner in live for own in runner.plan.keys_in if own.wait
         }
-        blocking = {runner.name for runner in live if any(own.blocks for own in runner.plan.keys_out)}
+        blocking = {f"keys of {runner.name}" for runner in live if any(own.blocks for own in runner.plan.keys_out)}
         # A counter for each that limits the node, in memory of its own: only this thread uses it.
         map_, _ = map_memory([self._plan.node, *waiting, *blocking], {})
         counters = HostMemory.private(map_, self._plan.node).progress
@@ -71,8 +71,7 @@ class KeyEnds:
                 self._subscribers.append(self._session.declare_subscriber(own.key, take))
             if any(not own.blocks for own in runner.plan.keys_out):
                 self.lossy.append(KeyOutputs(runner, self._session, None))
-            if runner.name in blocking:
-                counter = counters[runner.name]
+            if (counter := counters.get(f"keys of {runner.name}")) is not None:
                 self._blocking.append((KeyOutputs(runner, self._session, counter), counter))
 
     def begin(self) -> None:

@@ -312,9 +312,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
         waits = any(own.wait for name in members for own in system.instances[name].keys_in)
-        shared = waits or any(
-            name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles
-        )
+        shared = any(name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles)
         links_in = tuple(link for link in links if link.target_node == node)
         nodes[node] = NodePlan(
             mesh=config.mesh,
