@@ -87,7 +87,7 @@ def test_a_topic_that_is_no_key_ends_the_connection_of_its_client(meeting: Meeti
 
 
 @pytest.mark.parametrize("version", ["mqttv311", "mqttv5"])
-def test_qos_2_is_refused_in_words_or_by_the_end_of_the_connection(meeting: Meeting, version: str) -> None:
+def test_qos_2_is_refused(meeting: Meeting, version: str) -> None:
     client = meeting.place.start_command(meeting.ports.publish("a/b", "-V", version, "-q", "2", "-m", "x"))
 
     client.wait()
