@@ -311,6 +311,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
+        # A cycle over several nodes, or another program, waits for each row.
         waits = any(own.wait for name in members for own in system.instances[name].keys_in)
         shared = any(name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles)
         links_in = tuple(link for link in links if link.target_node == node)
@@ -323,9 +324,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
-            batch=1
-            if shared
-            else max(1, plan.window // 16),  # a cycle over several nodes, or another program, waits for each row
+            batch=1 if shared or waits else max(1, plan.window // 16),
             memory=memory,
             rings=tuple(
                 places[name]
