@@ -36,10 +36,27 @@ from .inputs import TimedInputs, set_input
 from .key_payloads import KeyReader
 from .stepping import Runner
 
-__all__ = ["KeyFeed"]
+__all__ = ["KeyFeed", "Patience"]
 
 _MOST_WAITING: Final = 1 << 16
 _MOST_AT_ONCE: Final = 64
+
+
+class Patience:
+    """For how long a runner has been held at one point."""
+
+    def __init__(self, runner: Runner) -> None:
+        self._runner = runner
+        self._since: tuple[int, float] | None = None
+
+    def spent_s(self, most: int, granted: int, now: float) -> float:
+        """The time in s; 0 if it may go on, which it may up to the points ``most`` and ``granted``; ``now`` is in s."""
+        point = self._runner.point
+        if min(point + 1, granted, self._runner.grid.last_point) <= most:
+            self._since = None
+        elif self._since is None or self._since[0] != point:
+            self._since = point, now
+        return now - self._since[1] if self._since is not None else 0.0
 
 
 class KeyFeed:
@@ -85,7 +102,7 @@ class KeyFeed:
         self._newest: float | None = None
         self._used = 0
         self._declared_at = time.monotonic()
-        self._blocked: tuple[int, float] | None = None
+        self._patience = Patience(runner)
 
     def arrived(self, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh."""
@@ -187,12 +204,9 @@ class KeyFeed:
         Raises:
             DeadlineExceeded: it has not.
         """
-        point = self.runner.point
-        if not self.holds(min(point + 1, granted, self.runner.grid.last_point)):
-            self._blocked = None
-        elif self._blocked is None or self._blocked[0] != point:
-            self._blocked = point, now
-        elif (waited_s := now - self._blocked[1]) > limit_s:
+        if self.counter is None:
+            return
+        if (waited_s := self._patience.spent_s(self.counter.value, granted, now)) > limit_s:
             newest = f"; the last one was for {self._newest:.9g} s" if self._newest is not None else ""
             text = f"no value for this point has come in {waited_s:.1f} s by the key {self.words}{newest}"
             hint = "Is its publisher running, and connected? `timeouts.step` is the longest wait."
