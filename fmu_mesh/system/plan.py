@@ -26,7 +26,7 @@ from .initialization_plan import InitializationPlan, Loop, check_loops, plan_ini
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
-from .live_keys import KeyInput, KeyOutput, RecordedKeys
+from .live_keys import KEY, KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
@@ -90,7 +90,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def sources(self) -> dict[str, str]:
         """What feeds each input that is connected, or of which an element is: an instance, or a key in words."""
         fed = {self.inputs.column(own.target).name: feed.source for feed in self.feeds for own in feed.columns}
-        return fed | {own.variable: f"key {own.key}" for own in self.keys_in}
+        return fed | {own.variable: f"{KEY}{own.key}" for own in self.keys_in}
 
     def check_settable(self, variable: Variable) -> None:
         """Check that a variable may be set between two steps.
