@@ -58,10 +58,11 @@ class KeyOutputs(RowsFor):
             for keys, rows in lists:
                 row, first = rows[offset], 0
                 for sinks, size, shape in keys:
-                    value = nested(row[first : first + size], shape)
+                    elements = row[first : first + size]
+                    value = nested(elements, shape)
                     first += size
                     for sink in sinks:
-                        sink.publish(value, point, time_s)
+                        sink.publish(value if sink.place is None else elements[sink.place], point, time_s)
             if self.counter is not None:
                 self.counter.raise_to(point + 1)
 
@@ -81,10 +82,11 @@ class KeyOutputs(RowsFor):
 
 
 class _Sink:
-    """One key of one variable."""
+    """One key of one variable, or of the element at ``place``."""
 
     def __init__(self, own: KeyOutput, variable: Variable, session: zenoh.Session) -> None:
         self._own, self._session = own, session
+        self.place = int(np.ravel_multi_index(own.index, variable.shape)) if own.index else None
         self._write, encoding = key_writer(own, variable)
         congestion = zenoh.CongestionControl.BLOCK if own.blocks else zenoh.CongestionControl.DROP
         self.publisher = session.declare_publisher(
