@@ -165,6 +165,7 @@ class Recorder:
         try:
             try:
                 self._write_rows()
+                self._take_last_values()
                 if isinstance(error, RunReset):
                     self._files.note({"ended_by": error.message})
             finally:
@@ -337,6 +338,16 @@ class Recorder:
                     return
                 message = self._inbox.wait(left)
             if message is not None and message[1] in (FRAME, LAST, SET, KEYS):
+                self._take(message)
+
+    def _take_last_values(self) -> None:
+        """Take what was set and what came by keys: it may come after the rows, which take other ways.
+
+        The master of this process has the reports of the nodes, which they have sent after it.
+        """
+        self._inbox.close()
+        while (message := self._inbox.poll()) is not None:
+            if message[1] in (SET, KEYS):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:
