@@ -21,9 +21,11 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 import zenoh
+import zenoh.ext
 from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, MeshLost
@@ -88,13 +90,22 @@ class KeyFeed:
         self._last_at = time.monotonic()
         self._first_at = self._first_at or self._last_at
         self._received += 1
-        if self._only_newest and self._waiting:
-            self._replaced += 1
-            self._waiting[-1] = sample
-        elif len(self._waiting) < _MOST_WAITING:
+        if self._only_newest:
+            with suppress(IndexError):  # the main thread takes them, at any moment
+                self._waiting.pop()
+                self._replaced += 1
+        if len(self._waiting) < _MOST_WAITING:
             self._waiting.append(sample)
         else:
             self._lost += 1
+        self._post_take()
+
+    def missed(self, miss: zenoh.ext.Miss) -> None:
+        """On a thread of Zenoh: so many values of another mesh were lost on their way, and cannot be had again."""
+        self._lost += miss.nb
+        self._post_take()
+
+    def _post_take(self) -> None:
         if not self._posted:
             self._posted = True
             self._post(self._take)
@@ -117,13 +128,13 @@ class KeyFeed:
         if values:
             self._tell(values)
         if self._lost and "lost" not in self._told:
-            self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
+            why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
+            self._say("lost", f"{why}. More are only counted")
             if self._own.wait:
-                text = f"a value of {self.words} is lost, because {_MOST_WAITING} wait for their points"
-                raise MeshLost(text, **self._place(), hint="Its publisher has to wait for this run.")
-        if self._waiting and self._begun and not self._posted:
-            self._posted = True
-            self._post(self._take)
+                hint = "Its publisher has to wait for this run."
+                raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
+        if self._waiting and self._begun:
+            self._post_take()
 
     def _use(self, sample: zenoh.Sample) -> KeyValue:
         """Let a value take effect at its time."""
@@ -136,6 +147,9 @@ class KeyFeed:
             if self._shift is None:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
             when = said + self._shift + own.delay
+            if own.wait and not self._used and when > (first := grid.start_time + own.delay) + grid.rounding(first):
+                text = f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
+                raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
         step = set_input(runner, own.variable, value, when)
         self._used += 1
         if when is not None:

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 import zenoh
+import zenoh.ext
 from numpy.typing import NDArray
 
 from ..rings.host_memory import Counter
@@ -27,6 +28,12 @@ from .streams import PRIORITY, Picked, RowsFor
 __all__ = ["KeyOutputs"]
 
 _NOTHING: Final = object()
+
+_KEPT: Final = 1 << 10
+"""Values that who waits for them gets again: those from before it came, and those that a link has lost."""
+
+_BEAT_S: Final = 0.2
+"""How often in s it is told which value was the last one, if there was one."""
 
 
 class KeyOutputs(RowsFor):
@@ -89,8 +96,15 @@ class _Sink:
         self.place = int(np.ravel_multi_index(own.index, variable.shape)) if own.index else None
         self._write, encoding = key_writer(own, variable)
         congestion = zenoh.CongestionControl.BLOCK if own.blocks else zenoh.CongestionControl.DROP
-        self.publisher = session.declare_publisher(
-            own.key, encoding=encoding, congestion_control=congestion, priority=PRIORITY
+        self.publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            own.key,
+            encoding=encoding,
+            congestion_control=congestion,
+            priority=PRIORITY,
+            cache=zenoh.ext.CacheConfig(_KEPT),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_BEAT_S),
+            publisher_detection=True,
         )
         self._last: object = _NOTHING
         self._slot = -1
