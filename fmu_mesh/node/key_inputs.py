@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import zenoh
+import zenoh.ext
 from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, MeshLost
@@ -36,10 +37,27 @@ from .inputs import TimedInputs, set_input
 from .key_payloads import KeyReader
 from .stepping import Runner
 
-__all__ = ["KeyFeed"]
+__all__ = ["KeyFeed", "Patience"]
 
 _MOST_WAITING: Final = 1 << 16
 _MOST_AT_ONCE: Final = 64
+
+
+class Patience:
+    """For how long a runner has been held at one point."""
+
+    def __init__(self, runner: Runner) -> None:
+        self._runner = runner
+        self._since: tuple[int, float] | None = None
+
+    def spent_s(self, most: int, granted: int, now: float) -> float:
+        """The time in s; 0 if it may go on, which it may up to the points ``most`` and ``granted``; ``now`` is in s."""
+        point = self._runner.point
+        if min(point + 1, granted, self._runner.grid.last_point) <= most:
+            self._since = None
+        elif self._since is None or self._since[0] != point:
+            self._since = point, now
+        return now - self._since[1] if self._since is not None else 0.0
 
 
 class KeyFeed:
@@ -85,7 +103,7 @@ class KeyFeed:
         self._newest: float | None = None
         self._used = 0
         self._declared_at = time.monotonic()
-        self._blocked: tuple[int, float] | None = None
+        self._patience = Patience(runner)
 
     def arrived(self, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh."""
@@ -97,6 +115,14 @@ class KeyFeed:
             self._waiting.append(sample)
         else:
             self._lost += 1
+        self._post_take()
+
+    def missed(self, miss: zenoh.ext.Miss) -> None:
+        """On a thread of Zenoh: so many values of another mesh were lost on their way, and cannot be had again."""
+        self._lost += miss.nb
+        self._post_take()
+
+    def _post_take(self) -> None:
         if not self._posted:
             self._posted = True
             self._post(self._take)
@@ -117,13 +143,13 @@ class KeyFeed:
         self._posted = False
         self._use(min(len(self._waiting), _MOST_AT_ONCE))
         if self._lost and "lost" not in self._told:
-            self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
+            why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
+            self._say("lost", f"{why}. More are only counted")
             if self._own.wait:
-                text = f"a value of {self.words} is lost, because {_MOST_WAITING} wait for their points"
-                raise MeshLost(text, **self._place(), hint="Its publisher has to wait for this run.")
-        if self._waiting and not self._posted:
-            self._posted = True
-            self._post(self._take)
+                hint = "Its publisher has to wait for this run."
+                raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
+        if self._waiting:
+            self._post_take()
 
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
@@ -152,6 +178,11 @@ class KeyFeed:
             if self._shift is None:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
             when = said + self._shift + own.delay
+            if own.wait and not self._used and when > (first := grid.start_time + own.delay) + grid.rounding(first):
+                text = (
+                    f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
+                )
+                raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
         step = set_input(runner, own.variable, value, when)
         self._used += 1
         if when is not None:
@@ -187,12 +218,9 @@ class KeyFeed:
         Raises:
             DeadlineExceeded: it has not.
         """
-        point = self.runner.point
-        if not self.holds(min(point + 1, granted, self.runner.grid.last_point)):
-            self._blocked = None
-        elif self._blocked is None or self._blocked[0] != point:
-            self._blocked = point, now
-        elif (waited_s := now - self._blocked[1]) > limit_s:
+        if self.counter is None:
+            return
+        if (waited_s := self._patience.spent_s(self.counter.value, granted, now)) > limit_s:
             newest = f"; the last one was for {self._newest:.9g} s" if self._newest is not None else ""
             text = f"no value for this point has come in {waited_s:.1f} s by the key {self.words}{newest}"
             hint = "Is its publisher running, and connected? `timeouts.step` is the longest wait."

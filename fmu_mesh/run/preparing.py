@@ -172,7 +172,7 @@ def planned(
 
     checked = partial(check_record, loaded)
     system = build(loaded, descriptions, findings, scenario, claimed, obstacles, checked, base_unit_of)
-    check_messages(loaded.config, system, obstacles)
+    check_messages(system, obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
