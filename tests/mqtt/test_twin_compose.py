@@ -41,7 +41,8 @@ def test_the_services_of_the_compose_file_are_a_twin(place: Place) -> None:
             *[endpoint if own == "tcp/router:7447" else own for own in command], "--output", place.folder / "twin.csv"
         )
         wait_until(lambda: "twin/pump/flow" in reader.output, "the first flow")
-        ended(place, ports.publish("plant/pump/speed", "-q", "1", "-m", '{"rpm": 2400}'))
+        # Without a header, curl says that the content is that of a form.
+        ended(place, ports.curl("plant/pump/speed", "-X", "PUT", "-d", '{"rpm": 2400}'))
         wait_until(lambda: reader.output.count("twin/pump/flow") == 2, "the flow of the measured speed")
         known = reader.output.count("twin/pump/forecast")
         wait_until(lambda: reader.output.count("twin/pump/forecast") > known, "a forecast after it")

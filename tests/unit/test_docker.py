@@ -194,9 +194,7 @@ def test_the_ports_of_the_twin_are_published_for_its_host_only(twin: dict[str, A
     assert twin["networks"]["mesh"] == {"internal": True}
 
 
-def test_router_and_image_of_the_twin_are_those_of_the_main_job(
-    compose: dict[str, Any], twin: dict[str, Any]
-) -> None:
+def test_router_and_image_of_the_twin_are_those_of_the_main_job(compose: dict[str, Any], twin: dict[str, Any]) -> None:
     router = compose["services"]["router"]
     version = router["image"].partition(":")[2]
 
