@@ -167,7 +167,7 @@ def part(request: pytest.FixtureRequest, place: Place) -> tuple[Path, str]:
 
 def _seen(place: Place, ports: Bridge) -> None:
     """Wait until the bridge is linked to the mesh, which has declared its keys by then."""
-    curl = ports.curl("fmu_mesh/part/mesh/status")
+    curl = ports.curl("fmu_mesh/*/mesh/status")
     wait_until(lambda: '"running"' in ended(place, curl).output, "the mesh, by HTTP")
 
 
@@ -224,3 +224,37 @@ def test_a_run_that_waits_in_vain_ends_with_these_words(place: Place, part: tupl
     assert mesh.wait() == 4
     [shown] = masked(part[1])
     assert " ".join(masked(mesh.message)).startswith(shown)
+
+
+def test_a_run_goes_on_while_the_bridge_is_dead(place: Place) -> None:
+    bridge_or_skip()
+    ports = Bridge.on_free_ports()
+    file, endpoint = place.folder / "twin.csv", f"tcp/127.0.0.1:{ports.zenoh}"
+    config = ROOT / "configs" / "pump_twin.yaml"
+
+    def speeds() -> list[float]:
+        """Those in the rows that are complete by now."""
+        return [float(line.split(",")[1]) for line in file.read_text("utf-8").split("\n")[1:-1]]
+
+    def publish(rpm: int) -> None:
+        ended(place, ports.publish("plant/pump/speed", "-q", "1", "-m", f'{{"rpm": {rpm}}}'))
+        wait_until(lambda: speeds()[-1:] == [rpm * RPM], f"{rpm} rpm in the result")
+
+    twin = place.start("launch", config, "--no-progress", "--listen", endpoint, "--output", file)
+    with running_bridge(place, ports) as bridge:
+        _seen(place, ports)
+        wait_until(file.exists, "the first rows")
+        publish(2400)
+        bridge.signal(signal.SIGKILL)
+        bridge.wait()
+        known = len(speeds())
+        wait_until(lambda: len(speeds()) > known + 5, "points without a bridge")
+    with running_bridge(place, ports) as bridge:
+        wait_until(lambda: "ready" in bridge.output, "the link of the second bridge")
+        publish(2900)
+    place.run("stop", "pump_twin")
+
+    assert twin.wait() == 0, twin.story()
+    assert "warning" not in twin.errors
+    assert sorted(set(speeds())) == [0.0, 2400 * RPM, 2900 * RPM]
+    assert speeds() == sorted(speeds())
