@@ -151,14 +151,13 @@ def test_a_stream_of_http_has_each_sample_as_an_event(meeting: Meeting) -> None:
     for value in (1.5, 2.5):
         meeting.session.put("twin/pump/forecast", f'{{"value": {value}}}', encoding="application/json")
 
+    def events() -> list[dict[str, Any]]:
+        return [json.loads(line[6:]) for line in stream.output.split("\n")[:-1] if line.startswith("data: {")]
+
+    wait_until(lambda: len(events()) == 2, "two events")
     assert meeting.published("twin/by mqtt", "-q", "1", "-m", "2.5") == 0
-
-    def found() -> list[dict[str, Any]] | None:
-        events = [json.loads(line[6:]) for line in stream.output.splitlines() if line.startswith("data: {")]
-        return events if len(events) == 3 else None
-
-    events = wait_until(found, "three events")
-    assert [(one["key"], one["value"]) for one in events] == [
+    wait_until(lambda: len(events()) == 3, "a third event")
+    assert [(one["key"], one["value"]) for one in events()] == [
         ("twin/pump/forecast", {"value": 1.5}),
         ("twin/pump/forecast", {"value": 2.5}),
         ("twin/by mqtt", base64.b64encode(b"2.5").decode()),
