@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,12 +15,12 @@ import pytest
 import zenoh
 
 from tests.helpers import Launched, Place, wait_until
-from tests.ros.peers import free_port
 
 __all__ = ["CONFIG", "PROGRAM", "Bridge", "bridge_or_skip", "ended", "listening", "running_bridge"]
 
 PROGRAM = "fmu-mesh-zenoh-bridge"
 CONFIG = Path(__file__).resolve().parents[2] / "bridges" / "zenoh" / "config.json5"
+_claims: list[socket.socket] = []
 _PORTS = {"zenoh": ":7447", "mqtt": ":1883", "http": ":8000"}
 
 
@@ -46,7 +47,8 @@ class Bridge(msgspec.Struct, frozen=True):
 
     @classmethod
     def on_free_ports(cls) -> Bridge:
-        return cls(free_port(), free_port(), free_port())
+        """On ports that stay free while a bridge is not there, or not there any more."""
+        return cls(_own_port(), _own_port(), _own_port())
 
     def translated(self, text: str) -> str:
         """A text of the repository with these ports in the place of its own."""
@@ -70,6 +72,24 @@ def ended(place: Place, command: Sequence[str]) -> Launched:
     launched = place.start_command(command)
     assert launched.wait() == 0, launched.story()
     return launched
+
+
+def _own_port() -> int:
+    """A port that no other test has, and that the kernel gives to no connection: it is below those."""
+    for port in range(20_000 + os.getpid() % 8000, 32_000):
+        claim, probe = socket.socket(socket.AF_UNIX), socket.socket()
+        try:
+            claim.bind(f"\0fmu_mesh_tests_port_{port}")  # no file, and gone with the process
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            claim.close()
+            continue
+        finally:
+            probe.close()
+        _claims.append(claim)
+        return port
+    raise AssertionError("all ports of tests are in use")
 
 
 @contextmanager
