@@ -78,7 +78,7 @@ class KeyEnds:
                 self._blocking.append((KeyOutputs(runner, self._session, counter), counter))
 
     def _subscriber(self, feed: KeyFeed, own: KeyInput) -> _Subscriber:
-        """A subscriber; if steps wait for the key, it also gets what another mesh has published before, or a link lost."""
+        """A subscriber; where steps wait, also for what another mesh has published before, or a link has lost."""
         take = Callback(feed.arrived, indirect=False)
         if not own.wait:
             return self._session.declare_subscriber(own.key, take)

@@ -148,7 +148,9 @@ class KeyFeed:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
             when = said + self._shift + own.delay
             if own.wait and not self._used and when > (first := grid.start_time + own.delay) + grid.rounding(first):
-                text = f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
+                text = (
+                    f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
+                )
                 raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
         step = set_input(runner, own.variable, value, when)
         self._used += 1
