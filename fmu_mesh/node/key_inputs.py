@@ -67,7 +67,8 @@ class KeyFeed:
         variable = runner.instance.description.variable(own.variable)
         assert variable is not None  # the plan has it
         self.runner, self.counter = runner, counter
-        self.words = f"'{own.key}', which feeds '{runner.name}.{own.variable}'"
+        self._name = f"{runner.name}.{own.variable}"
+        self.words = f"'{own.key}', which feeds '{self._name}'"
         self._own, self._post, self._log, self._tell = own, post, log, tell
         self._reader = KeyReader(own, variable, finite=runner.plan.not_finite == "stop")
         self._only_newest = own.time == "arrival" and not own.wait
@@ -108,13 +109,16 @@ class KeyFeed:
         """On the main thread, between two steps."""
         self._posted = False
         values: list[KeyValue] = []
+        at = self.runner.point
         for _ in range(min(len(self._waiting), _MOST_AT_ONCE) if self._begun else 0):
             try:
-                values.append(self._use(self._waiting.popleft()))
+                values.append(self._use(self._waiting.popleft(), at))
             except ValueRefused as refused:
                 self._counts = replace(self._counts, refused=self._counts.refused + 1)
                 self._say("refused", f"is refused: {refused}. More are only counted in `status`")
         if values:
+            self.runner.follow_inputs()
+            self._let_step()
             self._tell(values)
         if self._lost and "lost" not in self._told:
             self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
@@ -125,26 +129,29 @@ class KeyFeed:
             self._posted = True
             self._post(self._take)
 
-    def _use(self, sample: zenoh.Sample) -> KeyValue:
-        """Let a value take effect at its time."""
-        runner, own = self.runner, self._own
-        grid, points, at = runner.grid, runner.plan.step_points, runner.point
+    def _use(self, sample: zenoh.Sample, at: int) -> KeyValue:
+        """Let a value take effect at its time; the instance is at the point ``at``."""
+        grid, points = self.runner.grid, self.runner.plan.step_points
         value, said, is_simulated = self._reader.read(sample)
         if said is None:
-            when = grid.time(self._used * points) if own.wait else None
+            when = grid.time(self._used * points) if self._own.wait else None
         else:
             if self._shift is None:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
-            when = said + self._shift + own.delay
-        step = set_input(runner, own.variable, value, when)
+            when = said + self._shift + self._own.delay
+        step = set_input(self.runner, self._own.variable, value, when, more=True)
         self._used += 1
         if when is not None:
-            self._look_at_time(when, late=step > grid.step_at(when, points))
-            if self.counter is not None and when >= grid.start_time - grid.rounding(when):
-                reached = grid.step_at(when, points)
-                reached -= grid.time(reached * points) > when + grid.rounding(when)  # the last step that begins by then
-                self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
-        return f"{runner.name}.{own.variable}", at, when, to_plain(value)
+            self._look_at_time(when, late=step * points == at and step > grid.step_at(when, points))
+        return self._name, at, when, to_plain(value)
+
+    def _let_step(self) -> None:
+        """The steps that begin by the time of the newest value need not wait for the key any more."""
+        grid, points, when = self.runner.grid, self.runner.plan.step_points, self._newest
+        if self.counter is not None and when is not None and when >= grid.start_time - grid.rounding(when):
+            reached = grid.step_at(when, points)
+            reached -= grid.time(reached * points) > when + grid.rounding(when)
+            self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
 
     def _first_shift(self, said: float, *, is_simulated: bool) -> float:
         grid = self.runner.grid
