@@ -25,7 +25,7 @@ from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.overriding import memory_file, memory_of
-from ..run.preparing import KnownModels, planned
+from ..run.preparing import KnownModels, planned, without_keys
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
@@ -568,7 +568,7 @@ class Mesh:
     def open(self, options: OpenOptions) -> System:
         """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
 
-        Nothing is recorded into a file, and no other process is started.
+        Nothing is recorded into a file, and no other process is started. Inputs with a Zenoh key are free to be set.
 
         Example:
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
@@ -586,7 +586,9 @@ class Mesh:
         """
         from .open_system import System  # noqa: PLC0415  only this needs it
 
-        return System(self.plan(**options.given()))
+        if options.keys_from is not None:
+            raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `system.set`.")
+        return System(without_keys(self.plan(**options.given())))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

@@ -104,6 +104,11 @@ class KeyOutputConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="key_
     field: Annotated[str | None, Meta(description="With `encoding: cdr`, where the value is; default: data.")] = None
     factor: Factor = 1.0
     offset: Factor = 0.0
+    unit: Annotated[str | None, Meta(description="Unit of the values that are published; default: its own.")] = None
+    map: Annotated[
+        dict[str, bool | int | float | str],
+        Meta(description="What is published instead of a value, such as {1: open}; others stay as they are."),
+    ] = {}
     congestion: Annotated[
         Literal["drop", "block"],
         Meta(description="drop: who is too slow loses values, and a warning says so; block: the run waits."),

@@ -77,6 +77,7 @@ class TimedInputs(AroundNativeSteps):
         recorded: Iterable[KeyValue] = (),
     ) -> None:
         super().__init__(instance)
+        self._asked: list[Callable[[], None]] = []
         self._recorded = iter(recorded)
         self._next = next(self._recorded, None)
         self._last = LastValues(timeouts, courses, instance.description)
@@ -128,6 +129,14 @@ class TimedInputs(AroundNativeSteps):
         """Note that ``step`` own steps are done: `do_step` has not taken those without a change."""
         self._step = step
 
+    def ask(self, source: Callable[[], None]) -> None:
+        """Call ``source``, which may `add` values, before each step that Python takes; `expect` says which it takes."""
+        self._asked.append(source)
+
+    def expect(self, step: int) -> None:
+        """Own step ``step`` may change a value, so Python takes it."""
+        self.python_at = min(self.python_at, step)
+
     def add(self, name: str, value: Value, time: float | None) -> int:
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
@@ -167,13 +176,7 @@ class TimedInputs(AroundNativeSteps):
     def _set_changes(self, step: int) -> None:
         """Set what changes in own step ``step``."""
         time = self._time(step)
-        while self._next is not None and self._next[1] <= step * self._points:
-            name = self._next[0].partition(".")[2]
-            variable = self.description.variable(name)
-            assert variable is not None  # the plan has it
-            self._step = step
-            self.add(name, to_value(self._next[3], variable), self._next[2])
-            self._next = next(self._recorded, None)
+        self._take_arrived(step)
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
         if self._last.sent:
             changes |= self._fall_back(step, time)
@@ -192,6 +195,18 @@ class TimedInputs(AroundNativeSteps):
         if others := {name: value for name, value in changes.items() if name not in self._in_row}:
             self._set_in_step(others)
         self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
+
+    def _take_arrived(self, step: int) -> None:
+        """Take what has come by keys: in an earlier run, or now."""
+        while self._next is not None and self._next[1] <= step * self._points:
+            name = self._next[0].partition(".")[2]
+            variable = self.description.variable(name)
+            assert variable is not None  # the plan has it
+            self._step = step
+            self.add(name, to_value(self._next[3], variable), self._next[2])
+            self._next = next(self._recorded, None)
+        for ask in self._asked:
+            ask()
 
     def _fall_back(self, step: int, time: float) -> dict[str, Value]:
         """What inputs fall back to in own step ``step``, which begins at ``time`` (s)."""

@@ -4,14 +4,14 @@ Owns when a value takes effect, and for which value a step waits. Payloads are `
 gets its value is `fmu_mesh.node.inputs`, as for values that are set.
 """
 
-# Threads: one of Zenoh calls `_Feed.arrived`, which counts a sample, puts it into a deque and posts `_take` once. The
-# main thread calls `_take` between two steps, and everything that changes an input. The thread of the server calls
-# `look` and `status`, which read numbers that somebody else writes in one assignment.
+# Threads: one of Zenoh calls `arrived`, which counts a sample, puts it into a deque and posts `_take` once. The main
+# thread calls `_take` between two steps, or `_take_newest` before one, and everything that changes an input. The thread
+# of the server calls `look` and `status`, which read numbers that somebody else writes in one assignment.
 #
 # What may go wrong, and what then happens:
-# * A flood. On arrival only the newest value counts, so there is at most one at each point; of values with times
-#   `_MOST_WAITING` may wait. What is more is counted and lost, and the sender is never held back: it may be a stranger.
-#   `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
+# * A flood. On arrival only the newest value counts, and a step asks for it, so one is decoded at a point; of values
+#   with times `_MOST_WAITING` may wait. What is more is counted and lost. The sender is never held back: it may be a
+#   stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
 # * Silence. A step that waits ends with the deadline of a step. Else the input holds, or falls back (`timeout`).
 # * A step must not wait inside an instance: the main thread would not see the end of the run. So a key that is waited
 #   for limits the node as the window of another node does, by a counter that only the main thread raises.
@@ -32,14 +32,31 @@ from ..system.live_keys import KeyInput, KeyValue
 from ..variables.value_conversion import to_plain
 from ..wire.values import ValueRefused
 from ..wire.views import KeyStatus, LogLine
-from .inputs import set_input
+from .inputs import TimedInputs, set_input
 from .key_payloads import KeyReader
 from .stepping import Runner
 
-__all__ = ["KeyFeed"]
+__all__ = ["KeyFeed", "Patience"]
 
 _MOST_WAITING: Final = 1 << 16
 _MOST_AT_ONCE: Final = 64
+
+
+class Patience:
+    """For how long a runner has been held at one point."""
+
+    def __init__(self, runner: Runner) -> None:
+        self._runner = runner
+        self._since: tuple[int, float] | None = None
+
+    def spent_s(self, most: int, granted: int, now: float) -> float:
+        """The time in s; 0 if it may go on, which it may up to the points ``most`` and ``granted``; ``now`` is in s."""
+        point = self._runner.point
+        if min(point + 1, granted, self._runner.grid.last_point) <= most:
+            self._since = None
+        elif self._since is None or self._since[0] != point:
+            self._since = point, now
+        return now - self._since[1] if self._since is not None else 0.0
 
 
 class KeyFeed:
@@ -72,7 +89,11 @@ class KeyFeed:
         self._own, self._post, self._log, self._tell = own, post, log, tell
         self._reader = KeyReader(own, variable, finite=runner.plan.not_finite == "stop")
         self._only_newest = own.time == "arrival" and not own.wait
-        self._waiting: deque[zenoh.Sample] = deque()
+        self._waiting: deque[zenoh.Sample] = deque(maxlen=1 if self._only_newest else None)
+        assert isinstance(runner.instance, TimedInputs)  # `with_times`
+        self._inputs = runner.instance
+        if self._only_newest:
+            self._inputs.ask(self._take_newest)
         self._posted = self._begun = False
         self._counts = KeyStatus(own.key, own.variable)
         self._received = self._replaced = self._lost = 0
@@ -82,17 +103,15 @@ class KeyFeed:
         self._newest: float | None = None
         self._used = 0
         self._declared_at = time.monotonic()
-        self._blocked: tuple[int, float] | None = None
+        self._patience = Patience(runner)
 
     def arrived(self, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh."""
         self._last_at = time.monotonic()
         self._first_at = self._first_at or self._last_at
         self._received += 1
-        if self._only_newest and self._waiting:
-            self._replaced += 1
-            self._waiting[-1] = sample
-        elif len(self._waiting) < _MOST_WAITING:
+        self._replaced += self._only_newest and bool(self._waiting)
+        if len(self._waiting) < _MOST_WAITING:
             self._waiting.append(sample)
         else:
             self._lost += 1
@@ -107,12 +126,35 @@ class KeyFeed:
 
     def _take(self) -> None:
         """On the main thread, between two steps."""
+        if not self._begun:
+            return
+        if self._only_newest:
+            self._inputs.expect(self.runner.step)
+            self.runner.follow_inputs()
+            return
         self._posted = False
+        self._use(min(len(self._waiting), _MOST_AT_ONCE))
+        if self._lost and "lost" not in self._told:
+            self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
+            if self._own.wait:
+                text = f"a value of {self.words} is lost, because {_MOST_WAITING} wait for their points"
+                raise MeshLost(text, **self._place(), hint="Its publisher has to wait for this run.")
+        if self._waiting and not self._posted:
+            self._posted = True
+            self._post(self._take)
+
+    def _take_newest(self) -> None:
+        """On the main thread, at the begin of a step."""
+        self._posted = False
+        self._use(len(self._waiting))
+
+    def _use(self, count: int) -> None:
+        """Let the first values take effect, each at its time."""
         values: list[KeyValue] = []
         at = self.runner.point
-        for _ in range(min(len(self._waiting), _MOST_AT_ONCE) if self._begun else 0):
+        for _ in range(count):
             try:
-                values.append(self._use(self._waiting.popleft(), at))
+                values.append(self._used_now(self._waiting.popleft(), at))
             except ValueRefused as refused:
                 self._counts = replace(self._counts, refused=self._counts.refused + 1)
                 self._say("refused", f"is refused: {refused}. More are only counted in `status`")
@@ -120,17 +162,8 @@ class KeyFeed:
             self.runner.follow_inputs()
             self._let_step()
             self._tell(values)
-        if self._lost and "lost" not in self._told:
-            self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
-            if self._own.wait:
-                text = f"a value of {self.words} is lost, because {_MOST_WAITING} wait for their points"
-                raise MeshLost(text, **self._place(), hint="Its publisher has to wait for this run.")
-        if self._waiting and self._begun and not self._posted:
-            self._posted = True
-            self._post(self._take)
 
-    def _use(self, sample: zenoh.Sample, at: int) -> KeyValue:
-        """Let a value take effect at its time; the instance is at the point ``at``."""
+    def _used_now(self, sample: zenoh.Sample, at: int) -> KeyValue:
         grid, points = self.runner.grid, self.runner.plan.step_points
         value, said, is_simulated = self._reader.read(sample)
         if said is None:
@@ -162,10 +195,10 @@ class KeyFeed:
     def _look_at_time(self, when: float, *, late: bool) -> None:
         if late and not self._own.wait:
             self._counts = replace(self._counts, late=self._counts.late + 1)
-            self._say("late", "has come after its time, and takes effect at once. Is its `delay` too short?")
+            self._say("late", "has come after its time: a later one stays in effect. Is its `delay` too short?")
         if self._newest is not None and when < self._newest:
             self._counts = replace(self._counts, disordered=self._counts.disordered + 1)
-            self._say("disordered", "is for an earlier time than the one before it; it replaces no later value")
+            self._say("disordered", "is for an earlier time than the one before it: has a clock jumped?")
         self._newest = when if self._newest is None else max(when, self._newest)
 
     def holds(self, point: int) -> bool:
@@ -178,12 +211,9 @@ class KeyFeed:
         Raises:
             DeadlineExceeded: it has not.
         """
-        point = self.runner.point
-        if not self.holds(min(point + 1, granted, self.runner.grid.last_point)):
-            self._blocked = None
-        elif self._blocked is None or self._blocked[0] != point:
-            self._blocked = point, now
-        elif (waited_s := now - self._blocked[1]) > limit_s:
+        if self.counter is None:
+            return
+        if (waited_s := self._patience.spent_s(self.counter.value, granted, now)) > limit_s:
             newest = f"; the last one was for {self._newest:.9g} s" if self._newest is not None else ""
             text = f"no value for this point has come in {waited_s:.1f} s by the key {self.words}{newest}"
             hint = "Is its publisher running, and connected? `timeouts.step` is the longest wait."
@@ -197,13 +227,9 @@ class KeyFeed:
     @property
     def status(self) -> KeyStatus:
         """What has come; from any thread."""
-        received, now = self._received, time.monotonic()
-        rate = (
-            (received - 1) / (self._last_at - self._first_at)
-            if received > 1 and self._last_at > self._first_at
-            else 0.0
-        )
-        age = now - self._last_at if received else None
+        received, took_s = self._received, self._last_at - self._first_at
+        rate = (received - 1) / took_s if took_s > 0.0 else 0.0
+        age = time.monotonic() - self._last_at if received else None
         return replace(self._counts, received=received, replaced=self._replaced, lost=self._lost, rate=rate, age=age)
 
     def _say(self, what: str, text: str) -> None:

@@ -1,25 +1,31 @@
 """Values of outputs under Zenoh keys for other programs.
 
 Those that may be lost are published by the thread of the server, as streams are. Where the file says `block`, the main
-thread publishes them between two steps: the run waits for who is slow, and no row is overwritten before.
+thread publishes them between two steps: the run waits for who is slow, and while a key has no reader, also at the
+start. So no value is lost, but those that are on their way when a link is cut.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
+from zenoh.handlers import Callback
 
+from ..errors import DeadlineExceeded
 from ..rings.host_memory import Counter
 from ..system.live_keys import KeyOutput
+from ..text import listed
 from ..variables.model_description import Value, Variable
 from ..variables.value_types import nested
-from ..wire.session import undeclare_all
+from ..wire.session import matches, undeclare_all
 from ..wire.views import KeyStatus
+from .key_inputs import Patience
 from .key_payloads import key_writer
 from .stepping import Runner
 from .streams import PRIORITY, Picked, RowsFor
@@ -34,17 +40,26 @@ class KeyOutputs(RowsFor):
 
     Args:
         counter: if they block, one more than the last point that is published: the node is never far ahead of it.
+        post: lets the main thread do something, from any thread.
     """
 
-    def __init__(self, runner: Runner, session: zenoh.Session, counter: Counter | None) -> None:
+    def __init__(
+        self,
+        runner: Runner,
+        session: zenoh.Session,
+        counter: Counter | None,
+        post: Callable[[Callable[[], None]], None],
+    ) -> None:
         super().__init__(runner)
         self.counter = counter
+        self._patience = Patience(runner)
         self.window = max(1, runner.outputs.rows // 2) * runner.plan.step_points
         self._sinks: dict[str, list[_Sink]] = {}
         for own in runner.plan.keys_out:
             variable = runner.instance.description.variable(own.variable)
             if own.blocks == (counter is not None) and variable is not None:
-                self._sinks.setdefault(own.variable, []).append(_Sink(own, variable, session))
+                wake = partial(post, self.publish_now) if own.blocks else None
+                self._sinks.setdefault(own.variable, []).append(_Sink(own, variable, session, wake))
 
     def begin(self) -> None:
         """On the main thread, at point 0: from now on each point counts."""
@@ -66,9 +81,26 @@ class KeyOutputs(RowsFor):
                 self.counter.raise_to(point + 1)
 
     def publish_now(self) -> None:
-        """On the main thread: publish all rows, and wait for who is slow."""
-        if self.counter is not None and (batch := self.collect(0)) is not None:
+        """On the main thread: publish all rows while all keys are read, and wait for who is slow."""
+        if not self._unread and (batch := self.collect(0)) is not None:
             self.publish(*batch[1:])
+
+    def check(self, granted: int, now: float, limit_s: float) -> None:
+        """Look whether nobody reads a key that blocks; arguments and errors are those of `KeyFeed.check`."""
+        if self.counter is None or not (unread := self._unread):
+            return
+        runner, most = self.runner, self.counter.value - 1 + self.window
+        if (waited_s := self._patience.spent_s(most, granted, now)) > limit_s:
+            text = f"nobody has read the key {listed(unread)} for {waited_s:.1f} s, which blocks"
+            hint = "Is its reader running, and connected? `timeouts.step` is the longest wait."
+            raise DeadlineExceeded(text, instance=runner.name, hint=hint).at(
+                runner.point, runner.grid.time(runner.point)
+            )
+
+    @property
+    def _unread(self) -> list[str]:
+        """The keys without a reader."""
+        return [sink.key for sinks in self._sinks.values() for sink in sinks if not matches(sink.publisher)]
 
     @property
     def statuses(self) -> Iterator[KeyStatus]:
@@ -77,19 +109,26 @@ class KeyOutputs(RowsFor):
 
     def close(self) -> None:
         """Undeclare the publishers."""
-        undeclare_all(sink.publisher for sinks in self._sinks.values() for sink in sinks)
+        undeclare_all(entity for sinks in self._sinks.values() for sink in sinks for entity in sink.entities)
 
 
 class _Sink:
-    """One key of one variable."""
+    """One key of one variable; ``wake`` is called on a thread of Zenoh when it gets a reader, or loses all."""
 
-    def __init__(self, own: KeyOutput, variable: Variable, session: zenoh.Session) -> None:
+    def __init__(
+        self, own: KeyOutput, variable: Variable, session: zenoh.Session, wake: Callable[[], None] | None
+    ) -> None:
+        self.key = own.key
         self._own, self._session = own, session
         self._write, encoding = key_writer(own, variable)
         congestion = zenoh.CongestionControl.BLOCK if own.blocks else zenoh.CongestionControl.DROP
         self.publisher = session.declare_publisher(
             own.key, encoding=encoding, congestion_control=congestion, priority=PRIORITY
         )
+        self.entities: list[Any] = [self.publisher]
+        if wake is not None:
+            notice: Callback[Any] = Callback(lambda _status: wake(), indirect=False)  # without a thread
+            self.entities.insert(0, self.publisher.declare_matching_listener(notice))
         self._last: object = _NOTHING
         self._slot = -1
         self._count = 0

@@ -145,7 +145,7 @@ def key_writer(own: KeyOutput, variable: Variable) -> tuple[Callable[[Value, int
 
     def value_of(value: Value) -> Any:  # noqa: ANN401  any JSON
         one = value if place is None else flattened(value, len(variable.shape))[place]
-        return to_plain(changed(one, change))
+        return own.map.get(_word(one), to_plain(changed(one, change)))
 
     match own.encoding:
         case "json":

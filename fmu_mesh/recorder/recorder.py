@@ -164,6 +164,7 @@ class Recorder:
         self._thread.join()  # all its waits have deadlines; a slow disk takes its time
         try:
             try:
+                self._take_notes()
                 self._write_rows()
                 if isinstance(error, RunReset):
                     self._files.note({"ended_by": error.message})
@@ -176,6 +177,13 @@ class Recorder:
         finally:
             self._membership.close()
             self._inbox.close()
+
+    def _take_notes(self) -> None:
+        """All nodes have reported: what they have told before, faster rows may have overtaken."""
+        self._inbox.settle(_LAST_S)
+        while (message := self._inbox.poll()) is not None:
+            if message[1] in (SET, KEYS):
+                self._take(message)
 
     def _end(self, cause: BaseException | None) -> None:
         self._finished, self._cause = True, cause

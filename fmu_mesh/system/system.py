@@ -29,7 +29,7 @@ from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.live_keys import KeyInput, KeyOutput, RecordedKeys, resolve_keys
+from fmu_mesh.system.live_keys import KEY, KeyInput, KeyOutput, RecordedKeys, resolve_keys
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
@@ -179,10 +179,10 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     connected = {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
     keys_in, keys_out = resolve_keys(config, variables, connected, unit_of, collected)
     sources = config.sources | connected  # also those of wrong connections
-    free = {f"{name}.{own.variable}" for name, inputs in keys_in.items() for own in inputs}
+    fed = {name for name, source in sources.items() if not source.startswith(KEY)}
     base = grid.step_size if grid is not None else 1.0
     timeouts = {
-        name: tuple(_timeouts(own, config, sources.keys() - free, base, collected))
+        name: tuple(_timeouts(own, config, fed, base, collected))
         for name, own in instances.items()
         if config.instances[name].inputs
     }

@@ -88,6 +88,7 @@ class Inbox:
         self.is_direct = self._sleeps = False
         self._alarm = threading.Condition()
         self._alarm_at = self._looks_at = math.inf
+        self._echo = threading.Event()
         self.refusals = Refusals()
 
     def open(
@@ -163,6 +164,13 @@ class Inbox:
         self._sleeps = False
         return self.poll()
 
+    def settle(self, timeout_s: float) -> None:
+        """Wait until `poll` has all messages that Zenoh has delivered before; not for an owner that reads directly."""
+        if self._subscriber is not None:
+            self._echo.clear()
+            self._send_wake()  # comes after them
+            self._echo.wait(timeout_s)
+
     def wait_until(self, is_so: Callable[[], bool], timeout_s: float) -> bool:
         """Run what is posted, and drop messages, until something is so; whether it was within ``timeout_s`` seconds."""
         deadline = time.monotonic() + timeout_s
@@ -195,7 +203,9 @@ class Inbox:
         key, data = str(sample.key_expr), sample.payload.to_bytes()
         if (sender := self._senders.get(key)) is not None:
             self._arrived.append((sender, data))
-        elif key != self._own_key or data != self._token:
+        elif key == self._own_key and data == self._token:
+            self._echo.set()
+        else:
             self.refusals.add(key, "no participant of this run sends with this key")
 
     def _wake(self) -> None:
