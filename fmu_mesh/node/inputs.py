@@ -22,12 +22,10 @@ from ..results.keys_file import recorded_values
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.input_timeouts import InputTimeout, LastValues
-from ..system.live_keys import KeyValue
 from ..system.plan import InstancePlan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
 from ..variables.model_description import Value
-from ..variables.value_conversion import to_value
 from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
 from .stepping import Runner
@@ -74,7 +72,7 @@ class TimedInputs(AroundNativeSteps):
         warn: Callable[[LogMessage], None] = lambda _message: None,
         *,
         keys: Mapping[str, bool] = MappingProxyType({}),
-        recorded: Iterable[KeyValue] = (),
+        recorded: Iterable[tuple[str, int, float | None, Value]] = (),
     ) -> None:
         super().__init__(instance)
         self._asked: list[Callable[[], None]] = []
@@ -199,11 +197,9 @@ class TimedInputs(AroundNativeSteps):
     def _take_arrived(self, step: int) -> None:
         """Take what has come by keys: in an earlier run, or now."""
         while self._next is not None and self._next[1] <= step * self._points:
-            name = self._next[0].partition(".")[2]
-            variable = self.description.variable(name)
-            assert variable is not None  # the plan has it
+            name, _, when, value = self._next
             self._step = step
-            self.add(name, to_value(self._next[3], variable), self._next[2])
+            self.add(name, value, when)
             self._next = next(self._recorded, None)
         for ask in self._asked:
             ask()
@@ -285,7 +281,8 @@ def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid, warn: Cal
         return instance
     courses = courses_of(plan.scenario, instance.description, grid, plan.step_points)
     keys = {own.variable: own.linear for own in plan.keys_in}
-    recorded = recorded_values(plan.recorded_keys, plan.name) if plan.recorded_keys is not None else ()
+    known = {one.name: one for one in instance.description.variables if one.name in keys}
+    recorded = recorded_values(plan.recorded_keys, plan.name, known) if plan.recorded_keys is not None else ()
     return TimedInputs(instance, interpolation or "hold", courses, plan.timeouts, warn, keys=keys, recorded=recorded)
 
 

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import zenoh
+import zenoh.ext
 from zenoh.handlers import Callback
 
 from ..rings.host_memory import Counter, HostMemory
-from ..system.live_keys import KeyValue
+from ..system.live_keys import KeyInput, KeyValue
 from ..system.memory_map import map_memory
 from ..system.plan import NodePlan
 from ..wire.session import undeclare_all
@@ -20,6 +21,8 @@ from .key_outputs import KeyOutputs
 from .stepping import Runner
 
 __all__ = ["KeyEnds"]
+
+_Subscriber = zenoh.Subscriber[Any] | zenoh.ext.AdvancedSubscriber[Any]
 
 
 class KeyEnds:
@@ -50,7 +53,7 @@ class KeyEnds:
         self._session = session
         self._around = post, log, tell
         self._feeds: list[KeyFeed] = []
-        self._subscribers: list[zenoh.Subscriber[Any]] = []
+        self._subscribers: list[_Subscriber] = []
         self._blocking: list[tuple[KeyOutputs, Counter]] = []
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
@@ -67,12 +70,24 @@ class KeyEnds:
             for own in runner.plan.keys_in:
                 counter = counters.get(f"{own.key} > {runner.name}.{own.variable}")
                 self._feeds.append(feed := KeyFeed(own, runner, counter, *self._around))
-                take = Callback(feed.arrived, indirect=False)
-                self._subscribers.append(self._session.declare_subscriber(own.key, take))
+                self._subscribers.append(self._subscriber(feed, own))
             if any(not own.blocks for own in runner.plan.keys_out):
                 self.lossy.append(KeyOutputs(runner, self._session, None, self._around[0]))
             if (counter := counters.get(f"keys of {runner.name}")) is not None:
                 self._blocking.append((KeyOutputs(runner, self._session, counter, self._around[0]), counter))
+
+    def _subscriber(self, feed: KeyFeed, own: KeyInput) -> _Subscriber:
+        """A subscriber; if steps wait for the key, it also gets what was published before, or lost with a link."""
+        take = Callback(feed.arrived, indirect=False)
+        if not own.wait:
+            return self._session.declare_subscriber(own.key, take)
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self._session, own.key, take, history=history, recovery=recovery
+        )
+        subscriber.sample_miss_listener(Callback(feed.missed, indirect=False))
+        return subscriber
 
     def begin(self) -> None:
         """At point 0: use what has come before, and publish the first values."""

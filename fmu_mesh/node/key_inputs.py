@@ -24,6 +24,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import zenoh
+import zenoh.ext
 from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, MeshLost
@@ -115,6 +116,14 @@ class KeyFeed:
             self._waiting.append(sample)
         else:
             self._lost += 1
+        self._post_take()
+
+    def missed(self, miss: zenoh.ext.Miss) -> None:
+        """On a thread of Zenoh: so many values of another mesh were lost on their way, and cannot be had again."""
+        self._lost += miss.nb
+        self._post_take()
+
+    def _post_take(self) -> None:
         if not self._posted:
             self._posted = True
             self._post(self._take)
@@ -135,13 +144,13 @@ class KeyFeed:
         self._posted = False
         self._use(min(len(self._waiting), _MOST_AT_ONCE))
         if self._lost and "lost" not in self._told:
-            self._say("lost", f"is lost, because {_MOST_WAITING} wait for their points. More are only counted")
+            why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
+            self._say("lost", f"{why}. More are only counted")
             if self._own.wait:
-                text = f"a value of {self.words} is lost, because {_MOST_WAITING} wait for their points"
-                raise MeshLost(text, **self._place(), hint="Its publisher has to wait for this run.")
-        if self._waiting and not self._posted:
-            self._posted = True
-            self._post(self._take)
+                hint = "Its publisher has to wait for this run."
+                raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
+        if self._waiting:
+            self._post_take()
 
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
@@ -164,15 +173,20 @@ class KeyFeed:
             self._tell(values)
 
     def _used_now(self, sample: zenoh.Sample, at: int) -> KeyValue:
-        grid, points = self.runner.grid, self.runner.plan.step_points
+        own, grid, points = self._own, self.runner.grid, self.runner.plan.step_points
         value, said, is_simulated = self._reader.read(sample)
         if said is None:
-            when = grid.time(self._used * points) if self._own.wait else None
+            when = grid.time(self._used * points) if own.wait else None
         else:
             if self._shift is None:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
-            when = said + self._shift + self._own.delay
-        step = set_input(self.runner, self._own.variable, value, when, more=True)
+            when = said + self._shift + own.delay
+            if own.wait and not self._used and when > (first := grid.start_time + own.delay) + grid.rounding(first):
+                text = (
+                    f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
+                )
+                raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
+        step = set_input(self.runner, own.variable, value, when, more=True)
         self._used += 1
         if when is not None:
             self._look_at_time(when, late=step * points == at and step > grid.step_at(when, points))

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 import zenoh
+import zenoh.ext
 from numpy.typing import NDArray
 from zenoh.handlers import Callback
 
@@ -33,6 +34,12 @@ from .streams import PRIORITY, Picked, RowsFor
 __all__ = ["KeyOutputs"]
 
 _NOTHING: Final = object()
+
+_KEPT: Final = 1 << 10
+"""Values that who waits for them gets again: those from before it came, and those that a link has lost."""
+
+_BEAT_S: Final = 0.2
+"""How often in s it is told which value was the last one, if there was one."""
 
 
 class KeyOutputs(RowsFor):
@@ -73,10 +80,11 @@ class KeyOutputs(RowsFor):
             for keys, rows in lists:
                 row, first = rows[offset], 0
                 for sinks, size, shape in keys:
-                    value = nested(row[first : first + size], shape)
+                    elements = row[first : first + size]
+                    value = nested(elements, shape)
                     first += size
                     for sink in sinks:
-                        sink.publish(value, point, time_s)
+                        sink.publish(value if sink.place is None else elements[sink.place], point, time_s)
             if self.counter is not None:
                 self.counter.raise_to(point + 1)
 
@@ -100,7 +108,7 @@ class KeyOutputs(RowsFor):
     @property
     def _unread(self) -> list[str]:
         """The keys without a reader."""
-        return [sink.key for sinks in self._sinks.values() for sink in sinks if not matches(sink.publisher)]
+        return [sink.key for sinks in self._sinks.values() for sink in sinks if not sink.is_read]
 
     @property
     def statuses(self) -> Iterator[KeyStatus]:
@@ -113,33 +121,53 @@ class KeyOutputs(RowsFor):
 
 
 class _Sink:
-    """One key of one variable; ``wake`` is called on a thread of Zenoh when it gets a reader, or loses all."""
+    """One key of one variable, or of the element at ``place``.
+
+    If it blocks, ``wake`` is called on a thread of Zenoh when it gets a reader, or loses all. Then values are also kept
+    for who waits for the key and comes late, or whose link was cut.
+    """
 
     def __init__(
         self, own: KeyOutput, variable: Variable, session: zenoh.Session, wake: Callable[[], None] | None
     ) -> None:
         self.key = own.key
         self._own, self._session = own, session
+        self.place = int(np.ravel_multi_index(own.index, variable.shape)) if own.index else None
         self._write, encoding = key_writer(own, variable)
-        congestion = zenoh.CongestionControl.BLOCK if own.blocks else zenoh.CongestionControl.DROP
-        self.publisher = session.declare_publisher(
-            own.key, encoding=encoding, congestion_control=congestion, priority=PRIORITY
-        )
-        self.entities: list[Any] = [self.publisher]
-        if wake is not None:
-            notice: Callback[Any] = Callback(lambda _status: wake(), indirect=False)  # without a thread
-            self.entities.insert(0, self.publisher.declare_matching_listener(notice))
         self._last: object = _NOTHING
         self._slot = -1
         self._count = 0
         self._first_at = self._last_at = 0.0
+        self._publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
+        if wake is None:
+            self._publisher = self._told = session.declare_publisher(own.key, encoding=encoding, priority=PRIORITY)
+            self.entities: list[Any] = [self._publisher]
+            return
+        self._publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            own.key,
+            encoding=encoding,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=PRIORITY,
+            cache=zenoh.ext.CacheConfig(_KEPT),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_BEAT_S),
+            publisher_detection=True,
+        )
+        self._told = session.declare_publisher(own.key)  # only it knows readers
+        notice: Callback[Any] = Callback(lambda _status: wake(), indirect=False)  # without a thread
+        self.entities = [self._told.declare_matching_listener(notice), self._told, self._publisher]
+
+    @property
+    def is_read(self) -> bool:
+        """Whether somebody subscribes to the key."""
+        return matches(self._told)
 
     def publish(self, value: Value, point: int, time_s: float) -> None:
         """Publish a value, if one is due at this point."""
         if (slot := point // self._own.every) == self._slot or (self._own.on == "change" and value == self._last):
             return
         self._slot, self._last = slot, value
-        self.publisher.put(self._write(value, point, time_s), timestamp=self._session.new_timestamp())
+        self._publisher.put(self._write(value, point, time_s), timestamp=self._session.new_timestamp())
         self._last_at = time.monotonic()
         self._first_at = self._first_at or self._last_at
         self._count += 1

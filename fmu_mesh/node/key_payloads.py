@@ -20,14 +20,20 @@ from ..system.live_keys import KeyInput, KeyOutput, KeyPath, field_parts, second
 from ..variables.model_description import Value, Variable
 from ..variables.units import Linear
 from ..variables.value_conversion import ValueRefused, checked_value, to_plain
-from ..variables.value_types import flattened
+from ..variables.value_types import PlainValue
 from ..wire.messages import decode_json
 from ..wire.values import MAX_VALUE_SIZE
 
 __all__ = ["KeyReader", "TimedValue", "key_writer"]
 
 _SHOWN: Final = 80
-_ENCODINGS: Final = {"application/json": "json", "text/json": "json", "text/plain": "text", "application/cdr": "cdr"}
+_ENCODINGS: Final = {
+    "application/json": "json",
+    "text/json": "json",
+    "text/plain": "text",
+    "zenoh/string": "text",
+    "application/cdr": "cdr",
+}
 _VALUE: Final = "value"
 _NOTHING: Final = object()
 
@@ -97,10 +103,12 @@ class KeyReader:
                 return self._from_text(data, kind)
 
     def _from_text(self, data: bytes, kind: str) -> tuple[Any, Any]:
+        has_parts = self._field is not None or self._time is not None
+        is_one_text = self._variable.type == "String" and not self._variable.shape and not has_parts
         try:
-            found = decode_json(data, object) if kind != "text" or self._variable.type != "String" else _NOTHING
+            found = decode_json(data, object) if kind != "text" or not is_one_text else _NOTHING
         except MessageRefused as error:
-            if kind == "json" or self._field is not None or self._time is not None:
+            if kind == "json" or has_parts:
                 raise ValueRefused(f"it is no JSON ({error})") from error
             found = _NOTHING
         if found is _NOTHING:
@@ -140,12 +148,14 @@ def _word(plain: object) -> str:
 
 
 def key_writer(own: KeyOutput, variable: Variable) -> tuple[Callable[[Value, int, float], bytes], zenoh.Encoding]:
-    """What makes a payload of a value, its point and its time in s, and its encoding."""
-    change, place = Linear(own.factor, own.offset), _flat_place(own, variable)
+    """What makes a payload of a value, its point and its time in s, and its encoding.
 
-    def value_of(value: Value) -> Any:  # noqa: ANN401  any JSON
-        one = value if place is None else flattened(value, len(variable.shape))[place]
-        return own.map.get(_word(one), to_plain(changed(one, change)))
+    The value is that of the variable, or of its element.
+    """
+    change = Linear(own.factor, own.offset)
+
+    def value_of(value: Value) -> PlainValue:
+        return own.map.get(_word(value), to_plain(changed(value, change)))
 
     match own.encoding:
         case "json":
@@ -164,16 +174,10 @@ def key_writer(own: KeyOutput, variable: Variable) -> tuple[Callable[[Value, int
         case "float64":
 
             def doubles(value: Value, _point: int, _time: float) -> bytes:
-                one = value if place is None else flattened(value, len(variable.shape))[place]
-                return np.asarray(changed(one, change), "<f8").tobytes()
+                return np.asarray(changed(value, change), "<f8").tobytes()
 
             return doubles, zenoh.Encoding.ZENOH_BYTES
         case "cdr":
-            scalar = msgspec.structs.replace(variable, shape=(), dimensions=()) if place is not None else variable
+            scalar = msgspec.structs.replace(variable, shape=(), dimensions=()) if own.index else variable
             messages = message_writer(own, scalar)
             return lambda value, _point, time: messages.make([value_of(value)], time), zenoh.Encoding.APPLICATION_CDR
-
-
-def _flat_place(own: KeyOutput, variable: Variable) -> int | None:
-    """Which of the elements, row by row, is published; None: the whole variable."""
-    return int(np.ravel_multi_index(own.index, variable.shape)) if own.index else None

@@ -8,7 +8,7 @@ writes nor who reads keeps the lines in memory.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +18,9 @@ from ..errors import ConfigurationError
 from ..files import opened, replaced, sha256_of
 from ..system.live_keys import KeyValue, RecordedKeys
 from ..system.records import IN_MEMORY
+from ..text import shown
+from ..variables.model_description import Value, Variable
+from ..variables.value_conversion import ValueRefused, checked_value
 
 __all__ = ["KEYS_ENDING", "KeysFile", "keys_beside", "recorded_keys", "recorded_values"]
 
@@ -93,8 +96,12 @@ def recorded_keys(path: Path) -> RecordedKeys:
         raise ConfigurationError(text, hint="It is written beside the first result file of a run with keys.") from error
 
 
-def recorded_values(recorded: RecordedKeys, instance: str) -> Iterator[KeyValue]:
-    """The values for one instance, in their order; the last line may be cut off where a run was killed.
+def recorded_values(
+    recorded: RecordedKeys, instance: str, variables: Mapping[str, Variable]
+) -> Iterator[tuple[str, int, float | None, Value]]:
+    """The values for one instance, in their order, by the names of its ``variables`` that get values of keys.
+
+    The last line may be cut off where a run was killed.
 
     Raises:
         ConfigurationError: the file cannot be read, has changed since the run was planned, or is something else.
@@ -109,7 +116,13 @@ def recorded_values(recorded: RecordedKeys, instance: str) -> Iterator[KeyValue]
             if not line.startswith(own):
                 continue
             try:
-                yield decode(line)
-            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                name, point, time, plain = decode(line)
+                variable = variables.get(name.partition(".")[2])
+                if variable is None:
+                    raise ValueRefused(f"'{name}' gets no values of keys in this run")
+                value = checked_value(plain, variable, shown(plain))
+            except (msgspec.DecodeError, UnicodeDecodeError, ValueRefused) as error:
                 if line.endswith(b"\n"):
                     raise ConfigurationError(f"line {number} of '{path}' is no value of a key: {error}") from error
+                return
+            yield variable.name, point, time, value

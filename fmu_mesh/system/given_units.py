@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -60,6 +61,8 @@ def changed(plain: Any, change: Linear) -> Any:  # noqa: ANN401  whatever a file
     if isinstance(plain, list):
         return [changed(one, change) for one in plain]
     is_number = isinstance(plain, int | float) and not isinstance(plain, bool)
+    if isinstance(plain, int) and abs(plain) > sys.float_info.max:
+        return plain  # it is no Real either
     return change.factor * plain + change.offset if is_number else plain
 
 

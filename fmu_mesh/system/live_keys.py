@@ -309,6 +309,8 @@ class _Resolving(msgspec.Struct):
             add(f"{path}.delay", f"{entry.delay:g}", "a time >= 0 in s")
         fields = {"field": entry.field, "time": entry.time if has_time and entry.time != "timestamp" else None}
         for name, field in fields.items() if entry.encoding != "cdr" else ():
+            if field is not None and entry.encoding == "float64":
+                add(f"{path}.{name}", f"the field '{field}' of doubles, which have none", "`encoding: json`")
             try:
                 field_parts(field if field is not None else "value")
             except ValueError:

@@ -128,7 +128,7 @@ def test_values_of_a_key_are_those_that_each_step_would_set(
     interpolation: Literal["hold", "linear"], tmp_path: Path
 ) -> None:
     """What has come for later steps is calculated ahead, for steps that Python does not take."""
-    numbers, ahead, late = random.Random(40), 0, 0
+    numbers, ahead, late = random.Random(40), 0, 0  # noqa: S311  no secret
     both = [Steps(tmp_path / str(by_key), interpolation, by_key=by_key) for by_key in (False, True)]
     for steps in both:
         steps.bind()
