@@ -243,6 +243,7 @@ NOT_RUN = [
         "CONFIG and router are yours; tests/faults/test_by_hand.py starts these parts",
     ),
     ("bridges/ros2dds/README.md", "./build", ".ci/long builds it, and tests/ros/test_bridge.py runs it"),
+    ("bridges/zenoh/README.md", "./build", ".ci/long builds it, and tests/mqtt/test_mqtt_and_http.py runs it"),
     (
         "docs/commands.md",
         "$ fmu-mesh launch configs/pendulum_delay.yaml --real-time-factor 1 --restarts 3",
@@ -257,6 +258,66 @@ NOT_RUN = [
         "docs/dashboard.md",
         "fmu-mesh dashboard",
         "it serves until somebody ends it; tests/equivalence/test_dashboard_page.py opens the page in a browser",
+    ),
+    (
+        "docs/digital-twin.md",
+        "connections:",
+        "tests/mqtt/test_digital_twin.py runs configs/pump_twin.yaml, which has these lines",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh-zenoh-bridge bridges/zenoh/config.json5",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh launch configs/pump_twin.yaml --listen tcp/127.0.0.1:7447 --no-progress",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "mosquitto_sub -v -t 'twin/#'",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "mosquitto_pub -q 1 -t plant/pump/speed -m '{\"rpm\": 2400}'",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "curl http://127.0.0.1:8000/fmu_mesh/pump_twin/pump/out/forecast",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "curl -N -H 'accept: text/event-stream' 'http://127.0.0.1:8000/twin/**'",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh dashboard pump_twin",
+        "it needs a running twin; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh stop pump_twin",
+        "it needs the result of the story; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "connections:",
+        "it is a part; tests/mqtt/test_digital_twin.py runs it in a complete file",
+    ),
+    (
+        "docs/digital-twin.md",
+        "connections:",
+        "it is a part; tests/mqtt/test_digital_twin.py runs it in a complete file",
+    ),
+    (
+        "docs/digital-twin.md",
+        "docker compose --file docker/twin.compose.yaml up --build",
+        "there is no engine of containers here; tests/mqtt/test_twin_compose.py runs the commands of the services",
     ),
     (
         "docs/foxglove.md",
