@@ -17,6 +17,7 @@ SMALLEST = 8 + 24
 """Bytes of a number that is kept in a list."""
 
 
+@pytest.mark.timeout(900)
 def test_no_client_loses_a_value_and_each_run_can_be_repeated(capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["--parts", "clients", "--seconds", str(max(2.0, POINTS / 1e5)), "--repeat", "1"])
 
