@@ -375,10 +375,10 @@ def _flood_table(runs: Sequence[Watched]) -> str:
         before, most, files, most_files = run.grown(0.25)
         own = run.figures
         kind = "on arrival" if own["kind"] == "arrival" else "at its time"
-        counts = [f"{own[name]:,}" for name in ("received", "replaced", "lost")]
+        counts = [f"{own[name]:,}" for name in ("received", "replaced", "lost", "refused")]
         rates = f"{own['rate']:,.0f}", f"{own['points']:,.0f}"
         rows.append((kind, *rates, *counts, f"{before:.0f}", f"{most:.0f}", files, most_files))
-    header = ("a value takes effect", "sent/s", "points/s of 1,000", "received", "replaced", "lost")
+    header = ("a value takes effect", "sent/s", "points/s of 1,000", "received", "replaced", "lost", "refused")
     return markdown_table((*header, "memory after a quarter, MB", "most after that, MB", "open files", "most"), rows)
 
 

@@ -78,7 +78,7 @@ class KeyFeed:
         own: KeyInput,
         runner: Runner,
         counter: Counter | None,
-        post: Callable[[Callable[[], None]], None],
+        post: Callable[..., None],
         log: Callable[[LogLine], None],
         tell: Callable[[Sequence[KeyValue]], None],
     ) -> None:
@@ -123,10 +123,10 @@ class KeyFeed:
         self._lost += miss.nb
         self._post_take()
 
-    def _post_take(self) -> None:
+    def _post_take(self, *, later: bool = False) -> None:
         if not self._posted:
             self._posted = True
-            self._post(self._take)
+            self._post(self._take, later=later)
 
     def begin(self) -> None:
         """At point 0: use what has come before."""
@@ -141,7 +141,6 @@ class KeyFeed:
             self._inputs.expect(self.runner.step)
             self.runner.follow_inputs()
             return
-        self._posted = False
         self._use(min(len(self._waiting), _MOST_AT_ONCE))
         if self._lost and "lost" not in self._told:
             why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
@@ -149,8 +148,9 @@ class KeyFeed:
             if self._own.wait:
                 hint = "Its publisher has to wait for this run."
                 raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
+        self._posted = False  # not before: each that arrives would end the next steps after one
         if self._waiting:
-            self._post_take()
+            self._post_take(later=True)
 
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
