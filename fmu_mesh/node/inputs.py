@@ -135,11 +135,11 @@ class TimedInputs(AroundNativeSteps):
         """Own step ``step`` may change a value, so Python takes it."""
         self.python_at = min(self.python_at, step)
 
-    def add(self, name: str, value: Value, time: float | None) -> int:
+    def add(self, name: str, value: Value, time: float | None, most: int = _WAITING) -> int:
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
-            ValueRefused: too many values wait for their time.
+            ValueRefused: so many values wait for their time already.
         """
         now = self._time(self._step)
         when = now if time is None else time
@@ -153,8 +153,8 @@ class TimedInputs(AroundNativeSteps):
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
             self._trajectories[name] = trajectory
-        if len(self._trajectories[name]) >= _WAITING:
-            raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
+        if len(self._trajectories[name]) >= most:
+            raise ValueRefused(f"{most} values of '{name}' wait for their time already")
         step = max(step, self._step)
         # A line changes in each step from now on. A value that holds changes nothing before its own step. What was sent
         # is calculated ahead up to the last value at most.
@@ -199,7 +199,7 @@ class TimedInputs(AroundNativeSteps):
         while self._next is not None and self._next[1] <= step * self._points:
             name, _, when, value = self._next
             self._step = step
-            self.add(name, value, when)
+            self.add(name, value, when, ENDLESS)  # when the first run took it, there was room
             self._next = next(self._recorded, None)
         for ask in self._asked:
             ask()

@@ -270,6 +270,23 @@ def test_a_parameter_with_a_time_holds_from_it_and_otherwise_at_once(linear: Ste
     assert used == [10.0, 10.0, 10.0, 20.0, 20.0]  # a parameter does not change in between, as inputs do here
 
 
+def test_what_an_earlier_run_took_is_never_too_much(tmp_path: Path) -> None:
+    """That run may have forgotten past values some steps earlier."""
+    values = [("u", 0, 1.0 + number * 1e-4, float(number)) for number in range(70_000)]
+    path = FMUS / "Gain.fmu"
+    inputs = TimedInputs(Fmi2Instance(path, "gain", read_description(path), tmp_path), "hold", recorded=values)
+    ring = Ring(Layout.of([("y", "Float64")]), 4)
+    inputs.enter_initialization(1.0, None, {})
+    inputs.exit_initialization()
+    inputs.bind(Ring(Layout.of([]), 1), (ring,), TimeGrid(1.0, STEP_SIZE, 60), 1)
+
+    inputs.do_step(0)
+    inputs.do_step(1)
+
+    assert [ring.value(row, "y") for row in (1, 2)] == [0.0, 1000.0]
+    inputs.close()
+
+
 def test_an_instance_follows_times_from_the_first_value_with_one_on(tmp_path: Path) -> None:
     path = FMUS / "Gain.fmu"
     instance = Fmi2Instance(path, "gain", read_description(path), tmp_path)
