@@ -45,7 +45,7 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.start_time + point * self.step_size
 
     def times(self, first: int, end: int, points: int = 1) -> NDArray[np.float64]:
-        """The times of the points ``first .. end - 1``, or of each own step there, in s, bit for bit those of `time`."""
+        """The times of the points ``first .. end - 1``, or of own steps there, in s, bit for bit those of `time`."""
         import numpy as np  # noqa: PLC0415 many commands need no array, and it takes as long as all the rest
 
         times: NDArray[np.float64] = self.start_time + np.arange(first, end, points, dtype=np.float64) * self.step_size
