@@ -367,7 +367,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
     given = {variable.name for variable in instance.description.with_causality("output")}
-    driven = {own.variable for own in (*instance.scenario, *instance.keys_in)}
+    driven = {own.variable for own in instance.scenario} | {own.variable for own in instance.keys_in}
     checked = tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
     return InstancePlan(
         name=instance.name,
