@@ -23,11 +23,13 @@ class Trajectory:
         >>> trajectory.value(1.0, resolution=1e-9)
         2.0
 
-    ``linear`` says whether the input is linear between two times, or constant from each time on.
+    ``linear`` says whether the input is linear between two times, or constant from each time on; ``held`` is the time
+    of a value that holds until the next one in any case.
     """
 
     def __init__(self, *, linear: bool) -> None:
         self.linear = linear
+        self.held: float | None = None
         self._times: list[float] = []
         self._values: list[Value] = []
 
@@ -36,6 +38,8 @@ class Trajectory:
 
     def add(self, time: float, value: Value) -> None:
         """The input has this value from ``time`` (s) on; it replaces the value for the same time."""
+        if time == self.held:
+            self.held = None
         place = bisect_left(self._times, time)
         if place < len(self._times) and self._times[place] == time:
             self._values[place] = value
@@ -53,7 +57,7 @@ class Trajectory:
             del self._times[:place], self._values[:place]
             place = 0
         start, value = self._times[place], self._values[place]
-        if not self.linear or place + 1 == len(self._times) or start >= time - resolution:
+        if not self.linear or place + 1 == len(self._times) or start >= time - resolution or start == self.held:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
         return between(value, right, (time - start) / (end - start))

@@ -101,12 +101,14 @@ def recorded_values(
 ) -> Iterator[tuple[str, int, float | None, Value]]:
     """The values for one instance, in their order, by the names of its ``variables`` that get values of keys.
 
-    The last line may be cut off where a run was killed.
+    The last line may be cut off where a run was killed. The file of a run to which nothing has come is `os.devnull`.
 
     Raises:
         ConfigurationError: the file cannot be read, has changed since the run was planned, or is something else.
     """
     path = Path(recorded.path)
+    if recorded.path == os.devnull:
+        return
     if recorded_keys(path) != recorded:
         raise ConfigurationError(f"'{path}' has changed since the run was planned", hint="Start the run again.")
     decode = msgspec.json.Decoder(KeyValue).decode
@@ -117,12 +119,11 @@ def recorded_values(
                 continue
             try:
                 name, point, time, plain = decode(line)
-                variable = variables.get(name.partition(".")[2])
-                if variable is None:
-                    raise ValueRefused(f"'{name}' gets no values of keys in this run")
+                variable = variables[name.partition(".")[2]]
                 value = checked_value(plain, variable, shown(plain))
-            except (msgspec.DecodeError, UnicodeDecodeError, ValueRefused) as error:
+            except (msgspec.DecodeError, UnicodeDecodeError, ValueRefused, KeyError) as error:
                 if line.endswith(b"\n"):
-                    raise ConfigurationError(f"line {number} of '{path}' is no value of a key: {error}") from error
+                    why = f"'{instance}' has no key for {error}" if isinstance(error, KeyError) else error
+                    raise ConfigurationError(f"line {number} of '{path}' is no value of a key: {why}") from error
                 return
             yield variable.name, point, time, value

@@ -58,7 +58,7 @@ def open_results(
             recording = Recording(loaded, descriptions, record.variables, place, record.first, record.every)
             if digest:
                 metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
-                recording = replace(recording, metadata=to_builtins(metadata))
+                recording = replace(recording, metadata=to_builtins(metadata) | _keys_of(system, record.file))
             files.append(required_format(record.file).open(Path(record.file), recording))
     except BaseException:
         for file in files:
@@ -66,6 +66,12 @@ def open_results(
                 file.close()
         raise
     return files
+
+
+def _keys_of(system: ResolvedSystem, result: str) -> dict[str, str]:
+    """Where the values of keys are that a run gets from an earlier one: its own results can be repeated, too."""
+    own = system.recorded_keys
+    return {"keys": os.path.relpath(own.path, Path(result).parent)} if own and own.path != os.devnull else {}
 
 
 def open_result(loaded: LoadedConfig, system: ResolvedSystem) -> ResultFile:

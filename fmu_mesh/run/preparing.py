@@ -230,6 +230,9 @@ def _repeated(system: ResolvedSystem, result: Path) -> ResolvedSystem:
     """The system with the values of keys of an earlier run, and without keys of its own."""
     known = result.name.endswith(KEYS_ENDING) or not result.is_file() or str(result) == os.devnull
     recorded = recorded_keys(result if known else keys_beside(result))
+    if system.result_file is not None and recorded.path == str(keys_beside(Path(system.result_file)).absolute()):
+        text = f"'{system.result_file}' is the result whose values of keys this run takes, and would be replaced"
+        raise ConfigurationError(text, hint="Write this one to another file with `output=...`.")
     alone = {name: replace(own, keys_out=()) for name, own in system.instances.items()}
     return replace(system, instances=alone, recorded_keys=recorded)
 

@@ -152,17 +152,12 @@ def some_json(random: Random, depth: int = 0) -> object:
     texts = ("NaN", "INF", "", "a", "1.5", "true", "\0", "\ud800", "2026-01-01T00:00:00Z", "AP8=", "low", "x" * 999)
     times = ("0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59.999999-23:59")
     numbers = (0, 1, -1, 2**63, 2**64, -(2**63), 10**30, 10**400, -(10**4000), 1e308, 5e-324, 1e39, math.nan, math.inf)
+    usual = random.random(), random.randrange(-5, 300), random.randrange(-(2**70), 2**70), random.uniform(-1e300, 1e300)
     match kind:
-        case 0:
-            return random.choice(numbers)
-        case 1:
-            return random.choice(texts + times)
-        case 2:
-            return random.choice((True, False, None))
-        case 3:
-            return random.uniform(-1e300, 1e300)
-        case 4 | 5 | 6 | 7:
-            return random.choice((random.random(), random.randrange(-5, 300), random.randrange(-(2**70), 2**70)))
+        case 0 | 1 | 2:
+            return random.choice((numbers, (*texts, *times), (True, False, None))[kind])
+        case 3 | 4 | 5 | 6 | 7:
+            return random.choice(usual)
         case 8 | 9:
             return [some_json(random, depth + 1) for _ in range(random.choice((0, 1, 2, 2, 3, 3, 6)))]
         case _:
@@ -177,10 +172,9 @@ def some_payload(random: Random) -> bytes:
             if random.random() < 0.15:
                 data[random.randrange(len(data))] = random.randrange(256)
             return bytes(data[: random.randrange(len(data) + 1)] if random.random() < 0.1 else data)
-        case 5 | 6:
-            return random.randbytes(random.choice((0, 1, 4, 8, 8, 12, 16, 24, 48, 60)))
-        case 7:
-            return b"\0\1\0\0" + bytes(random.choice((0, 0, 1, 2, 255)) for _ in range(random.choice((0, 8, 16, 40))))
+        case 5 | 6 | 7:
+            header = random.choice((b"", b"\0\1\0\0"))
+            return header + bytes(random.choice((0, 0, 1, 255, 7)) for _ in range(random.choice((0, 1, 4, 8, 16, 40))))
         case 8:
             return struct.pack("<d", random.choice((math.nan, 1.0, math.inf, -0.0))) * random.choice((1, 1, 6))
         case 9:
@@ -270,8 +264,7 @@ def test_any_payload_is_a_value_or_refused(part: int, sent: Callable[..., zenoh.
         sample = sent(data, random.choice(ZENOH_ENCODINGS), stamped=random.random() < 0.7)
         try:
             read = reader.read(sample)
-        except ValueRefused as refused:
-            assert str(refused)
+        except ValueRefused:
             outcomes[own.encoding, False] += 1
         else:
             assert_is_a_value(read, one, own)
