@@ -74,7 +74,12 @@ class Trajectory:
         following = np.minimum(place + 1, len(own_times) - 1)
         with np.errstate(all="ignore"):  # where two times are equal, the line is not used
             line = values + (own_values[following] - values) * ((times - start) / (own_times[following] - start))
-        return np.where((following == place) | (start >= times - resolutions), values, line)
+        holds = (
+            (following == place)
+            | (start >= times - resolutions)
+            | (start == (np.nan if self.held is None else self.held))
+        )
+        return np.where(holds, values, line)
 
     @property
     def last(self) -> float:

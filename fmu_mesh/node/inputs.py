@@ -152,7 +152,7 @@ class TimedInputs(AroundNativeSteps):
             trajectory = Trajectory(linear=linear)
             if when > now:
                 trajectory.add(now, self._instance.get_values([name])[0])
-                trajectory.held = now if name in self._linear_names else None  # no line to the first value of a key
+                trajectory.held = now if self._keys.get(name) else None  # no line to the first value of a key
             self._trajectories[name] = trajectory
         if len(self._trajectories[name]) >= most:
             raise ValueRefused(f"{most} values of '{name}' wait for their time already")

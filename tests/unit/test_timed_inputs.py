@@ -36,14 +36,19 @@ class Steps:
     """A gain of 1 whose input is not connected, from second 1 on in steps of a tenth."""
 
     def __init__(
-        self, folder: Path, interpolation: Literal["hold", "linear"], *timeouts: InputTimeout, by_key: bool = False
+        self,
+        folder: Path,
+        interpolation: Literal["hold", "linear"],
+        *timeouts: InputTimeout,
+        by_key: bool = False,
+        in_row: bool = False,
     ) -> None:
         path = FMUS / "Gain.fmu"
         self.warnings: list[LogMessage] = []
         instance = Fmi2Instance(path, "gain", read_description(path), folder)
         keys = {"u": interpolation == "linear"} if by_key else {}
         self.inputs = TimedInputs(instance, interpolation, {}, timeouts, self.warnings.append, keys=keys)
-        self.rings = Ring(Layout.of([("u", "Float64")] if by_key else []), 1), Ring(Layout.of([("y", "Float64")]), 64)
+        self.rings = Ring(Layout.of([("u", "Float64")] if in_row else []), 1), Ring(Layout.of([("y", "Float64")]), 64)
         self.inputs.enter_initialization(1.0, None, {"u": 5.0})
         self.inputs.exit_initialization()
         self.step = 0
@@ -129,7 +134,7 @@ def test_values_of_a_key_are_those_that_each_step_would_set(
 ) -> None:
     """What has come for later steps is calculated ahead, for steps that Python does not take."""
     numbers, ahead, late = random.Random(40), 0, 0  # noqa: S311  no secret
-    both = [Steps(tmp_path / str(by_key), interpolation, by_key=by_key) for by_key in (False, True)]
+    both = [Steps(tmp_path / str(in_row), interpolation, by_key=True, in_row=in_row) for in_row in (False, True)]
     for steps in both:
         steps.bind()
 
@@ -151,7 +156,7 @@ def test_values_of_a_key_are_those_that_each_step_would_set(
 
 
 def test_a_value_for_later_does_not_end_what_was_calculated_ahead(tmp_path: Path) -> None:
-    steps = Steps(tmp_path, "hold", by_key=True)
+    steps = Steps(tmp_path, "hold", by_key=True, in_row=True)
     steps.bind()
     for number in range(20):
         steps.inputs.add("u", float(number), 1.0 + number * STEP_SIZE)
