@@ -44,11 +44,11 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The time of ``point`` in s."""
         return self.start_time + point * self.step_size
 
-    def times(self, first: int, end: int) -> NDArray[np.float64]:
-        """The times of the points ``first .. end - 1`` in s, bit for bit those of `time`; shape `(end - first,)`."""
+    def times(self, first: int, end: int, points: int = 1) -> NDArray[np.float64]:
+        """The times of the points ``first .. end - 1``, or of own steps there, in s, bit for bit those of `time`."""
         import numpy as np  # noqa: PLC0415 many commands need no array, and it takes as long as all the rest
 
-        times: NDArray[np.float64] = self.start_time + np.arange(first, end, dtype=np.float64) * self.step_size
+        times: NDArray[np.float64] = self.start_time + np.arange(first, end, points, dtype=np.float64) * self.step_size
         return times
 
     def step_at(self, time: float, points: int = 1, tolerance: float = 0.0) -> int:

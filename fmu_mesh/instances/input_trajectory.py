@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..system.schedule import between
 from ..variables.model_description import Value
 
@@ -58,6 +61,30 @@ class Trajectory:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
         return between(value, right, (time - start) / (end - start))
+
+    def values(self, times: NDArray[np.float64], resolutions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The values at rising times, bit for bit those of `value`; of a Float64."""
+        first = bisect_right(self._times, times[0] + resolutions[0]) - 1
+        end = bisect_right(self._times, times[-1] + resolutions[-1]) + 1
+        own_times, own_values = np.array(self._times[first:end]), np.array(self._values[first:end], np.float64)
+        place = np.searchsorted(own_times, times + resolutions, side="right") - 1
+        start, values = own_times[place], own_values[place]
+        if not self.linear:
+            return values
+        following = np.minimum(place + 1, len(own_times) - 1)
+        with np.errstate(all="ignore"):  # where two times are equal, the line is not used
+            line = values + (own_values[following] - values) * ((times - start) / (own_times[following] - start))
+        holds = (
+            (following == place)
+            | (start >= times - resolutions)
+            | (start == (np.nan if self.held is None else self.held))
+        )
+        return np.where(holds, values, line)
+
+    @property
+    def last(self) -> float:
+        """The last time in s."""
+        return self._times[-1]
 
     def after(self, time: float) -> float | None:
         """The first time (s) after ``time``; None if no value has a later one."""

@@ -44,7 +44,7 @@ class KeyEnds:
         self,
         plan: NodePlan,
         session: zenoh.Session,
-        post: Callable[[Callable[[], None]], None],
+        post: Callable[..., None],
         log: Callable[[LogLine], None],
         tell: Callable[[Sequence[KeyValue]], None],
     ) -> None:

@@ -78,14 +78,15 @@ class KeyFeed:
         own: KeyInput,
         runner: Runner,
         counter: Counter | None,
-        post: Callable[[Callable[[], None]], None],
+        post: Callable[..., None],
         log: Callable[[LogLine], None],
         tell: Callable[[Sequence[KeyValue]], None],
     ) -> None:
         variable = runner.instance.description.variable(own.variable)
         assert variable is not None  # the plan has it
         self.runner, self.counter = runner, counter
-        self.words = f"'{own.key}', which feeds '{runner.name}.{own.variable}'"
+        self._name = f"{runner.name}.{own.variable}"
+        self.words = f"'{own.key}', which feeds '{self._name}'"
         self._own, self._post, self._log, self._tell = own, post, log, tell
         self._reader = KeyReader(own, variable, finite=runner.plan.not_finite == "stop")
         self._only_newest = own.time == "arrival" and not own.wait
@@ -122,10 +123,10 @@ class KeyFeed:
         self._lost += miss.nb
         self._post_take()
 
-    def _post_take(self) -> None:
+    def _post_take(self, *, later: bool = False) -> None:
         if not self._posted:
             self._posted = True
-            self._post(self._take)
+            self._post(self._take, later=later)
 
     def begin(self) -> None:
         """At point 0: use what has come before."""
@@ -140,7 +141,6 @@ class KeyFeed:
             self._inputs.expect(self.runner.step)
             self.runner.follow_inputs()
             return
-        self._posted = False
         self._use(min(len(self._waiting), _MOST_AT_ONCE))
         if self._lost and "lost" not in self._told:
             why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
@@ -148,8 +148,9 @@ class KeyFeed:
             if self._own.wait:
                 hint = "Its publisher has to wait for this run."
                 raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
+        self._posted = False  # not before: each that arrives would end the next steps after one
         if self._waiting:
-            self._post_take()
+            self._post_take(later=True)
 
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
@@ -159,18 +160,20 @@ class KeyFeed:
     def _use(self, count: int) -> None:
         """Let the first values take effect, each at its time."""
         values: list[KeyValue] = []
+        at = self.runner.point
         for _ in range(count):
             try:
-                values.append(self._used_now(self._waiting.popleft()))
+                values.append(self._used_now(self._waiting.popleft(), at))
             except ValueRefused as refused:
                 self._counts = replace(self._counts, refused=self._counts.refused + 1)
                 self._say("refused", f"is refused: {refused}. More are only counted in `status`")
         if values:
+            self.runner.follow_inputs()
+            self._let_step()
             self._tell(values)
 
-    def _used_now(self, sample: zenoh.Sample) -> KeyValue:
-        runner, own = self.runner, self._own
-        grid, points, at = runner.grid, runner.plan.step_points, runner.point
+    def _used_now(self, sample: zenoh.Sample, at: int) -> KeyValue:
+        own, grid, points = self._own, self.runner.grid, self.runner.plan.step_points
         value, said, is_simulated = self._reader.read(sample)
         if said is None:
             when = grid.time(self._used * points) if own.wait else None
@@ -183,15 +186,19 @@ class KeyFeed:
                     f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
                 )
                 raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
-        step = set_input(runner, own.variable, value, when)
+        step = set_input(self.runner, own.variable, value, when, more=True)
         self._used += 1
         if when is not None:
-            self._look_at_time(when, late=step > grid.step_at(when, points))
-            if self.counter is not None and when >= grid.start_time - grid.rounding(when):
-                reached = grid.step_at(when, points)
-                reached -= grid.time(reached * points) > when + grid.rounding(when)  # the last step that begins by then
-                self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
-        return f"{runner.name}.{own.variable}", at, when, to_plain(value)
+            self._look_at_time(when, late=step * points == at and step > grid.step_at(when, points))
+        return self._name, at, when, to_plain(value)
+
+    def _let_step(self) -> None:
+        """The steps that begin by the time of the newest value need not wait for the key any more."""
+        grid, points, when = self.runner.grid, self.runner.plan.step_points, self._newest
+        if self.counter is not None and when is not None and when >= grid.start_time - grid.rounding(when):
+            reached = grid.step_at(when, points)
+            reached -= grid.time(reached * points) > when + grid.rounding(when)
+            self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
 
     def _first_shift(self, said: float, *, is_simulated: bool) -> float:
         grid = self.runner.grid

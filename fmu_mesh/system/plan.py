@@ -48,7 +48,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
-        row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario.
+        row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario and of keys.
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
         initial_outputs: what is read in Initialization Mode only.
@@ -367,6 +367,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
     given = {variable.name for variable in instance.description.with_causality("output")}
+    driven = {own.variable for own in instance.scenario} | {own.variable for own in instance.keys_in}
     checked = tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
     return InstancePlan(
         name=instance.name,
@@ -384,7 +385,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
             if c.extrapolation == "linear"
         ),
         scenario=instance.scenario,
-        row=row_of(instance.description, instance.scenario, connected),
+        row=row_of(instance.description, driven, connected),
         parameters=feeds_of(initial),
         initial_inputs=Layout.of(v for v in instance.description.variables if v.name in initialized),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),

@@ -128,11 +128,20 @@ class Inbox:
         before.ring_bell()
         sleeper.ring_bell()  # for what came meanwhile
 
-    def post(self, action: Callable[[], None], *, first: bool = False) -> None:
-        """From any thread: let the main thread run ``action`` when it next looks into the inbox; ``first`` of all."""
+    def post(self, action: Callable[[], None], *, first: bool = False, later: bool = False) -> None:
+        """From any thread: let the main thread run ``action`` when it next looks into the inbox; ``first`` of all.
+
+        ``later`` is for the main thread itself: it may take its next steps before.
+        """
         (self._posted.appendleft if first else self._posted.append)(action)
-        self._sleeper.ring_bell()
-        self._wake()
+        if not later:
+            self._sleeper.ring_bell()
+            self._wake()
+
+    @property
+    def has_posted(self) -> bool:
+        """Whether there are posted actions."""
+        return bool(self._posted)
 
     def poll(self) -> Message | None:
         """The next message if there is one; also runs posted actions."""
