@@ -31,7 +31,7 @@ from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
 from .stepping import Runner
 
-__all__ = ["TimedInputs", "set_input", "with_times"]
+__all__ = ["TimedInputs", "TooManyWait", "set_input", "with_times"]
 
 _WAITING = 1 << 16
 _SOON = 64
@@ -39,6 +39,10 @@ _SOON = 64
 
 _AHEAD = 4096
 """Number of steps that inputs are calculated ahead."""
+
+
+class TooManyWait(ValueRefused):
+    """A value is refused only because too many others of its variable wait for their times."""
 
 
 class TimedInputs(AroundNativeSteps):
@@ -128,7 +132,7 @@ class TimedInputs(AroundNativeSteps):
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
-            ValueRefused: too many values wait for their time.
+            TooManyWait: too many values wait for their time.
         """
         now = self._time(self._step)
         when = now if time is None else time
@@ -144,7 +148,7 @@ class TimedInputs(AroundNativeSteps):
                 trajectory.held = now if name in self._linear_names else None  # no line to the first value of a key
             self._trajectories[name] = trajectory
         if len(self._trajectories[name]) >= _WAITING:
-            raise ValueRefused(f"{_WAITING} values of '{name}' wait for their time already")
+            raise TooManyWait(f"{_WAITING} values of '{name}' wait for their time already")
         step = max(step, self._step)
         # The value that it has fallen back to is as if it had been sent, and would be newer than one with a past time.
         self._trajectories[name].add(max(when, now) if name in self.late else when, value)

@@ -34,7 +34,7 @@ from ..system.live_keys import KeyInput, KeyValue
 from ..variables.value_conversion import to_plain
 from ..wire.values import ValueRefused
 from ..wire.views import KeyStatus, LogLine
-from .inputs import set_input
+from .inputs import TooManyWait, set_input
 from .key_payloads import KeyReader
 from .stepping import Runner
 
@@ -122,12 +122,14 @@ class KeyFeed:
         for _ in range(min(len(self._waiting), _MOST_AT_ONCE) if self._begun else 0):
             try:
                 values.append(self._use(self._waiting.popleft()))
+            except TooManyWait:
+                self._counts = replace(self._counts, lost=self._counts.lost + 1)
             except ValueRefused as refused:
                 self._counts = replace(self._counts, refused=self._counts.refused + 1)
                 self._say("refused", f"is refused: {refused}. More are only counted in `status`")
         if values:
             self._tell(values)
-        if self._lost and "lost" not in self._told:
+        if (self._lost or self._counts.lost) and "lost" not in self._told:
             why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
             self._say("lost", f"{why}. More are only counted")
             if self._own.wait:
@@ -213,7 +215,8 @@ class KeyFeed:
             else 0.0
         )
         age = now - self._last_at if received else None
-        return replace(self._counts, received=received, replaced=self._replaced, lost=self._lost, rate=rate, age=age)
+        lost = self._counts.lost + self._lost
+        return replace(self._counts, received=received, replaced=self._replaced, lost=lost, rate=rate, age=age)
 
     def _say(self, what: str, text: str) -> None:
         """Warn once of each kind of trouble."""
