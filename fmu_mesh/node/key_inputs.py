@@ -4,14 +4,15 @@ Owns when a value takes effect, and for which value a step waits. Payloads are `
 gets its value is `fmu_mesh.node.inputs`, as for values that are set.
 """
 
-# Threads: one of Zenoh calls `_Feed.arrived`, which counts a sample, puts it into a deque and posts `_take` once. The
-# main thread calls `_take` between two steps, and everything that changes an input. The thread of the server calls
-# `look` and `status`, which read numbers that somebody else writes in one assignment.
+# Threads: those of Zenoh, one for each link, call `arrived`, which counts a sample, puts it into a deque and posts
+# `_take` once; `_lock` is theirs alone. The main thread calls `_take` between two steps, and everything that changes an
+# input. The thread of the server calls `look` and `status`, which read numbers that somebody else writes in one
+# assignment.
 #
 # What may go wrong, and what then happens:
 # * A flood. On arrival only the newest value counts, so there is at most one at each point; of values with times
-#   `_MOST_WAITING` may wait. What is more is counted and lost, and the sender is never held back: it may be a stranger.
-#   `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
+#   `_MOST_WAITING` may wait, of `_MOST_BYTES` in all. What is more is counted and lost, and the sender is never held
+#   back: it may be a stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
 # * Silence. A step that waits ends with the deadline of a step. Else the input holds, or falls back (`timeout`).
 # * A step must not wait inside an instance: the main thread would not see the end of the run. So a key that is waited
 #   for limits the node as the window of another node does, by a counter that only the main thread raises.
@@ -20,8 +21,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from threading import Lock
 from typing import Any, Final
 
 import zenoh
@@ -41,7 +43,9 @@ from .stepping import Runner
 __all__ = ["KeyFeed"]
 
 _MOST_WAITING: Final = 1 << 16
+_MOST_BYTES: Final = 1 << 27
 _MOST_AT_ONCE: Final = 64
+_MOST_BYTES_AT_ONCE: Final = 1 << 16
 
 
 class KeyFeed:
@@ -76,7 +80,9 @@ class KeyFeed:
         self._waiting: deque[zenoh.Sample] = deque()
         self._posted = self._begun = False
         self._counts = KeyStatus(own.key, own.variable)
+        self._lock = Lock()
         self._received = self._replaced = self._lost = 0
+        self._came_bytes = self._taken_bytes = 0  # each of them is written by one side only
         self._first_at = self._last_at = 0.0
         self._told: set[str] = set()
         self._shift: float | None = None  # simulation time minus that of the values
@@ -86,18 +92,22 @@ class KeyFeed:
         self._blocked: tuple[int, float] | None = None
 
     def arrived(self, sample: zenoh.Sample) -> None:
-        """On a thread of Zenoh."""
-        self._last_at = time.monotonic()
-        self._first_at = self._first_at or self._last_at
-        self._received += 1
-        if self._only_newest:
-            with suppress(IndexError):  # the main thread takes them, at any moment
-                self._waiting.pop()
-                self._replaced += 1
-        if len(self._waiting) < _MOST_WAITING:
-            self._waiting.append(sample)
-        else:
-            self._lost += 1
+        """On a thread of Zenoh: each link has its own."""
+        with self._lock:
+            self._last_at = time.monotonic()
+            self._first_at = self._first_at or self._last_at
+            self._received += 1
+            if self._only_newest:
+                with suppress(IndexError):  # the main thread takes them, at any moment
+                    self._came_bytes -= len(self._waiting.pop().payload)
+                    self._replaced += 1
+            size = len(sample.payload)
+            is_full = self._came_bytes - self._taken_bytes + size > _MOST_BYTES or len(self._waiting) >= _MOST_WAITING
+            if is_full and self._waiting:
+                self._lost += 1
+            else:
+                self._came_bytes += size
+                self._waiting.append(sample)
         self._post_take()
 
     def missed(self, miss: zenoh.ext.Miss) -> None:
@@ -119,9 +129,9 @@ class KeyFeed:
         """On the main thread, between two steps."""
         self._posted = False
         values: list[KeyValue] = []
-        for _ in range(min(len(self._waiting), _MOST_AT_ONCE) if self._begun else 0):
+        for sample in self._some():
             try:
-                values.append(self._use(self._waiting.popleft()))
+                values.append(self._use(sample))
             except TooManyWait:
                 self._counts = replace(self._counts, lost=self._counts.lost + 1)
             except ValueRefused as refused:
@@ -137,6 +147,17 @@ class KeyFeed:
                 raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
         if self._waiting and self._begun:
             self._post_take()
+
+    def _some(self) -> Iterator[zenoh.Sample]:
+        """Some of those that wait, so that steps go on, and the recorder gets no message that is too large."""
+        end = self._taken_bytes + _MOST_BYTES_AT_ONCE
+        with suppress(IndexError):  # also if a newer one replaces the last one just now
+            for _ in range(_MOST_AT_ONCE if self._begun else 0):
+                sample = self._waiting.popleft()
+                self._taken_bytes += len(sample.payload)
+                yield sample
+                if self._taken_bytes > end:
+                    break
 
     def _use(self, sample: zenoh.Sample) -> KeyValue:
         """Let a value take effect at its time."""

@@ -19,7 +19,7 @@ from ..system.given_units import changed
 from ..system.live_keys import KeyInput, KeyOutput, KeyPath, field_parts, seconds_of
 from ..variables.model_description import Value, Variable
 from ..variables.units import Linear
-from ..variables.value_conversion import ValueRefused, checked_value, to_plain
+from ..variables.value_conversion import ValueRefused, checked_value, to_plain, to_value
 from ..variables.value_types import PlainValue
 from ..wire.messages import decode_json
 from ..wire.values import MAX_VALUE_SIZE
@@ -73,10 +73,13 @@ class KeyReader:
             if sample.timestamp is None:
                 raise ValueRefused("it has no timestamp of Zenoh: its publisher or a router has to add them")
             time = sample.timestamp.get_time_as_ntp64().as_nanos() / 1e9
-        shown = repr(plain)[:_SHOWN]
         if self._own.map and (word := _word(plain)) in self._own.map:
             plain = self._own.map[word]
-        value = checked_value(changed(plain, self._change), self._variable, shown, finite=self._finite)
+        plain = changed(plain, self._change)
+        try:
+            value = to_value(plain, self._variable, finite=self._finite)
+        except ValueRefused:  # in words, which take longer than a value
+            value = checked_value(plain, self._variable, repr(plain)[:_SHOWN], finite=self._finite)
         is_simulated = self._own.simulated and not isinstance(time, str)
         return TimedValue(value, seconds_of(time) if time is not None else None, is_simulated)
 

@@ -341,6 +341,35 @@ def test_a_sweep_repeats_the_values_in_each_run(place: Place, endpoint: str) -> 
         assert other["sum.y"].tolist() == pytest.approx((k * first["sum.y"]).tolist(), abs=0.0 if k == 1.0 else 1e-12)
 
 
+TEXTS = """
+import hashlib
+import fmu_mesh
+
+class Texts(fmu_mesh.Component):
+    u = fmu_mesh.Input("", type="String")
+    y = fmu_mesh.Output()
+
+    def step(self, time, step_size):
+        self.y = float(int(hashlib.sha256(self.u.encode()).hexdigest()[:8], 16))
+"""
+
+
+def test_long_texts_are_repeated_as_well(place: Place, endpoint: str) -> None:
+    (place.folder / "texts.py").write_text(TEXTS)
+    entry = {"key": "plant/u", "to": "gain.u", "time": "arrival", "encoding": "text", "wait": True}
+    instances = {"gain": {"python": "texts.py:Texts"}}
+    config = keyed(place, endpoint, entry, instances=instances, simulation={"stop_time": 2 * STEP_S})
+
+    with client(endpoint) as session, fmu_mesh.load(config).start(paused=True) as run:
+        put_values(session, "plant/u", [b"\x01" * 2**24, b"A" * (10 << 20)])
+        run.resume()
+        result = run.wait(DEADLINE_S)
+
+    assert len(set(result["gain.y"].tolist())) == 3
+    assert len(key_lines(config.with_suffix(".csv"))) == 2
+    assert fmu_mesh.rerun(config.with_suffix(".csv"), allow_code=True)["gain.y"].tolist() == result["gain.y"].tolist()
+
+
 def test_a_run_does_not_replace_what_it_repeats(place: Place, endpoint: str) -> None:
     config = fed(place, endpoint, 20)
     with client(endpoint) as session, fmu_mesh.load(config).start() as run:
