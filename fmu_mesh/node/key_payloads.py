@@ -181,6 +181,5 @@ def key_writer(own: KeyOutput, variable: Variable) -> tuple[Callable[[Value, int
 
             return doubles, zenoh.Encoding.ZENOH_BYTES
         case "cdr":
-            scalar = msgspec.structs.replace(variable, shape=(), dimensions=()) if own.index else variable
-            messages = message_writer(own, scalar)
+            messages = message_writer(own, variable)
             return lambda value, _point, time: messages.make([value_of(value)], time), zenoh.Encoding.APPLICATION_CDR

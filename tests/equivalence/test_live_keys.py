@@ -16,6 +16,7 @@ import pytest
 import zenoh
 
 import fmu_mesh
+from fmu_mesh.wire.session import matches
 from tests.helpers import DEADLINE_S, Place, wait_until
 from tests.key_meshes import client, key_lines, put_values, stepped_router, written
 
@@ -122,7 +123,7 @@ def test_a_timestamp_counts_from_its_origin(place: Place, endpoint: str) -> None
     sent: list[tuple[float, float]] = []
     with client(endpoint) as session, fmu_mesh.load(config).start(paused=True) as run:
         publisher = session.declare_publisher("plant/u", congestion_control=zenoh.CongestionControl.BLOCK)
-        wait_until(lambda: publisher.matching_status.matching, "a subscriber")
+        wait_until(lambda: matches(publisher), "a subscriber")
         for number in range(1, 5):
             stamp = session.new_timestamp()
             sent.append((stamp.get_time_as_ntp64().as_nanos() / 1e9 - origin, float(number)))
