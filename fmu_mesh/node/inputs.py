@@ -168,9 +168,9 @@ class TimedInputs(AroundNativeSteps):
         """Set what changes in own step ``step``."""
         time = self._time(step)
         while self._next is not None and self._next[1] <= step * self._points:
-            name, _, when, value = self._next
+            name, _, when, kept = self._next
             self._step = step
-            self.add(name, value, when)
+            self.add(name, kept, when)
             self._next = next(self._recorded, None)
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
         if self._last.sent:

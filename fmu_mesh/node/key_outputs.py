@@ -6,6 +6,7 @@ thread publishes them between two steps: the run waits for who is slow, and no r
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from typing import Any, Final
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from ..rings.host_memory import Counter
 from ..system.live_keys import KeyOutput
 from ..variables.model_description import Value, Variable
-from ..variables.value_types import nested
+from ..variables.value_types import is_text, nested
 from ..wire.session import undeclare_all
 from ..wire.views import KeyStatus
 from .key_payloads import key_writer
@@ -29,8 +30,13 @@ __all__ = ["KeyOutputs"]
 
 _NOTHING: Final = object()
 
-_KEPT: Final = 1 << 10
+_KEPT: Final = 1 << 9
 """Values that who waits for them gets again: those from before it came, and those that a link has lost."""
+
+_KEPT_BYTES: Final = 1 << 22
+_ELEMENT_BYTES: Final = 24
+_TEXT_BYTES: Final = 1 << 17
+"""What is kept of an array, or of texts, is less; these are their usual sizes."""
 
 _BEAT_S: Final = 0.2
 """How often in s it is told which value was the last one, if there was one."""
@@ -95,6 +101,7 @@ class _Sink:
         self._own, self._session = own, session
         self.place = int(np.ravel_multi_index(own.index, variable.shape)) if own.index else None
         self._write, encoding = key_writer(own, variable)
+        bytes_each = math.prod(variable.shape) * (_TEXT_BYTES if is_text(variable.type) else _ELEMENT_BYTES)
         congestion = zenoh.CongestionControl.BLOCK if own.blocks else zenoh.CongestionControl.DROP
         self.publisher = zenoh.ext.declare_advanced_publisher(
             session,
@@ -102,7 +109,7 @@ class _Sink:
             encoding=encoding,
             congestion_control=congestion,
             priority=PRIORITY,
-            cache=zenoh.ext.CacheConfig(_KEPT),
+            cache=zenoh.ext.CacheConfig(max(4, min(_KEPT, _KEPT_BYTES // bytes_each))),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_BEAT_S),
             publisher_detection=True,
         )

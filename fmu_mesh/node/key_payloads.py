@@ -106,9 +106,9 @@ class KeyReader:
                 return self._from_text(data, kind)
 
     def _from_text(self, data: bytes, kind: str) -> tuple[Any, Any]:
+        has_parts = self._field is not None or self._time is not None
+        is_one_text = self._variable.type == "String" and not self._variable.shape and not has_parts
         try:
-            has_parts = self._field is not None or self._time is not None
-            is_one_text = self._variable.type == "String" and not self._variable.shape and not has_parts
             found = decode_json(data, object) if kind != "text" or not is_one_text else _NOTHING
         except MessageRefused as error:
             if kind == "json" or has_parts:

@@ -7,6 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -51,6 +52,14 @@ def taken(run: fmu_mesh.Run, count: int, instance: str = "gain") -> None:
     """Wait until so many values have come; what is asked afterwards, the main thread answers after it has used them."""
     wait_until(lambda: received(run, instance) >= count, f"{count} values")
     run.get(f"{instance}.u")
+
+
+def is_over(end: float) -> bool:
+    return time.monotonic() > end
+
+
+def has_all(samples: Sequence[object], count: int) -> bool:
+    return len(samples) >= count
 
 
 def assert_repeats(config: Path) -> None:
@@ -128,8 +137,7 @@ def test_a_timestamp_counts_from_its_origin(place: Place, endpoint: str) -> None
             stamp = session.new_timestamp()
             sent.append((stamp.get_time_as_ntp64().as_nanos() / 1e9 - origin, float(number)))
             publisher.put(str(number), timestamp=stamp)
-            end = time.monotonic() + 3 * STEP_S
-            wait_until(lambda end=end: time.monotonic() > end, "three points")
+            wait_until(partial(is_over, time.monotonic() + 3 * STEP_S), "three points")
         publisher.put("5")  # without a timestamp: a router adds its own
         taken(run, 5)
         run.resume()
@@ -174,7 +182,7 @@ def messages(samples: Sequence[zenoh.Sample]) -> list[dict[str, Any]]:
 def test_each_point_and_each_change_goes_out_once(
     place: Place, endpoint: str, heard: Callable[[str], list[zenoh.Sample]]
 ) -> None:
-    keys = [
+    keys: list[dict[str, Any]] = [
         {"from": "gain.y", "key": "twin/point", "congestion": "block"},
         {"from": "gain.y", "key": "twin/change", "on": "change", "congestion": "block", "factor": -1.0},
         {"from": "gain.y", "key": "twin/every", "every": 0.25, "congestion": "block"},
@@ -193,7 +201,7 @@ def test_each_point_and_each_change_goes_out_once(
     counts = {"twin/point": 201, "twin/change": 4, "twin/every": 9, "twin/rare": 4, "twin/slow": 67}
     counts |= {"twin/text": 201, "twin/double": 201}
     for key, count in counts.items():
-        wait_until(lambda key=key, count=count: len(samples[key]) >= count, f"{count} samples of {key}")
+        wait_until(partial(has_all, samples[key], count), f"{count} samples of {key}")
     assert {key: len(own) for key, own in samples.items()} == counts
     values = result["gain.y"].tolist()
     points = messages(samples["twin/point"])
