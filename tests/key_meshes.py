@@ -13,6 +13,7 @@ import msgspec
 import yaml
 import zenoh
 
+from fmu_mesh.wire.session import matches
 from tests.helpers import FMUS, Launched, Place, wait_until
 
 __all__ = ["client", "endpoint_of", "key_lines", "put_values", "status_of", "stepped_router", "written"]
@@ -77,7 +78,7 @@ def put_values(
 ) -> None:
     """Publish values under a key, each as JSON, once somebody subscribes to it."""
     publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
-    wait_until(lambda: publisher.matching_status.matching, f"a subscriber of {key}")
+    wait_until(lambda: matches(publisher), f"a subscriber of {key}")
     if is_there is not None:
         wait_until(is_there, f"who gets {key}")
     for value in values:

@@ -30,7 +30,7 @@ from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
 from .stepping import Runner
 
-__all__ = ["TimedInputs", "set_input", "with_times"]
+__all__ = ["TimedInputs", "TooManyWait", "set_input", "with_times"]
 
 _WAITING = 1 << 16
 _SOON = 64
@@ -41,6 +41,10 @@ _LEAST = 8
 
 _AHEAD = 4096
 """Number of steps that inputs are calculated ahead."""
+
+
+class TooManyWait(ValueRefused):
+    """A value is refused only because too many others of its variable wait for their times."""
 
 
 class TimedInputs(AroundNativeSteps):
@@ -139,7 +143,7 @@ class TimedInputs(AroundNativeSteps):
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
-            ValueRefused: so many values wait for their time already.
+            TooManyWait: so many values wait for their time already.
         """
         now = self._time(self._step)
         when = now if time is None else time
@@ -155,7 +159,7 @@ class TimedInputs(AroundNativeSteps):
                 trajectory.held = now if self._keys.get(name) else None  # no line to the first value of a key
             self._trajectories[name] = trajectory
         if len(self._trajectories[name]) >= most:
-            raise ValueRefused(f"{most} values of '{name}' wait for their time already")
+            raise TooManyWait(f"{most} values of '{name}' wait for their time already")
         step = max(step, self._step)
         # A line changes in each step from now on. A value that holds changes nothing before its own step. What was sent
         # is calculated ahead up to the last value at most.

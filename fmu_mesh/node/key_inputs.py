@@ -4,14 +4,15 @@ Owns when a value takes effect, and for which value a step waits. Payloads are `
 gets its value is `fmu_mesh.node.inputs`, as for values that are set.
 """
 
-# Threads: one of Zenoh calls `arrived`, which counts a sample, puts it into a deque and posts `_take` once. The main
-# thread calls `_take` between two steps, or `_take_newest` before one, and everything that changes an input. The thread
-# of the server calls `look` and `status`, which read numbers that somebody else writes in one assignment.
+# Threads: those of Zenoh, one for each link, call `arrived`, which counts a sample, puts it into a deque and posts
+# `_take` once; `_lock` is theirs alone. The main thread calls `_take` between two steps, or `_take_newest` before one,
+# and everything that changes an input. The thread of the server calls `look` and `status`, which read numbers that
+# somebody else writes in one assignment.
 #
 # What may go wrong, and what then happens:
 # * A flood. On arrival only the newest value counts, and a step asks for it, so one is decoded at a point; of values
-#   with times `_MOST_WAITING` may wait. What is more is counted and lost. The sender is never held back: it may be a
-#   stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
+#   with times `_MOST_WAITING` may wait, of `_MOST_BYTES` in all. What is more is counted and lost. The sender is never
+#   held back: it may be a stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
 # * Silence. A step that waits ends with the deadline of a step. Else the input holds, or falls back (`timeout`).
 # * A step must not wait inside an instance: the main thread would not see the end of the run. So a key that is waited
 #   for limits the node as the window of another node does, by a counter that only the main thread raises.
@@ -20,7 +21,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from threading import Lock
 from typing import Any, Final
 
 import zenoh
@@ -33,14 +36,16 @@ from ..system.live_keys import KeyInput, KeyValue
 from ..variables.value_conversion import to_plain
 from ..wire.values import ValueRefused
 from ..wire.views import KeyStatus, LogLine
-from .inputs import TimedInputs, set_input
+from .inputs import TimedInputs, TooManyWait, set_input
 from .key_payloads import KeyReader
 from .stepping import Runner
 
 __all__ = ["KeyFeed", "Patience"]
 
 _MOST_WAITING: Final = 1 << 16
+_MOST_BYTES: Final = 1 << 27
 _MOST_AT_ONCE: Final = 64
+_MOST_BYTES_AT_ONCE: Final = 1 << 16
 
 
 class Patience:
@@ -90,14 +95,16 @@ class KeyFeed:
         self._own, self._post, self._log, self._tell = own, post, log, tell
         self._reader = KeyReader(own, variable, finite=runner.plan.not_finite == "stop")
         self._only_newest = own.time == "arrival" and not own.wait
-        self._waiting: deque[zenoh.Sample] = deque(maxlen=1 if self._only_newest else None)
+        self._waiting: deque[zenoh.Sample] = deque()
         assert isinstance(runner.instance, TimedInputs)  # `with_times`
         self._inputs = runner.instance
         if self._only_newest:
             self._inputs.ask(self._take_newest)
         self._posted = self._begun = False
         self._counts = KeyStatus(own.key, own.variable)
+        self._lock = Lock()
         self._received = self._replaced = self._lost = 0
+        self._came_bytes = self._taken_bytes = 0  # each of them is written by one side only
         self._first_at = self._last_at = 0.0
         self._told: set[str] = set()
         self._shift: float | None = None  # simulation time minus that of the values
@@ -107,15 +114,22 @@ class KeyFeed:
         self._patience = Patience(runner)
 
     def arrived(self, sample: zenoh.Sample) -> None:
-        """On a thread of Zenoh."""
-        self._last_at = time.monotonic()
-        self._first_at = self._first_at or self._last_at
-        self._received += 1
-        self._replaced += self._only_newest and bool(self._waiting)
-        if len(self._waiting) < _MOST_WAITING:
-            self._waiting.append(sample)
-        else:
-            self._lost += 1
+        """On a thread of Zenoh: each link has its own."""
+        with self._lock:
+            self._last_at = time.monotonic()
+            self._first_at = self._first_at or self._last_at
+            self._received += 1
+            if self._only_newest:
+                with suppress(IndexError):  # the main thread takes them, at any moment
+                    self._came_bytes -= len(self._waiting.pop().payload)
+                    self._replaced += 1
+            size = len(sample.payload)
+            is_full = self._came_bytes - self._taken_bytes + size > _MOST_BYTES or len(self._waiting) >= _MOST_WAITING
+            if is_full and self._waiting:
+                self._lost += 1
+            else:
+                self._came_bytes += size
+                self._waiting.append(sample)
         self._post_take()
 
     def missed(self, miss: zenoh.ext.Miss) -> None:
@@ -141,8 +155,8 @@ class KeyFeed:
             self._inputs.expect(self.runner.step)
             self.runner.follow_inputs()
             return
-        self._use(min(len(self._waiting), _MOST_AT_ONCE))
-        if self._lost and "lost" not in self._told:
+        self._use()
+        if (self._lost or self._counts.lost) and "lost" not in self._told:
             why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
             self._say("lost", f"{why}. More are only counted")
             if self._own.wait:
@@ -155,15 +169,17 @@ class KeyFeed:
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
         self._posted = False
-        self._use(len(self._waiting))
+        self._use()
 
-    def _use(self, count: int) -> None:
+    def _use(self) -> None:
         """Let the first values take effect, each at its time."""
         values: list[KeyValue] = []
         at = self.runner.point
-        for _ in range(count):
+        for sample in self._some():
             try:
-                values.append(self._used_now(self._waiting.popleft(), at))
+                values.append(self._used_now(sample, at))
+            except TooManyWait:
+                self._counts = replace(self._counts, lost=self._counts.lost + 1)
             except ValueRefused as refused:
                 self._counts = replace(self._counts, refused=self._counts.refused + 1)
                 self._say("refused", f"is refused: {refused}. More are only counted in `status`")
@@ -171,6 +187,17 @@ class KeyFeed:
             self.runner.follow_inputs()
             self._let_step()
             self._tell(values)
+
+    def _some(self) -> Iterator[zenoh.Sample]:
+        """Some of those that wait, so that steps go on, and the recorder gets no message that is too large."""
+        end = self._taken_bytes + _MOST_BYTES_AT_ONCE
+        with suppress(IndexError):  # also if a newer one replaces the last one just now
+            for _ in range(_MOST_AT_ONCE):
+                sample = self._waiting.popleft()
+                self._taken_bytes += len(sample.payload)
+                yield sample
+                if self._taken_bytes > end:
+                    break
 
     def _used_now(self, sample: zenoh.Sample, at: int) -> KeyValue:
         own, grid, points = self._own, self.runner.grid, self.runner.plan.step_points
@@ -244,7 +271,8 @@ class KeyFeed:
         received, took_s = self._received, self._last_at - self._first_at
         rate = (received - 1) / took_s if took_s > 0.0 else 0.0
         age = time.monotonic() - self._last_at if received else None
-        return replace(self._counts, received=received, replaced=self._replaced, lost=self._lost, rate=rate, age=age)
+        lost = self._counts.lost + self._lost
+        return replace(self._counts, received=received, replaced=self._replaced, lost=lost, rate=rate, age=age)
 
     def _say(self, what: str, text: str) -> None:
         """Warn once of each kind of trouble."""

@@ -7,6 +7,7 @@ start. So no value is lost, but those that are on their way when a link is cut.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -23,7 +24,7 @@ from ..rings.host_memory import Counter
 from ..system.live_keys import KeyOutput
 from ..text import listed
 from ..variables.model_description import Value, Variable
-from ..variables.value_types import nested
+from ..variables.value_types import is_text, nested
 from ..wire.session import matches, undeclare_all
 from ..wire.views import KeyStatus
 from .key_inputs import Patience
@@ -35,8 +36,13 @@ __all__ = ["KeyOutputs"]
 
 _NOTHING: Final = object()
 
-_KEPT: Final = 1 << 10
+_KEPT: Final = 1 << 9
 """Values that who waits for them gets again: those from before it came, and those that a link has lost."""
+
+_KEPT_BYTES: Final = 1 << 22
+_ELEMENT_BYTES: Final = 24
+_TEXT_BYTES: Final = 1 << 17
+"""What is kept of an array, or of texts, is less; these are their usual sizes."""
 
 _BEAT_S: Final = 0.2
 """How often in s it is told which value was the last one, if there was one."""
@@ -143,13 +149,14 @@ class _Sink:
             self._publisher = self._told = session.declare_publisher(own.key, encoding=encoding, priority=PRIORITY)
             self.entities: list[Any] = [self._publisher]
             return
+        bytes_each = math.prod(variable.shape) * (_TEXT_BYTES if is_text(variable.type) else _ELEMENT_BYTES)
         self._publisher = zenoh.ext.declare_advanced_publisher(
             session,
             own.key,
             encoding=encoding,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=PRIORITY,
-            cache=zenoh.ext.CacheConfig(_KEPT),
+            cache=zenoh.ext.CacheConfig(max(4, min(_KEPT, _KEPT_BYTES // bytes_each))),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_BEAT_S),
             publisher_detection=True,
         )

@@ -20,7 +20,7 @@ from ..system.given_units import changed
 from ..system.live_keys import KeyInput, KeyOutput, KeyPath, field_parts, seconds_of
 from ..variables.model_description import Value, Variable
 from ..variables.units import Linear
-from ..variables.value_conversion import ValueRefused, checked_value, to_plain
+from ..variables.value_conversion import ValueRefused, checked_value, to_plain, to_value
 from ..variables.value_types import PlainValue
 from ..wire.messages import decode_json
 from ..wire.values import MAX_VALUE_SIZE
@@ -81,7 +81,10 @@ class KeyReader:
             plain = self._own.map[word]
         value = changed(plain, self._change)
         if not (self._any_float and type(value) is float and math.isfinite(value)):  # the usual number needs no check
-            value = checked_value(value, self._variable, repr(said)[:_SHOWN], finite=self._finite)
+            try:
+                value = to_value(value, self._variable, finite=self._finite)
+            except ValueRefused:  # in words, which take longer than a value
+                value = checked_value(value, self._variable, repr(said)[:_SHOWN], finite=self._finite)
         is_simulated = self._own.simulated and not isinstance(time, str)
         return TimedValue(value, seconds_of(time) if time is not None else None, is_simulated)
 
@@ -183,6 +186,5 @@ def key_writer(own: KeyOutput, variable: Variable) -> tuple[Callable[[Value, int
 
             return doubles, zenoh.Encoding.ZENOH_BYTES
         case "cdr":
-            scalar = msgspec.structs.replace(variable, shape=(), dimensions=()) if own.index else variable
-            messages = message_writer(own, scalar)
+            messages = message_writer(own, variable)
             return lambda value, _point, time: messages.make([value_of(value)], time), zenoh.Encoding.APPLICATION_CDR

@@ -48,6 +48,7 @@ from ..rings.host_memory import HostMemory, Wish
 from ..simtime import ENDLESS
 from ..system.live_keys import KeyValue
 from ..system.plan import RECORDER, Link, NodePlan
+from ..variables.value_conversion import MAX_TEXT_SIZE
 from ..variables.value_types import is_text
 from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
@@ -85,6 +86,9 @@ _REST_S = 0.005
 and writing many rows at once takes less time."""
 
 _LAST_S = 0.5
+_MOST_KEYS = 8 * MAX_TEXT_SIZE
+"""In bytes; JSON has up to six for a character."""
+
 """How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 
 _FLUSH_S = 0.2
@@ -275,7 +279,7 @@ class Recorder:
             self._files.note(to_builtins(decode_json(data[HEADER.size :], SetValue)))
             return
         if kind == KEYS:
-            self._files.keep(decode_json(data[HEADER.size :], list[KeyValue]))
+            self._files.keep(decode_json(data[HEADER.size :], list[KeyValue], _MOST_KEYS))
             return
         source = self._sources.get(number)
         if source is None or source.link.source_node != sender:

@@ -5,6 +5,8 @@ What else is under keys is `fmu_mesh.node.key_payloads`. The definitions of the 
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from ..config.findings import Findings
 from ..config.mesh import RosTopicConfig
 from ..errors import ConfigurationError
@@ -47,5 +49,7 @@ def message_writer(own: KeyOutput, variable: Variable) -> Assembler:
 
 def _topic(own: KeyInput | KeyOutput, variable: Variable, instance: str = "") -> Topic:
     direction: Direction = "in" if isinstance(own, KeyInput) else "out"
+    if isinstance(own, KeyOutput) and own.index:
+        variable = replace(variable, shape=(), dimensions=())  # one element of it
     port = Port(own.field or "data", instance, variable, direction)
     return Topic(own.key, own.type or "", direction, (port,))

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import csv
+import signal
+import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import pytest
+import yaml
 
 import fmu_mesh
-from tests.helpers import BY_STREAMS, BY_ZENOH, Launched, Place
+from tests.helpers import BY_STREAMS, BY_ZENOH, Launched, Place, row_count, wait_until
 from tests.key_meshes import key_lines, stepped_router, written
 
 VECTOR = """
@@ -89,7 +93,12 @@ def whole(place: Place, split: Split, **sections: Any) -> Path:  # noqa: ANN401 
     return written(place, "whole", instances, connections, **sections)
 
 
-def parts(place: Place, split: Split, **sections: Any) -> dict[str, Path]:  # noqa: ANN401
+def parts(
+    place: Place,
+    split: Split,
+    wait: Mapping[str, Any] = MappingProxyType({"time": "time"}),
+    **sections: Any,  # noqa: ANN401  as the file has them
+) -> dict[str, Path]:
     """A file for each mesh; a connection between two of them is a key."""
     (place.folder / "vector.py").write_text(VECTOR)
     files = {}
@@ -105,10 +114,15 @@ def parts(place: Place, split: Split, **sections: Any) -> dict[str, Path]:  # no
                 sent.add(source)
                 connections.append({"from": source, "key": key, "congestion": "block"})
             elif here[1]:
-                connections.append({"key": key, "to": target, "time": "time", "wait": True, **more})
+                connections.append({"key": key, "to": target, "wait": True, **wait, **more})
         instances = {name: section for name, (own, section) in split.instances.items() if own == mesh}
         files[mesh] = written(place, mesh, instances, connections, **sections)
     return files
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as own:
+        return int(own.getsockname()[1])
 
 
 def columns_of(config: Path) -> dict[str, list[str]]:
@@ -153,3 +167,45 @@ def test_the_way_between_processes_changes_no_float(ways: Mapping[str, bool], mo
         assert_ended([place.start("launch", config, "--no-progress") for config in files.values()])
 
     assert_equals_one_mesh(whole(place, GROUPS), list(files.values()))
+
+
+@pytest.mark.parametrize("listening", ["left", "right"])
+def test_one_mesh_may_listen_and_the_other_connect(listening: str, place: Place) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    files = parts(place, OSCILLATOR)
+    for mesh, config in files.items():
+        text = yaml.safe_load(config.read_text())
+        text["zenoh"] = {"listen": [endpoint]} if mesh == listening else {"connect": [endpoint]}
+        config.write_text(yaml.safe_dump(text))
+    first = place.start("launch", files.pop(listening), "--no-progress")
+    wait_until(lambda: "tcp/" in first.errors, "a mesh that listens")
+    [other] = files.values()
+
+    assert_ended([first, place.start("launch", other, "--no-progress")])
+
+    assert_equals_one_mesh(whole(place, OSCILLATOR), [place.folder / "left.yaml", place.folder / "right.yaml"])
+
+
+def test_values_without_times_are_taken_one_for_each_point(place: Place) -> None:
+    with stepped_router(place) as (_, endpoint):
+        section = {"mode": "client", "connect": [endpoint]}
+        files = parts(place, OSCILLATOR, {"time": "arrival"}, zenoh=section)
+        assert_ended([place.start("launch", config, "--no-progress") for config in files.values()])
+
+    assert_equals_one_mesh(whole(place, OSCILLATOR), list(files.values()))
+
+
+def test_a_mesh_that_begins_again_catches_up(place: Place) -> None:
+    with stepped_router(place) as (_, endpoint):
+        section = {"mode": "client", "connect": [endpoint]}
+        files = parts(place, OSCILLATOR, zenoh=section, simulation={"real_time_factor": 1})
+        left = place.start("launch", files["left"], "--no-progress")
+        right = place.start("launch", files["right"], "--no-progress")
+        wait_until(lambda: row_count(files["right"].with_suffix(".csv")) > 60, "60 rows")
+        right.signal(signal.SIGKILL)
+        right.wait()
+        wait_until(lambda: not place.processes("node") or len(place.processes("node")) == 1, "the end of its node")
+
+        assert_ended([left, place.start("launch", files["right"], "--no-progress")])
+
+    assert_equals_one_mesh(whole(place, OSCILLATOR), list(files.values()))

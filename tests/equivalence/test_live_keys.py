@@ -7,6 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -16,6 +17,7 @@ import pytest
 import zenoh
 
 import fmu_mesh
+from fmu_mesh.wire.session import matches
 from tests.helpers import DEADLINE_S, Place, wait_until
 from tests.key_meshes import client, key_lines, put_values, stepped_router, written
 
@@ -50,6 +52,14 @@ def taken(run: fmu_mesh.Run, count: int, instance: str = "gain") -> None:
     """Wait until so many values have come; what is asked afterwards, the main thread answers after it has used them."""
     wait_until(lambda: received(run, instance) >= count, f"{count} values")
     run.get(f"{instance}.u")
+
+
+def is_over(end: float) -> bool:
+    return time.monotonic() > end
+
+
+def has_all(samples: Sequence[object], count: int) -> bool:
+    return len(samples) >= count
 
 
 def assert_repeats(config: Path) -> None:
@@ -122,13 +132,12 @@ def test_a_timestamp_counts_from_its_origin(place: Place, endpoint: str) -> None
     sent: list[tuple[float, float]] = []
     with client(endpoint) as session, fmu_mesh.load(config).start(paused=True) as run:
         publisher = session.declare_publisher("plant/u", congestion_control=zenoh.CongestionControl.BLOCK)
-        wait_until(lambda: publisher.matching_status.matching, "a subscriber")
+        wait_until(lambda: matches(publisher), "a subscriber")
         for number in range(1, 5):
             stamp = session.new_timestamp()
             sent.append((stamp.get_time_as_ntp64().as_nanos() / 1e9 - origin, float(number)))
             publisher.put(str(number), timestamp=stamp)
-            end = time.monotonic() + 3 * STEP_S
-            wait_until(lambda end=end: time.monotonic() > end, "three points")
+            wait_until(partial(is_over, time.monotonic() + 3 * STEP_S), "three points")
         publisher.put("5")  # without a timestamp: a router adds its own
         taken(run, 5)
         run.resume()
@@ -173,7 +182,7 @@ def messages(samples: Sequence[zenoh.Sample]) -> list[dict[str, Any]]:
 def test_each_point_and_each_change_goes_out_once(
     place: Place, endpoint: str, heard: Callable[[str], list[zenoh.Sample]]
 ) -> None:
-    keys = [
+    keys: list[dict[str, Any]] = [
         {"from": "gain.y", "key": "twin/point", "congestion": "block"},
         {"from": "gain.y", "key": "twin/change", "on": "change", "congestion": "block", "factor": -1.0},
         {"from": "gain.y", "key": "twin/every", "every": 0.25, "congestion": "block"},
@@ -192,7 +201,7 @@ def test_each_point_and_each_change_goes_out_once(
     counts = {"twin/point": 201, "twin/change": 4, "twin/every": 9, "twin/rare": 4, "twin/slow": 67}
     counts |= {"twin/text": 201, "twin/double": 201}
     for key, count in counts.items():
-        wait_until(lambda key=key, count=count: len(samples[key]) >= count, f"{count} samples of {key}")
+        wait_until(partial(has_all, samples[key], count), f"{count} samples of {key}")
     assert {key: len(own) for key, own in samples.items()} == counts
     values = result["gain.y"].tolist()
     points = messages(samples["twin/point"])
@@ -339,6 +348,35 @@ def test_a_sweep_repeats_the_values_in_each_run(place: Place, endpoint: str) -> 
             keys_from=result, start_values={"sum.k": k}, output=place.folder / f"k{k}.csv", processes=k == 1.0
         )
         assert other["sum.y"].tolist() == pytest.approx((k * first["sum.y"]).tolist(), abs=0.0 if k == 1.0 else 1e-12)
+
+
+TEXTS = """
+import hashlib
+import fmu_mesh
+
+class Texts(fmu_mesh.Component):
+    u = fmu_mesh.Input("", type="String")
+    y = fmu_mesh.Output()
+
+    def step(self, time, step_size):
+        self.y = float(int(hashlib.sha256(self.u.encode()).hexdigest()[:8], 16))
+"""
+
+
+def test_long_texts_are_repeated_as_well(place: Place, endpoint: str) -> None:
+    (place.folder / "texts.py").write_text(TEXTS)
+    entry = {"key": "plant/u", "to": "gain.u", "time": "arrival", "encoding": "text", "wait": True}
+    instances = {"gain": {"python": "texts.py:Texts"}}
+    config = keyed(place, endpoint, entry, instances=instances, simulation={"stop_time": 2 * STEP_S})
+
+    with client(endpoint) as session, fmu_mesh.load(config).start(paused=True) as run:
+        put_values(session, "plant/u", [b"\x01" * 2**24, b"A" * (10 << 20)])
+        run.resume()
+        result = run.wait(DEADLINE_S)
+
+    assert len(set(result["gain.y"].tolist())) == 3
+    assert len(key_lines(config.with_suffix(".csv"))) == 2
+    assert fmu_mesh.rerun(config.with_suffix(".csv"), allow_code=True)["gain.y"].tolist() == result["gain.y"].tolist()
 
 
 def test_a_run_does_not_replace_what_it_repeats(place: Place, endpoint: str) -> None:

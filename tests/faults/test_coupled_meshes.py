@@ -7,8 +7,9 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import psutil
 import pytest
@@ -37,6 +38,10 @@ def router(place: Place) -> Iterator[tuple[Launched, str]]:
         yield router
 
 
+def has_rows(file: Path) -> bool:
+    return row_count(file) > 50
+
+
 def started(place: Place, endpoint: str, *, step_s: float, stop_time: float = ENDLESS_S, factor: float = 0.0) -> Pair:
     """An oscillator of two meshes, both of which have made some points."""
     sections = {
@@ -50,7 +55,7 @@ def started(place: Place, endpoint: str, *, step_s: float, stop_time: float = EN
     right = written(place, "right", {"v": V}, [into_v, {"from": "v.y", "key": "pair/v"}], **sections)
     runs = [place.start("launch", config, "--no-progress") for config in (left, right)]
     for config in (left, right):
-        wait_until(lambda config=config: row_count(config.with_suffix(".csv")) > 50, f"50 rows of {config.stem}")
+        wait_until(partial(has_rows, config.with_suffix(".csv")), f"50 rows of {config.stem}")
     return Pair(runs[0], runs[1], (left, right), endpoint)
 
 
@@ -66,9 +71,10 @@ def waits(endpoint: str, mesh: str, instance: str) -> str:
         def activity() -> str | None:
             first = status_of(session, mesh, instance)
             second = status_of(session, mesh, instance)
-            return second.get("activity") if first.get("point") == second.get("point") else None
+            said = str(second.get("activity"))
+            return said if "pair/" in said and first.get("point") == second.get("point") else None
 
-        return wait_until(lambda: (said := activity()) and "pair/" in said and said, f"a wait of {instance}")
+        return wait_until(activity, f"a wait of {instance}")
 
 
 def rows_of(config: Path) -> list[dict[str, str]]:
@@ -77,7 +83,7 @@ def rows_of(config: Path) -> list[dict[str, str]]:
 
 
 def assert_equals_one_mesh(place: Place, pair: Pair, stop_time: float) -> None:
-    connections = ["v.y -> x.u", {"from": "x.y", "to": "v.u", "factor": -1.0}]
+    connections: list[str | dict[str, Any]] = ["v.y -> x.u", {"from": "x.y", "to": "v.u", "factor": -1.0}]
     one = written(place, "one", {"x": X, "v": V}, connections, simulation={"stop_time": stop_time})
     fmu_mesh.load(one).run(processes=False)
     expected = rows_of(one)

@@ -68,7 +68,9 @@ def sent() -> Iterator[Callable[..., zenoh.Sample]]:
         config.insert_json5(name, value)
     with zenoh.open(config) as session, session.declare_subscriber("plant/u", zenoh.handlers.FifoChannel(1)) as own:
 
-        def send(data: bytes | None, encoding: object = "zenoh/bytes", *, stamped: bool = True) -> zenoh.Sample:
+        def send(
+            data: bytes | None, encoding: zenoh.Encoding | str = "zenoh/bytes", *, stamped: bool = True
+        ) -> zenoh.Sample:
             stamp = session.new_timestamp() if stamped else None
             if data is None:
                 session.delete("plant/u", timestamp=stamp)
@@ -94,7 +96,7 @@ ELEMENTS: Mapping[str, st.SearchStrategy[Any]] = {
 }
 
 
-def elements(type_: str) -> st.SearchStrategy[Any]:
+def elements(type_: VariableType) -> st.SearchStrategy[Any]:
     if type_ in ELEMENTS:
         return ELEMENTS[type_]
     whole = INTEGERS[type_]
