@@ -216,7 +216,7 @@ class _Resolving(msgspec.Struct):
             found = f"'{entry.key}', which can match several keys"
             self.findings.add(f"{path}.key", found, "one key, or `take: newest` as well")
         if wild and entry.wait:
-            self.findings.add(f"{path}.wait", "a wait for a key with a wildcard", "one key")
+            self.findings.add(f"{path}.wait", "true for a key with a wildcard", "false, or one key")
         origin = self._origin(entry, path)
         self._check_message(entry, path)
         linear = entry.interpolation == "linear"
@@ -338,7 +338,9 @@ class _Resolving(msgspec.Struct):
     def _check_key(self, key: str, path: str) -> bool:
         """Whether a key has wildcards; a finding if it is no key of Zenoh."""
         if key and not all(map(_CHUNK.fullmatch, key.split("/"))):
-            self.findings.add(f"{path}.key", f"'{key}'", "a Zenoh key such as plant/pump/flow, without # and ?")
+            self.findings.add(
+                f"{path}.key", f"'{key}'", "a Zenoh key such as plant/pump/flow, without #, ? and empty parts"
+            )
         return "*" in key
 
     def _check_message(self, entry: KeyInputConfig | KeyOutputConfig, path: str) -> None:
