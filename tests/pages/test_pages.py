@@ -147,7 +147,8 @@ class PageRun:
         process = self._place.start_command(["bash", "-euo", "pipefail", "-c", self._exports + line])
         if in_background or command.line.endswith("&"):
             self._meanwhile.append(process)
-            wait_until(lambda: process.errors or process.output or not process.running, f"something that '{line}' tells")
+            said = f"something that '{line}' tells"
+            wait_until(lambda: process.errors or process.output or not process.running, said)
             return
         if UNTIL_CTRL_C.match(line):
             wait_until(lambda: process.output or not process.running, f"something that '{line}' shows")
