@@ -258,6 +258,8 @@ def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[s
     written: list[Plain] = []
     for index, connection in enumerate(connections):
         if isinstance(connection, dict):
+            if connection.get("key") == "":  # which is also the place of a wrong one
+                findings.add(f"connections[{index}].key", "''", "a Zenoh key such as plant/pump/flow")
             with_key = "key_output" if "from" in connection else "key_input"
             written.append({**connection, KIND: with_key if "key" in connection else "connection"})
             continue

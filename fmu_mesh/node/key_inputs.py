@@ -28,11 +28,11 @@ from typing import Any, Final
 
 import zenoh
 import zenoh.ext
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from ..errors import DeadlineExceeded, MeshLost
 from ..rings.host_memory import Counter
-from ..system.live_keys import KeyInput, KeyValue
+from ..system.live_keys import KeyInput, KeyValue, key_views
 from ..variables.value_conversion import to_plain
 from ..wire.values import ValueRefused
 from ..wire.views import KeyStatus, LogLine
@@ -101,7 +101,7 @@ class KeyFeed:
         if self._only_newest:
             self._inputs.ask(self._take_newest)
         self._posted = self._begun = False
-        self._counts = KeyStatus(own.key, own.variable)
+        self._counts = KeyStatus(**asdict(key_views(runner.name, own)[0]))
         self._lock = Lock()
         self._received = self._replaced = self._lost = 0
         self._came_bytes = self._taken_bytes = 0  # each of them is written by one side only

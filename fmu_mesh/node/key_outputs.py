@@ -16,12 +16,13 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 import zenoh.ext
+from msgspec.structs import asdict
 from numpy.typing import NDArray
 from zenoh.handlers import Callback
 
 from ..errors import DeadlineExceeded
 from ..rings.host_memory import Counter
-from ..system.live_keys import KeyOutput
+from ..system.live_keys import KeyOutput, key_views
 from ..text import listed
 from ..variables.model_description import Value, Variable
 from ..variables.value_types import is_text, nested
@@ -72,7 +73,7 @@ class KeyOutputs(RowsFor):
             variable = runner.instance.description.variable(own.variable)
             if own.blocks == (counter is not None) and variable is not None:
                 wake = partial(post, self.publish_now) if own.blocks else None
-                self._sinks.setdefault(own.variable, []).append(_Sink(own, variable, session, wake))
+                self._sinks.setdefault(own.variable, []).append(_Sink(own, runner.name, variable, session, wake))
 
     def begin(self) -> None:
         """On the main thread, at point 0: from now on each point counts."""
@@ -134,10 +135,11 @@ class _Sink:
     """
 
     def __init__(
-        self, own: KeyOutput, variable: Variable, session: zenoh.Session, wake: Callable[[], None] | None
+        self, own: KeyOutput, instance: str, variable: Variable, session: zenoh.Session, wake: Callable[[], None] | None
     ) -> None:
         self.key = own.key
         self._own, self._session = own, session
+        self._view = key_views(instance, own)[0]
         self.place = int(np.ravel_multi_index(own.index, variable.shape)) if own.index else None
         self._write, encoding = key_writer(own, variable)
         self._last: object = _NOTHING
@@ -184,4 +186,4 @@ class _Sink:
         """See `KeyOutputs.statuses`."""
         took_s = self._last_at - self._first_at
         rate, age = (self._count - 1) / took_s if took_s > 0.0 else 0.0, time.monotonic() - self._last_at
-        return KeyStatus(self._own.key, self._own.variable, self._count, rate=rate, age=age if self._count else None)
+        return KeyStatus(**asdict(self._view), received=self._count, rate=rate, age=age if self._count else None)

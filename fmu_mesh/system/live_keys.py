@@ -15,14 +15,14 @@ from typing import Final, Literal
 import msgspec
 
 from ..config.findings import Findings
-from ..config.key_sections import KeyInputConfig, KeyOutputConfig
+from ..config.key_sections import KeyInputConfig, KeyOutputConfig, KeyView
 from ..config.mesh import Config
 from ..simtime import steps_between
 from ..text import listed, shown
 from ..variables.model_description import Variable
 from ..variables.units import BaseUnit, Linear
 from ..variables.value_conversion import ValueRefused, to_value
-from ..variables.value_types import PlainValue, is_float
+from ..variables.value_types import PlainValue, element_name, is_float
 from .connections import Variables, offered, resolve_variable
 from .given_units import type_in_words, unit_change
 from .start_values import why_not_settable
@@ -35,6 +35,7 @@ __all__ = [
     "KeyValue",
     "RecordedKeys",
     "field_parts",
+    "key_views",
     "resolve_keys",
     "seconds_of",
 ]
@@ -118,9 +119,20 @@ class KeyOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blocks: bool = False
 
     def __str__(self) -> str:
-        when = "on change" if self.on == "change" else "at each point"
-        rare = f", at most every {self.every} points" if self.every > 1 else ""
-        return when + rare + (", the run waits for who is slow" if self.blocks else "")
+        rare = f"every {self.every} points" if self.every > 1 else "at each point"
+        when = rare if self.on == "point" else "on change" + (f", at most {rare}" if self.every > 1 else "")
+        return when + (", the run waits for who is slow" if self.blocks else "")
+
+
+def key_views(instance: str, *keys: KeyInput | KeyOutput) -> tuple[KeyView, ...]:
+    """What people see of keys of an instance."""
+    views = []
+    for own in keys:
+        index = own.index if isinstance(own, KeyOutput) else ()
+        name = element_name(own.variable, index) if index else own.variable
+        payload = " ".join(filter(None, (own.type or own.encoding, own.field)))
+        views.append(KeyView(instance, own.key, "in" if isinstance(own, KeyInput) else "out", name, payload, str(own)))
+    return tuple(views)
 
 
 def field_parts(path: str) -> KeyPath:
@@ -204,7 +216,7 @@ class _Resolving(msgspec.Struct):
             found = f"'{entry.key}', which can match several keys"
             self.findings.add(f"{path}.key", found, "one key, or `take: newest` as well")
         if wild and entry.wait:
-            self.findings.add(f"{path}.wait", "a wait for a key with a wildcard", "one key")
+            self.findings.add(f"{path}.wait", "true for a key with a wildcard", "false, or one key")
         origin = self._origin(entry, path)
         self._check_message(entry, path)
         linear = entry.interpolation == "linear"
@@ -326,7 +338,9 @@ class _Resolving(msgspec.Struct):
     def _check_key(self, key: str, path: str) -> bool:
         """Whether a key has wildcards; a finding if it is no key of Zenoh."""
         if key and not all(map(_CHUNK.fullmatch, key.split("/"))):
-            self.findings.add(f"{path}.key", f"'{key}'", "a Zenoh key such as plant/pump/flow, without # and ?")
+            self.findings.add(
+                f"{path}.key", f"'{key}'", "a Zenoh key such as plant/pump/flow, without #, ? and empty parts"
+            )
         return "*" in key
 
     def _check_message(self, entry: KeyInputConfig | KeyOutputConfig, path: str) -> None:
