@@ -74,6 +74,17 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return near
         return math.ceil(exact)
 
+    def snapped(self, time: float, tolerance: float) -> float:
+        """The time of the point that differs from ``time`` by ``tolerance`` at most (s), or ``time`` itself.
+
+        Example:
+            >>> TimeGrid(start_time=0.0, step_size=0.1, last_point=60).snapped(0.9000000953674316, tolerance=2.4e-7)
+            0.9
+        """
+        near = (time - self.start_time) / self.step_size
+        at = self.time(round(near)) if abs(near) < ENDLESS else time
+        return at if abs(at - time) <= tolerance else time
+
     def rounding(self, time: float) -> float:
         """Largest difference in s of two equal times: the rounding of one multiplication and one addition."""
         return 8 * math.ulp(max(abs(self.start_time), abs(time)))

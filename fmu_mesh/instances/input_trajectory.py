@@ -23,23 +23,25 @@ class Trajectory:
         >>> trajectory.value(1.0, resolution=1e-9)
         2.0
 
-    ``linear`` says whether the input is linear between two times, or constant from each time on; ``held`` is the time
-    of a value that holds until the next one in any case.
+    ``linear`` says whether the input is linear between two times, or constant from each time on.
     """
 
     def __init__(self, *, linear: bool) -> None:
         self.linear = linear
-        self.held: float | None = None
+        self._held: float | None = None
         self._times: list[float] = []
         self._values: list[Value] = []
 
     def __len__(self) -> int:
         return len(self._times)
 
-    def add(self, time: float, value: Value) -> None:
-        """The input has this value from ``time`` (s) on; it replaces the value for the same time."""
-        if time == self.held:
-            self.held = None
+    def add(self, time: float, value: Value, *, holds: bool = False) -> None:
+        """The input has this value from ``time`` (s) on; it replaces the value for the same time.
+
+        If it ``holds``, there is no line to the next one.
+        """
+        if holds or time == self._held:
+            self._held = time if holds else None
         place = bisect_left(self._times, time)
         if place < len(self._times) and self._times[place] == time:
             self._values[place] = value
@@ -57,7 +59,7 @@ class Trajectory:
             del self._times[:place], self._values[:place]
             place = 0
         start, value = self._times[place], self._values[place]
-        if not self.linear or place + 1 == len(self._times) or start >= time - resolution or start == self.held:
+        if not self.linear or place + 1 == len(self._times) or start >= time - resolution or start == self._held:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
         return between(value, right, (time - start) / (end - start))
@@ -77,7 +79,7 @@ class Trajectory:
         holds = (
             (following == place)
             | (start >= times - resolutions)
-            | (start == (np.nan if self.held is None else self.held))
+            | (start == (np.nan if self._held is None else self._held))
         )
         return np.where(holds, values, line)
 

@@ -155,8 +155,8 @@ class TimedInputs(AroundNativeSteps):
             linear = real and (self._linear or self._keys.get(name, False))
             trajectory = Trajectory(linear=linear)
             if when > now:
-                trajectory.add(now, self._instance.get_values([name])[0])
-                trajectory.held = now if self._keys.get(name) else None  # no line to the first value of a key
+                # There is no line to the first value of a key.
+                trajectory.add(now, self._instance.get_values([name])[0], holds=self._keys.get(name, False))
             self._trajectories[name] = trajectory
         if len(self._trajectories[name]) >= most:
             raise TooManyWait(f"{most} values of '{name}' wait for their time already")

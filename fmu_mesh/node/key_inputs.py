@@ -19,6 +19,7 @@ gets its value is `fmu_mesh.node.inputs`, as for values that are set.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -207,7 +208,9 @@ class KeyFeed:
         else:
             if self._shift is None:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
-            when = said + self._shift + own.delay
+            # Seconds since 1970 have steps of 0.2 us, so that a value would be a point too late as often as not.
+            blur = math.ulp(said) + math.ulp(self._shift)
+            when = grid.snapped(said + self._shift + own.delay, blur)
             if own.wait and not self._used and when > (first := grid.start_time + own.delay) + grid.rounding(first):
                 text = (
                     f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
