@@ -6,6 +6,7 @@ file is `fmu_mesh.config.loading`; what the names in it mean is `fmu_mesh.system
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache, reduce
 from operator import or_
 from typing import Annotated, Any, Literal, cast
@@ -35,6 +36,7 @@ __all__ = [
     "TimeoutsConfig",
     "ZenohConfig",
     "config_type",
+    "sources_of",
 ]
 
 MAX_WINDOW = 1_000_000
@@ -361,15 +363,6 @@ class Config(Base, frozen=True, kw_only=True):
     version: Annotated[Literal[1], Meta(description="Version of this file format.")] = 1
 
     @property
-    def sources(self) -> dict[str, str]:
-        """By the name of each input with a connection, right or wrong: the source instance, or the key in words."""
-        return {
-            one.target: f"key {one.key}" if isinstance(one, KeyInputConfig) else one.source.partition(".")[0]
-            for one in self.connections
-            if not isinstance(one, KeyOutputConfig)
-        }
-
-    @property
     def records(self) -> dict[str, RecordConfig]:
         """The sections of all result files, by their paths in the file: `record`, or `record[0]`, `record[1]`, ..."""
         if isinstance(self.record, RecordConfig):
@@ -409,3 +402,12 @@ def config_type(sections: tuple[type[InstanceSection], ...]) -> type[Config]:
         kw_only=True,
     )
     return cast("type[Config]", made)
+
+
+def sources_of(connections: Iterable[ConnectionConfig | KeyInputConfig | KeyOutputConfig]) -> dict[str, str]:
+    """By the name of each input with a connection, right or wrong: the source instance, or the key in words."""
+    return {
+        one.target: f"key {one.key}" if isinstance(one, KeyInputConfig) else one.source.partition(".")[0]
+        for one in connections
+        if not isinstance(one, KeyOutputConfig)
+    }

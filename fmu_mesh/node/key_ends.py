@@ -9,10 +9,10 @@ import zenoh
 import zenoh.ext
 from zenoh.handlers import Callback
 
+from ..config.mesh import TimeoutsConfig
 from ..rings.host_memory import Counter, HostMemory
 from ..system.live_keys import KeyInput, KeyValue
 from ..system.memory_map import map_memory
-from ..system.plan import NodePlan
 from ..wire.session import undeclare_all
 from ..wire.views import KeyStatus, LogLine
 from .engine import Windows
@@ -40,16 +40,17 @@ class KeyEnds:
         lossy: the outputs that another thread publishes.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  what a node has around its keys
         self,
-        plan: NodePlan,
+        node: str,
+        timeouts: TimeoutsConfig,
         session: zenoh.Session,
         post: Callable[..., None],
         log: Callable[[LogLine], None],
         tell: Callable[[Sequence[KeyValue]], None],
     ) -> None:
         self.lossy: list[KeyOutputs] = []
-        self._plan = plan
+        self._node, self._timeouts = node, timeouts
         self._session = session
         self._around = post, log, tell
         self._feeds: list[KeyFeed] = []
@@ -64,8 +65,8 @@ class KeyEnds:
         }
         blocking = {f"keys of {runner.name}" for runner in live if any(own.blocks for own in runner.plan.keys_out)}
         # A counter for each that limits the node, in memory of its own: only this thread uses it.
-        map_, _ = map_memory([self._plan.node, *waiting, *blocking], {})
-        counters = HostMemory.private(map_, self._plan.node).progress
+        map_, _ = map_memory([self._node, *waiting, *blocking], {})
+        counters = HostMemory.private(map_, self._node).progress
         for runner in live:
             for own in runner.plan.keys_in:
                 counter = counters.get(f"{own.key} > {runner.name}.{own.variable}")
@@ -124,14 +125,14 @@ class KeyEnds:
             DeadlineExceeded: no value has come, or nobody reads one.
         """
         for feed in self._feeds:
-            feed.check(granted, now, self._plan.timeouts.step)
+            feed.check(granted, now, self._timeouts.step)
         for outputs, _ in self._blocking:
-            outputs.check(granted, now, self._plan.timeouts.step)
+            outputs.check(granted, now, self._timeouts.step)
 
     def look(self, now: float) -> None:
         """On the thread of the server: tell of keys that nobody has published for the time of a start."""
         for feed in self._feeds:
-            feed.look(now, self._plan.timeouts.start)
+            feed.look(now, self._timeouts.start)
 
     def statuses(self, name: str) -> tuple[KeyStatus, ...]:
         """What `status` says of the keys of an instance; from any thread."""

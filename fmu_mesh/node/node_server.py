@@ -91,7 +91,7 @@ class NodeServer:
         self._next_search = 0.0
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
-        self.keys = KeyEnds(plan, session, inbox.post, self.log_message, tell)
+        self.keys = KeyEnds(plan.node, plan.timeouts, session, inbox.post, self.log_message, tell)
         self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log, tell)
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}

@@ -5,14 +5,15 @@ What else is under keys is `fmu_mesh.node.key_payloads`. The definitions of the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from msgspec.structs import replace
 
 from ..config.findings import Findings
 from ..config.mesh import RosTopicConfig
 from ..errors import ConfigurationError
 from ..system.live_keys import KeyInput, KeyOutput
-from ..system.system import ResolvedSystem
-from ..variables.model_description import Variable
+from ..variables.model_description import ModelDescription, Variable
 from .assembling import Assembler, Disassembler
 from .definitions import MessageTypes
 from .fitting import TopicEntry, check_topic
@@ -21,20 +22,20 @@ from .topics import Direction, Port, Topic
 __all__ = ["check_messages", "message_reader", "message_writer"]
 
 
-def check_messages(system: ResolvedSystem, findings: Findings) -> None:
+def check_messages(
+    instance: str, description: ModelDescription, keys: Iterable[KeyInput | KeyOutput], findings: Findings
+) -> None:
     """Add a finding for each message under a key that cannot carry its variable."""
-    for name, own in system.instances.items():
-        entries: tuple[KeyInput | KeyOutput, ...] = (*own.keys_in, *own.keys_out)
-        for entry in entries:
-            variable = own.description.variable(entry.variable)
-            if entry.encoding != "cdr" or variable is None:
-                continue
-            path, topic = entry.path, _topic(entry, variable, name)
-            written = RosTopicConfig(topic=entry.key, type=topic.message, fields={topic.ports[0].path: name})
-            try:
-                check_topic(TopicEntry(written, path, path, f"{path}.field"), topic, MessageTypes(), findings, [])
-            except ConfigurationError as error:
-                findings.add(f"{path}.encoding", error.message, error.hint or "")
+    for own in keys:
+        variable = description.variable(own.variable)
+        if own.encoding != "cdr" or variable is None:
+            continue
+        path, topic = own.path, _topic(own, variable, instance)
+        written = RosTopicConfig(topic=own.key, type=topic.message, fields={topic.ports[0].path: instance})
+        try:
+            check_topic(TopicEntry(written, path, path, f"{path}.field"), topic, MessageTypes(), findings, [])
+        except ConfigurationError as error:
+            findings.add(f"{path}.encoding", error.message, error.hint or "")
 
 
 def message_reader(own: KeyInput, variable: Variable) -> Disassembler:

@@ -172,7 +172,8 @@ def planned(
 
     checked = partial(check_record, loaded)
     system = build(loaded, descriptions, findings, scenario, claimed, obstacles, checked, base_unit_of)
-    check_messages(system, obstacles)
+    for name, own in system.instances.items():
+        check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from ..config.findings import Findings
 from ..config.instance_sections import ActuatorConfig, ControllerConfig, FluidDynamicsConfig, PhysicsSection
-from ..config.mesh import Config
+from ..config.mesh import Config, sources_of
 from ..text import listed, nearest
 from ..variables.model_description import ModelDescription, Variable
 from .connections import Connection, Variables, resolve_connections
@@ -74,7 +74,7 @@ def driven_inputs(config: Config, descriptions: Mapping[str, ModelDescription]) 
     connections = (*explicit, *coupled_connections(engines, variables, explicit, ignored))
     driven = {f"{c.target_instance}.{c.target.name}": _FREE for c in connections}
     # Also the target of a connection whose source does not exist.
-    driven |= dict.fromkeys(config.sources, _FREE)
+    driven |= dict.fromkeys(sources_of(config.connections), _FREE)
     for name, engine in engines.items():
         for actuator in engine.actuators:
             if actuator.enabled:

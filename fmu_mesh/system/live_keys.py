@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Final, Literal
 
@@ -16,7 +16,6 @@ import msgspec
 
 from ..config.findings import Findings
 from ..config.key_sections import KeyInputConfig, KeyOutputConfig, KeyView
-from ..config.mesh import Config
 from ..simtime import steps_between
 from ..text import listed, shown
 from ..variables.model_description import Variable
@@ -167,8 +166,10 @@ def seconds_of(time: object) -> float | None:
     return float(time) if abs(time) < 1e300 else None  # a larger integer is no float
 
 
-def resolve_keys(
-    config: Config,
+def resolve_keys(  # noqa: PLR0913, PLR0917  a part of a configuration, and what is around it
+    entries: Iterable[object],
+    root: str,
+    step_size: float,
     variables: Variables,
     connected: Mapping[str, str],
     unit_of: Callable[[str], BaseUnit | None],
@@ -177,16 +178,18 @@ def resolve_keys(
     """What comes by keys and what goes to keys, by instance; what is wrong is a finding.
 
     Args:
-        config: the configuration; an entry may be a placeholder.
+        entries: the connections of the configuration; one may be a placeholder.
+        root: what the keys of the mesh itself begin with.
+        step_size: base step size in s.
         variables: all variables of all instances.
         connected: the source instance of each `instance.variable` with a connection.
         unit_of: the meaning of a unit by its usual name; None if it is not known.
         findings: where everything goes that is wrong.
     """
-    resolving = _Resolving(config, variables, dict(connected), unit_of, findings, set())
+    resolving = _Resolving(root, step_size, variables, dict(connected), unit_of, findings, set())
     inputs: dict[str, list[KeyInput]] = {}
     outputs: dict[str, list[KeyOutput]] = {}
-    for index, entry in enumerate(config.connections):
+    for index, entry in enumerate(entries):
         path = f"connections[{index}]"
         if isinstance(entry, KeyInputConfig) and entry.target:
             for own in resolving.input(entry, path):
@@ -200,7 +203,8 @@ def resolve_keys(
 class _Resolving(msgspec.Struct):
     """See `resolve_keys`; ``published`` has the keys of the outputs so far."""
 
-    config: Config
+    root: str
+    step_size: float
     variables: Variables
     connected: dict[str, str]
     unit_of: Callable[[str], BaseUnit | None]
@@ -251,14 +255,13 @@ class _Resolving(msgspec.Struct):
     def output(self, entry: KeyOutputConfig, path: str) -> Iterator[KeyOutput]:
         """As `input`, for a key that others read."""
         before, add = len(self.findings), self.findings.add
-        own = f"{self.config.zenoh.key_prefix}/{self.config.mesh}/"
-        if self._check_key(entry.key, path) or entry.key.startswith(own):
-            add(f"{path}.key", f"'{entry.key}'", f"one key, without wildcards, and not below {own}")
+        if self._check_key(entry.key, path) or entry.key.startswith(self.root):
+            add(f"{path}.key", f"'{entry.key}'", f"one key, without wildcards, and not below {self.root}")
         if entry.key in self.published:
             add(f"{path}.key", f"'{entry.key}' a second time", "a key of its own for each output")
         self.published.add(entry.key)
         self._check_message(entry, path)
-        step = self.config.simulation.step_size
+        step = self.step_size
         every = steps_between(0.0, entry.every, step) if entry.every is not None and step > 0.0 else 1
         if not every:
             add(f"{path}.every", f"{entry.every:g} s", f"a multiple of the step size {step:.12g} s")

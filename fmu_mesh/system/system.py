@@ -20,7 +20,7 @@ from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.key_sections import KeyView
 from fmu_mesh.config.loading import LoadedConfig
-from fmu_mesh.config.mesh import Config
+from fmu_mesh.config.mesh import Config, sources_of
 from fmu_mesh.config.ros_section import MeshTopic
 from fmu_mesh.errors import Finding
 from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
@@ -184,8 +184,9 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     of_files = collected if obstacles is None else obstacles
     records = resolve_records(loaded, variables, grid, collected, of_files, check_record)
     connected = {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
-    keys_in, keys_out = resolve_keys(config, variables, connected, unit_of, collected)
-    sources = config.sources | connected  # also those of wrong connections
+    root, step_size = f"{config.zenoh.key_prefix}/{config.mesh}/", config.simulation.step_size
+    keys_in, keys_out = resolve_keys(config.connections, root, step_size, variables, connected, unit_of, collected)
+    sources = sources_of(config.connections) | connected  # also those of wrong connections
     fed = {name for name, source in sources.items() if not source.startswith(KEY)}
     base = grid.step_size if grid is not None else 1.0
     timeouts = {
