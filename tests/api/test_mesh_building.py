@@ -151,7 +151,7 @@ def test_a_key_with_the_name_of_an_instance_stays_when_that_goes() -> None:
         (lambda mesh: mesh.subscribe("a/b", "delay"), r"mesh.subscribe\('a/b', 'delay'\): 'delay'; expected instance"),
         (lambda mesh: mesh.publish("delay", "a/b"), r"mesh.publish\('delay', 'a/b'\): 'delay'; expected instance"),
         (lambda mesh: mesh.subscribe("", "delay.x"), "key: ''; expected a Zenoh key"),
-        (lambda mesh: mesh.subscribe("a/b", "delay.x", encodin="text"), "encodin: an unknown key.*'encoding'"),
+        (lambda mesh: mesh.subscribe("a/b", "delay.x", factr=2.0), "factr: an unknown key.*'factor'"),
         (lambda mesh: mesh.publish("delay.y", "a/b", on="x"), "on: 'x'; expected change or point"),
         (
             lambda mesh: mesh.disconnect("delay.y", "twin/z"),

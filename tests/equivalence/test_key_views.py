@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -21,7 +22,7 @@ _ENDLESS = {"stop_time": 600.0, "real_time_factor": 1}
 @contextmanager
 def seen(place: Place) -> Iterator[tuple[Launched, zenoh.Session]]:
     """A mesh with a key at each end that has got a value, and something else, and a session beside it."""
-    connections = [
+    connections: list[str | dict[str, Any]] = [
         "pump.y -> tank.u",
         {"key": "plant/flow", "to": "pump.u", "field": "sensors[0].value"},
         {"from": "pump.y", "key": "twin/y", "on": "change", "encoding": "text"},
@@ -80,7 +81,16 @@ def test_an_fmu_on_the_command_line_gets_and_publishes_keys(place: Place) -> Non
         subscriber = session.declare_subscriber(
             "twin/y", lambda sample: published.append(json.loads(sample.payload.to_bytes())["value"])
         )
-        command = ["run", FMUS / "Gain.fmu", "--set", "k=2", "--subscribe", "u=plant/*/flow", "--publish", "y=twin/y"]
+        command: list[str | Path] = [
+            "run",
+            FMUS / "Gain.fmu",
+            "--set",
+            "k=2",
+            "--subscribe",
+            "u=plant/*/flow",
+            "--publish",
+            "y=twin/y",
+        ]
         launched = place.start(*command, "--name", "pump", "--output", "pump.csv", "--connect", endpoint)
         put_values(session, "plant/pump/flow", [3.5])
         wait_until(lambda: 7.0 in published, "an output that the value has reached")
@@ -111,9 +121,9 @@ def test_a_wrong_key_on_the_command_line_is_told_by_flag(
 
 def test_check_says_where_kept_values_come_from(place: Place) -> None:
     path = written(place, "kept", {"pump": {"fmu": "Gain"}}, [{"key": "plant/flow", "to": "pump.u"}])
-    kept: Path = place.folder / "kept.csv.keys.jsonl"
+    kept: Path = place.folder / "earlier.csv.keys.jsonl"
     kept.write_text('["pump.u",3,null,2.0]\n')
 
     output = place.run("check", path, "--keys-from", kept).output
 
-    assert "  plant/flow -> pump.u  auto  on arrival\n  their values come from kept.csv.keys.jsonl\n" in output
+    assert "  plant/flow -> pump.u  auto  on arrival\n  their values come from earlier.csv.keys.jsonl\n" in output
