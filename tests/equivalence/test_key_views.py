@@ -12,7 +12,10 @@ from typing import Any
 import pytest
 import zenoh
 
+import fmu_mesh
 from fmu_mesh.cli.main import main
+from fmu_mesh.foxglove.mesh_topics import topics_by_instance
+from fmu_mesh.wire.client.readings import Target
 from tests.helpers import FMUS, Launched, Place, wait_until
 from tests.key_meshes import client, key_lines, put_values, status_of, stepped_router, written
 
@@ -127,3 +130,23 @@ def test_check_says_where_kept_values_come_from(place: Place) -> None:
     output = place.run("check", path, "--keys-from", kept).output
 
     assert "  plant/flow -> pump.u  auto  on arrival\n  their values come from earlier.csv.keys.jsonl\n" in output
+
+
+def test_foxglove_shows_a_key_as_publisher_or_subscriber_of_a_variable() -> None:
+    mesh = fmu_mesh.Mesh("graph", step_size=0.01, stop_time=1.0)
+    mesh.add("pump", fmu=FMUS / "Gain.fmu")
+    mesh.add("tank", fmu=FMUS / "Gain.fmu")
+    mesh.connect("pump.y", "tank.u")
+    mesh.subscribe("plant/flow", "pump.u")
+    mesh.publish("pump.y", "twin/y")
+    with mesh.start(record="memory", paused=True) as run:
+        run.wait_for("paused")
+        infos = {name: run.instance_info(name) for name in ("pump", "tank")}
+
+    targets = [Target(name, view.key, view) for name, info in infos.items() for view in info.variables]
+    around = topics_by_instance(infos, targets)
+
+    assert around["/pump/u"] == ("key plant/flow", ("pump",))
+    assert around["/pump/y"] == ("pump", ("key twin/y", "tank"))
+    assert around["/tank/y"] == ("tank", ())
+    assert not any(view.settable for view in infos["pump"].variables if view.name == "u")
