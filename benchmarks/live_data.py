@@ -42,7 +42,9 @@ _STEP_S: Final = 1 / _RATE_HZ
 _OUT_OF_STEP_HZ: Final = 997.0
 """Values that take effect on arrival come at each moment between two points, and seldom two of them."""
 
-_AHEAD_S: Final = 0.5
+_AHEAD_S: Final = 2.0
+"""How long before its time a value is sent: none may come late, however busy the machine is."""
+
 _WINDOW: Final = 20_000
 _MORE_S: Final = 120.0
 _PEER: Final = Path(__file__).with_name("live_data_peer.py")
@@ -97,6 +99,7 @@ class Way:
     replaced: int = 0
     lost: int = 0
     misplaced: int = 0
+    late: int = 0
     sent: int = 0
 
     def row(self, name: str) -> list[str]:
@@ -106,7 +109,8 @@ class Way:
             for rounds in (self.bare_ms, self.mesh_ms, self.points)
             for place in (0, 1)
         ]
-        return [_WAYS[name], *medians, str(self.replaced), f"{self.sent:,}", str(self.lost), str(self.misplaced)]
+        counts = self.lost, self.misplaced, self.late
+        return [_WAYS[name], *medians, f"{self.replaced:,}", f"{self.sent:,}", *map(str, counts)]
 
 
 _HEADER: Final = (
@@ -121,6 +125,7 @@ _HEADER: Final = (
     "with times",
     "lost",
     "at another point",
+    "late",
 )
 
 
@@ -152,6 +157,7 @@ def _clients(options: argparse.Namespace) -> tuple[list[str], list[str]]:
                 ways[name].sent += count
                 ways[name].lost += lost
                 ways[name].misplaced += moved
+                ways[name].late += answer["late"]
             problems += _rerun(place, result)
     rows = [way.row(name) for name, way in ways.items()]
     rows += [[_WAYS[name], f"not measured: {reason}", *[""] * (len(_HEADER) - 2)] for name in _WAYS if name not in ways]
@@ -228,6 +234,8 @@ def _mesh(place: Place, network: Network, count: int, kind: str) -> tuple[Path, 
     mesh, result = _start(place, instances, connections, network.ports.zenoh, 3600.0, 1)
     network.wait_for_link()
     answers = _feed(network, "plain" if kind == "arrival" else "timed", count)
+    for name, answer in answers.items():
+        answer["late"] = _status(place, name)["late"]
     place.run("stop", "live")
     mesh.wait()
     return result, answers
@@ -353,7 +361,7 @@ def flooded(kind: str, seconds: float) -> Watched:
         with seen.watching(place), _peer({"role": "flood", "port": port, "seconds": seconds}) as peer:
             sent = peer.answer(0, seconds + _MORE_S)["sent"]
             points, took_s = row_count(result) - before, time.monotonic() - began
-            status = _status(place)
+            status = _status(place, "gain")
         place.run("stop", "live")
         mesh.wait()
         seen.figures = {**status, "kind": kind, "rate": sent / seconds, "points": points / took_s}
@@ -362,9 +370,9 @@ def flooded(kind: str, seconds: float) -> Watched:
     return seen
 
 
-def _status(place: Place) -> dict[str, Any]:
-    """What the mesh says of its key."""
-    launched = place.run("status", "live/gain", "--json")
+def _status(place: Place, instance: str) -> dict[str, Any]:
+    """What the mesh says of the key of an instance."""
+    launched = place.run("status", f"live/{instance}", "--json")
     own: dict[str, Any] = json.loads(launched.output)["keys"][0]
     return own
 

@@ -12,6 +12,7 @@ publishes, and what the role needs. With `mqtt`, a port, its values go to `mosqu
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import threading
@@ -27,6 +28,9 @@ from fmu_mesh.wire.session import matches
 _DEADLINE_S: Final = 60.0
 _LAST_S: Final = 5.0
 """How long a value that has not come back may still be on its way."""
+
+_PART_S: Final = 0.25
+"""The fastest row of each such time says when its points were due."""
 
 _LOOK: Final = 500
 """After so many values, `ahead` looks how far the mesh is."""
@@ -44,12 +48,12 @@ def joined(port: int) -> zenoh.Session:
 
 
 class Returned:
-    """What has come back: when each value has come first and at which point, and when the run began, in s."""
+    """What has come back: when each value has come first and at which point, and when each point was due, in s."""
 
     def __init__(self, session: zenoh.Session, key: str, step_s: float) -> None:
         self.at: dict[float, tuple[float, int]] = {}
         self.point = -1
-        self.began = float("inf")
+        self._began: dict[int, float] = {}
         self._step_s = step_s
         self._changed = threading.Condition()
         self._subscriber = session.declare_subscriber(key, self._take)
@@ -60,9 +64,15 @@ class Returned:
         with self._changed:
             self.at.setdefault(message["value"], (now, point))
             self.point = max(self.point, point)
-            # No row is published before its time, so the fastest of all says when point 0 was.
-            self.began = min(self.began, now - point * self._step_s)
+            # No row is published before its time, so the fastest one says when point 0 was. A run that has fallen
+            # behind gives points up, and goes on as if it had begun later.
+            part, began = int(now / _PART_S), now - point * self._step_s
+            self._began[part] = min(self._began.get(part, began), began)
             self._changed.notify()
+
+    def point_at(self, time_s: float) -> float:
+        """The point that was due at a time; NaN where nothing came at that time."""
+        return (time_s - self._began.get(int(time_s / _PART_S), math.nan)) / self._step_s
 
     def wait(self, is_enough: Callable[[], bool], seconds: float = _DEADLINE_S) -> bool:
         """Wait until something is so, at most for some seconds."""
@@ -98,11 +108,11 @@ def plain(put: Put, back: Returned, orders: dict[str, Any]) -> dict[str, Any]:
     known = [(number, *back.at[first + number]) for number in range(count) if first + number in back.at]
     numbers, times, points = (np.array(own) for own in zip(*known, strict=True))
     trips_ms = 1000 * (times - sent[numbers])
-    effects = points - (sent[numbers] - back.began) / orders["step_s"]
+    effects = points - np.array([back.point_at(time_s) for time_s in sent[numbers].tolist()])
     return {
         "missing": count - len(known),
         "round_trips_ms": np.percentile(trips_ms, [50, 99]).tolist(),
-        "points": np.percentile(effects, [50, 99]).tolist(),
+        "points": np.nanpercentile(effects, [50, 99]).tolist(),
     }
 
 
