@@ -193,7 +193,8 @@ def test_a_flood_neither_stops_the_run_nor_fills_its_memory(kind: str, place: Pl
                 assert keys["replaced"] > 0
         told = live.stop()
 
-    assert sizes[2] - sizes[0] < 16 * 2**20, sizes
+    # 65,536 samples of 0.6 kB may have waited at once; all that came since the first look would be 120 MB.
+    assert sizes[2] - sizes[0] < 48 * 2**20, sizes
     if kind == "arrival":
         assert len(key_lines(live.result)) == 3 * count - keys["replaced"]
     else:
