@@ -20,13 +20,12 @@ class Trajectory:
         >>> trajectory.value(1.0, resolution=1e-9)
         2.0
 
-    ``linear`` says whether the input is linear between two times, or constant from each time on; ``held`` is the time
-    of a value that holds until the next one in any case.
+    ``linear`` says whether the input is linear between two times, or constant from each time on.
     """
 
     def __init__(self, *, linear: bool) -> None:
         self.linear = linear
-        self.held: float | None = None
+        self._held: float | None = None
         self._times: list[float] = []
         self._values: list[Value] = []
 
@@ -35,14 +34,19 @@ class Trajectory:
 
     def add(self, time: float, value: Value) -> None:
         """The input has this value from ``time`` (s) on; it replaces the value for the same time."""
-        if time == self.held:
-            self.held = None
+        if time == self._held:
+            self._held = None
         place = bisect_left(self._times, time)
         if place < len(self._times) and self._times[place] == time:
             self._values[place] = value
         else:
             self._times.insert(place, time)
             self._values.insert(place, value)
+
+    def hold(self, time: float, value: Value) -> None:
+        """As `add`, and the input has this value until the next time, also if it is linear."""
+        self.add(time, value)
+        self._held = time
 
     def value(self, time: float, resolution: float) -> Value:
         """The value at ``time``, which is not before the first time; both in s.
@@ -54,7 +58,7 @@ class Trajectory:
             del self._times[:place], self._values[:place]
             place = 0
         start, value = self._times[place], self._values[place]
-        if not self.linear or place + 1 == len(self._times) or start >= time - resolution or start == self.held:
+        if not self.linear or place + 1 == len(self._times) or start >= time - resolution or start == self._held:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
         return between(value, right, (time - start) / (end - start))

@@ -144,8 +144,10 @@ class TimedInputs(AroundNativeSteps):
             linear = real and (self._linear or name in self._linear_names)
             trajectory = Trajectory(linear=linear)
             if when > now:
-                trajectory.add(now, self._instance.get_values([name])[0])
-                trajectory.held = now if name in self._linear_names else None  # no line to the first value of a key
+                # There is no line to the first value of a key.
+                (trajectory.hold if name in self._linear_names else trajectory.add)(
+                    now, self._instance.get_values([name])[0]
+                )
             self._trajectories[name] = trajectory
         if len(self._trajectories[name]) >= _WAITING:
             raise TooManyWait(f"{_WAITING} values of '{name}' wait for their time already")

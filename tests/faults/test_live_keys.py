@@ -47,7 +47,7 @@ def endpoint(place: Place) -> Iterator[str]:
 class Live:
     """A gain of 1 with a key, in a mesh that runs in real time without an end; and what is said of it."""
 
-    def __init__(self, place: Place, endpoint: str, *entries: dict[str, Any], **sections: Any) -> None:  # noqa: ANN401
+    def __init__(self, place: Place, endpoint: str, *entries: dict[str, Any], **sections: Any) -> None:  # noqa: ANN401  as the file has it
         self.place, self.endpoint = place, endpoint
         self.result = place.folder / "live.csv"
         simulation = {"real_time_factor": 1, "stop_time": None, **sections.pop("simulation", {})}
@@ -354,7 +354,7 @@ def test_a_slow_reader_loses_what_may_be_dropped(place: Place, endpoint: str) ->
     result: Path = place.folder / "live.csv"
     with client(endpoint) as session:
         own = session.declare_subscriber("twin/y", zenoh.handlers.RingChannel(5))
-        next_of: Callable[[], int] = lambda: json.loads(own.recv().payload.to_bytes())["point"]  # noqa: E731
+        next_of: Callable[[], int] = lambda: json.loads(own.recv().payload.to_bytes())["point"]  # noqa: E731  a name for what is called twice
         first = next_of()
         before = row_count(result)
         wait_until(lambda: row_count(result) > before + 2000, "rows")
