@@ -47,6 +47,7 @@ BLOCKS = {
     "jobs": "benchmarks",
     "far": "benchmarks.far",
     "ros topics": "benchmarks.ros_topics",
+    "live data": "benchmarks.live_data",
     "recording": "benchmarks.recording",
     "formats": "benchmarks.formats",
     "scale": "benchmarks.scale",

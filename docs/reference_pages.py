@@ -86,6 +86,9 @@ _SWEEP = """\
 `fmu_mesh.sweep` and the command take these beside those of a run that any variant has ([sweeps](../sweeps.md)).
 """
 
+_FORMS: Mapping[object, str] = {"key_input": "with `key` and `to`", "key_output": "with `from` and `key`"}
+"""What tells sections of one list apart, by their tags."""
+
 _OF_ALL = ("--help", "--debug")
 
 
@@ -233,6 +236,7 @@ def _sections(kind: inspect.StructType, path: str, seen: dict[type, str]) -> Ite
         about = f"{_first_line(kind.cls)} Keys of every instance are [above](#every-instance)."
         yield Section(kind.cls, f"`instances.NAME` with `{kind.tag}`", about, keys_of(kind, own))
     else:
+        path = f"`{path}` {_FORMS[kind.tag]}" if kind.tag in _FORMS else path
         yield Section(kind.cls, path, _first_line(kind.cls), keys_of(kind))
     for field in kind.fields:
         place = f"{path}.{field.encode_name}" if path else field.encode_name

@@ -44,11 +44,11 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The time of ``point`` in s."""
         return self.start_time + point * self.step_size
 
-    def times(self, first: int, end: int) -> NDArray[np.float64]:
-        """The times of the points ``first .. end - 1`` in s, bit for bit those of `time`; shape `(end - first,)`."""
+    def times(self, first: int, end: int, points: int = 1) -> NDArray[np.float64]:
+        """The times of the points ``first .. end - 1``, or of own steps there, in s, bit for bit those of `time`."""
         import numpy as np  # noqa: PLC0415 many commands need no array, and it takes as long as all the rest
 
-        times: NDArray[np.float64] = self.start_time + np.arange(first, end, dtype=np.float64) * self.step_size
+        times: NDArray[np.float64] = self.start_time + np.arange(first, end, points, dtype=np.float64) * self.step_size
         return times
 
     def step_at(self, time: float, points: int = 1, tolerance: float = 0.0) -> int:
@@ -73,6 +73,17 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if abs(self.time(near * points) - time) <= max(tolerance, self.rounding(time)):
             return near
         return math.ceil(exact)
+
+    def snapped(self, time: float, tolerance: float) -> float:
+        """The time of the point that differs from ``time`` by ``tolerance`` at most (s), or ``time`` itself.
+
+        Example:
+            >>> TimeGrid(start_time=0.0, step_size=0.1, last_point=60).snapped(0.9000000953674316, tolerance=2.4e-7)
+            0.9
+        """
+        near = (time - self.start_time) / self.step_size
+        at = self.time(round(near)) if abs(near) < ENDLESS else time
+        return at if abs(at - time) <= tolerance else time
 
     def rounding(self, time: float) -> float:
         """Largest difference in s of two equal times: the rounding of one multiplication and one addition."""

@@ -25,7 +25,7 @@ from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.overriding import memory_file, memory_of
-from ..run.preparing import KnownModels, planned
+from ..run.preparing import KnownModels, planned, without_keys
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
@@ -291,12 +291,57 @@ class Mesh:
         Raises:
             CallRefused: a key is wrong.
         """
-        call, own = f"mesh.connect({source!r}, {target!r})", plain({"from": source, "to": target, **keys})
+        self._join(f"mesh.connect({source!r}, {target!r})", {"from": source, "to": target, **keys}, [source, target])
+
+    def subscribe(self, key: str, target: str, **keys: Any) -> None:  # noqa: ANN401  as the file has it
+        """Let an input get what other programs publish under a Zenoh key (docs/live-data.md).
+
+        Example:
+            >>> mesh = fmu_mesh.Mesh("twin", step_size=0.01, stop_time=1.0, real_time_factor=1.0)
+            >>> mesh.add("pump", fmu="fmus/Gain.fmu")
+            >>> mesh.subscribe("plant/pump/flow", "pump.u", field="sensors[0].value", time="timestamp")
+            >>> mesh.publish("pump.y", "twin/pump/y", every=0.1)
+            >>> for key in mesh.check().plan.keys:
+            ...     print(key.ends, "|", key.encoding, "|", key.rule)
+            plant/pump/flow -> pump.u | auto sensors[0].value | at its timestamp
+            pump.y -> twin/pump/y | json | every 10 points
+
+        Args:
+            key: the key of Zenoh; with ``take="newest"`` it may have wildcards.
+            target: the input, or a tunable parameter, as `instance.variable`.
+            keys: any other key of such a connection in a configuration file, such as ``encoding="text"``.
+
+        Raises:
+            CallRefused: a key is wrong.
+        """
+        self._join(f"mesh.subscribe({key!r}, {target!r})", {"key": key, "to": target, **keys}, [target])
+
+    def publish(self, source: str, key: str, **keys: Any) -> None:  # noqa: ANN401  as the file has it
+        """Publish the values of an output under a Zenoh key, for other programs; see `subscribe`.
+
+        Example:
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> mesh.publish("delay.y", "twin/angle", on="change", encoding="text")
+            >>> mesh.disconnect("delay.y", "twin/angle")
+
+        Args:
+            source: the output as `instance.variable`.
+            key: the key of Zenoh.
+            keys: any other key of such a connection in a configuration file, such as ``every=0.1``.
+
+        Raises:
+            CallRefused: a key is wrong.
+        """
+        self._join(f"mesh.publish({source!r}, {key!r})", {"from": source, "key": key, **keys}, [source])
+
+    def _join(self, call: str, entry: Mapping[str, Any], ends: Sequence[str]) -> None:
+        own = plain(entry)
         check_part(call, {"connections": [own]}, ["connections[0]"], "connections[0]")
-        if wrong := [end for end in (source, target) if not all(end.partition(".")[::2])]:
+        if wrong := [end for end in ends if not all(end.partition(".")[::2])]:
             raise CallRefused(f"{call}: '{wrong[0]}'; expected instance.variable")
         connections = connections_of(self._plain)
-        place = next((n for n, one in enumerate(connections) if ends_of(one) == (source, target)), len(connections))
+        both = ends_of(own)
+        place = next((n for n, one in enumerate(connections) if ends_of(one) == both), len(connections))
         self._plain = said_by(self._plain, call, [f"connections[{place}]"], new=place == len(connections))
         connections[place : place + 1] = [own]
         self._data["connections"] = connections
@@ -305,15 +350,16 @@ class Mesh:
         """Remove connections: of an output, of an input, or the one from an output to an input.
 
         Args:
-            source: the output; None: any.
-            target: the input; None: any.
+            source: the output, or the Zenoh key; None: any.
+            target: the input, or the Zenoh key; None: any.
 
         Raises:
             UnknownName: there is no such connection; suggests the nearest one.
         """
 
         def keeps(one: object, other: object) -> bool:
-            return source not in (None, one) or target not in (None, other)
+            pairs = (source, one), (target, other)
+            return any(wanted is not None and end not in (wanted, f"key {wanted}") for wanted, end in pairs)
 
         left, there = with_connections(self._plain, keeps), connections_of(self._plain)
         if source is target is None or len(connections_of(left)) == len(there):
@@ -568,7 +614,7 @@ class Mesh:
     def open(self, options: OpenOptions) -> System:
         """Open all instances in this process, for a program that steps them itself (docs/stepping.md).
 
-        Nothing is recorded into a file, and no other process is started.
+        Nothing is recorded into a file, and no other process is started. Inputs with a Zenoh key are free to be set.
 
         Example:
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open({"pendulum.a": 0.5}) as system:
@@ -586,7 +632,9 @@ class Mesh:
         """
         from .open_system import System  # noqa: PLC0415  only this needs it
 
-        return System(self.plan(**options.given()))
+        if options.keys_from is not None:
+            raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `system.set`.")
+        return System(without_keys(self.plan(**options.given())))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

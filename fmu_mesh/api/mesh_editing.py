@@ -160,9 +160,10 @@ def connections_of(plain: PlainConfig) -> list[Any]:
 
 
 def ends_of(connection: Any) -> tuple[Any, Any]:  # noqa: ANN401  as a file has it
-    """Source and target of a connection in one of its two forms."""
+    """Source and target of a connection in one of its two forms; a Zenoh key is `key <key>`."""
     if isinstance(connection, dict):
-        return connection.get("from"), connection.get("to")
+        key = f"key {connection['key']}" if "key" in connection else None
+        return connection.get("from", key), connection.get("to", key)
     source, _, target = str(connection).partition("->")
     return source.strip(), target.strip()
 

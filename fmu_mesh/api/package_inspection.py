@@ -14,6 +14,7 @@ from ..errors import ConfigurationError
 from ..pictures.tables import pairs, table, titled
 from ..printing import page
 from ..ssp.configuration_files import named_package
+from ..ssp.own_annotation import has_key
 from ..ssp.package import Package
 from ..ssp.problems import Problems
 from ..ssp.ssd_reading import annotations_of, read_structure
@@ -209,7 +210,7 @@ def inspect_package(path: str | Path, *, ssd: str | None = None) -> PackageInspe
                 PackageConnector(one.name, one.kind, one.type, one.unit.name if one.unit is not None else None)
                 for one in structure.system.connectors
             ),
-            connections=len(connections) if isinstance(connections, list) else 0,
+            connections=sum(not has_key(one) for one in connections) if isinstance(connections, list) else 0,
             parameters=tuple(_source(package, place, own) for place, one in elements for own in one.bindings),
             annotations=dict(Counter(one.type for one in annotations)),
             problems=tuple(map(str, plain.findings)),

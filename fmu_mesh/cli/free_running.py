@@ -69,6 +69,10 @@ def _mesh(arguments: argparse.Namespace) -> Mesh:
     if re.search(NAME_PATTERN, mesh.name) is None:
         what = "a name of letters, digits, _ and - that starts with a letter or _"
         raise ConfigurationError(f"'{mesh.name}' is not {what}", hint="Give the mesh such a name with --name.")
+    for variable, key in arguments.subscribe:
+        mesh.subscribe(key, f"{mesh.name}.{variable}", take="newest" if "*" in key else "all")
+    for variable, key in arguments.publish:
+        mesh.publish(f"{mesh.name}.{variable}", key)
     return mesh
 
 

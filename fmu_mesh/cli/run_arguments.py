@@ -11,6 +11,7 @@ from ..sweeps.sweep_options import SweepOptions
 from .arguments import (
     PACKAGE,
     QUIET,
+    ArgumentPart,
     Parsers,
     argument,
     count,
@@ -55,6 +56,17 @@ def _part(text: str) -> tuple[int, int]:
     return int(number), int(of)
 
 
+def _end(text: str) -> tuple[str, str]:
+    variable, _, key = text.partition("=")
+    if not (variable and key):
+        raise argparse.ArgumentTypeError(f"'{text}' is no variable and key such as u=plant/pump/flow")
+    return variable, key
+
+
+def _with_key(flag: str, text: str) -> ArgumentPart:
+    return argument(flag, "VARIABLE=KEY", f"{text}; repeatable", type=_end, action="append", default=[])
+
+
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
@@ -91,6 +103,11 @@ PARSERS: Parsers = {
             choices=("hold", "linear"),
             default="linear",
         ),
+        _with_key(
+            "--subscribe",
+            "give an input what others publish under a Zenoh key, which may have wildcards",
+        ),
+        _with_key("--publish", "publish the values of an output under a Zenoh key"),
         options(
             "step_size",
             "stop_time",

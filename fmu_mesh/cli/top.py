@@ -26,7 +26,7 @@ from ..pictures.tables import shortened, table, wrapped
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs
 from .output.json_output import print_json
-from .output.pages import progress, seconds
+from .output.pages import keys, progress, seconds
 from .output.screen import Screen
 from .output.sparklines import Histories, sparkline_signs
 from .output.terminal import may_draw
@@ -161,10 +161,11 @@ def page(look: Look, before: Look | None = None, *, width: int | None = None) ->
         _row(own, before[1].get(own.instance) if before is not None else None, step_size)
         for _, own in sorted(instances.items())
     ]
+    of_keys = keys(instances.values())
     if width is None:
-        return [", ".join(head), "", *table(rows, heading=_HEADING)]
+        return [", ".join(head), "", *table(rows, heading=_HEADING), *of_keys]
     head[0] = f"{shortened(status.mesh, width // 2)}: {status.state}"
-    return [*wrapped(head, width), "", *_fitted(rows, width)]
+    return [*wrapped(head, width), "", *_cut([*_fitted(rows, width), *of_keys], width)]
 
 
 def _fitted(rows: list[list[str]], width: int) -> list[str]:
@@ -185,7 +186,10 @@ def _fitted(rows: list[list[str]], width: int) -> list[str]:
             del cells[column]
     for row in rows:
         row[0] = shortened(row[0], max(len(heading[0]), room() - _LEAST_ACTIVITY))
-    lines = table(rows, heading=heading)
+    return table(rows, heading=heading)
+
+
+def _cut(lines: list[str], width: int) -> list[str]:
     return [line if len(line) <= width else f"{line[: width - 1]}\N{HORIZONTAL ELLIPSIS}" for line in lines]
 
 

@@ -1,6 +1,6 @@
 """Entries of `connections` with a Zenoh key at one end: values of other programs for an input, and of outputs for them.
 
-Owns the keys of the file. What they mean is `fmu_mesh.system.live_keys`.
+Owns the keys of the file, and how people see one. What they mean is `fmu_mesh.system.live_keys`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,46 @@ from msgspec import Meta
 from fmu_mesh.config.base import NOT_NEGATIVE, POSITIVE, Base
 from fmu_mesh.config.instance_sections import KIND
 
-__all__ = ["KeyInputConfig", "KeyOutputConfig"]
+__all__ = ["KeyInputConfig", "KeyOutputConfig", "KeyView"]
 
-Key = Annotated[str, Meta(min_length=1, description="A Zenoh key.", examples=["plant/pump/flow"])]
+Key = Annotated[str, Meta(description="A Zenoh key.", examples=["plant/pump/flow"], extra_json_schema={"minLength": 1})]
 Factor = Annotated[float, Meta(description="The value is factor * number + offset; Real only.")]
 MessageType = Annotated[
     str | None, Meta(description="With `encoding: cdr`, the message type of ROS.", examples=["std_msgs/msg/Float64"])
 ]
+
+
+class KeyView(msgspec.Struct, frozen=True):
+    """One Zenoh key at an end of a connection, as pages, pictures and `info` show it.
+
+    Attributes:
+        direction: `in`: the values of the key are for the variable; `out`: those of the variable go to the key.
+        encoding: the encoding or the type of its payloads, and which field of them.
+        rule: when a value takes effect, or when there is one, in words.
+    """
+
+    instance: str
+    key: str
+    direction: Literal["in", "out"]
+    variable: str
+    encoding: str
+    rule: str
+
+    @property
+    def ends(self) -> str:
+        """Both ends, such as `plant/pump/flow -> pump.u`."""
+        name = f"{self.instance}.{self.variable}"
+        return f"{self.key} -> {name}" if self.direction == "in" else f"{name} -> {self.key}"
+
+    @property
+    def activity(self) -> str:
+        """What came or went so far, in words; nothing is known of it here."""
+        return ""
+
+    @property
+    def cells(self) -> list[str]:
+        """A row of a table of keys."""
+        return [self.ends, self.encoding, self.rule, *filter(None, [self.activity])]
 
 
 class KeyInputConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="key_input"):
@@ -104,6 +137,11 @@ class KeyOutputConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="key_
     field: Annotated[str | None, Meta(description="With `encoding: cdr`, where the value is; default: data.")] = None
     factor: Factor = 1.0
     offset: Factor = 0.0
+    unit: Annotated[str | None, Meta(description="Unit of the values that are published; default: its own.")] = None
+    map: Annotated[
+        dict[str, bool | int | float | str],
+        Meta(description="What is published instead of a value, such as {1: open}; others stay as they are."),
+    ] = {}
     congestion: Annotated[
         Literal["drop", "block"],
         Meta(description="drop: who is too slow loses values, and a warning says so; block: the run waits."),

@@ -47,8 +47,16 @@ _ARROW = "->"
 _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
 _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
 
+_NO_CONNECTION: Final[dict[str, Plain]] = {KIND: "connection", "from": "", "to": ""}
+_FILLING: Final[dict[Plain, dict[str, Plain]]] = {
+    "connection": _NO_CONNECTION,
+    "key_input": {"key": "", "to": ""},
+    "key_output": {"key": "", "from": ""},
+}
+"""By the kind of a connection, the keys that it needs."""
+
 _PLACEHOLDERS: Final[dict[str, Plain]] = {
-    "connections": {KIND: "connection", "from": "", "to": ""},
+    "connections": _NO_CONNECTION,
     "record": {"file": None},
     r"record(\[\d+\])?\.variables": "",
     r"scenario\.events": {"at": math.inf, "set": {}},
@@ -250,6 +258,8 @@ def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[s
     written: list[Plain] = []
     for index, connection in enumerate(connections):
         if isinstance(connection, dict):
+            if connection.get("key") == "":  # which is also the place of a wrong one
+                findings.add(f"connections[{index}].key", "''", "a Zenoh key such as plant/pump/flow")
             with_key = "key_output" if "from" in connection else "key_input"
             written.append({**connection, KIND: with_key if "key" in connection else "connection"})
             continue
@@ -258,7 +268,7 @@ def _with_long_connections(data: dict[str, Plain], findings: Findings) -> dict[s
             written.append({KIND: "connection", "from": ends[0], "to": ends[1]})
         else:
             findings.add(f"connections[{index}]", shown(connection), _SHORT_FORM, _arrow_meant(connection))
-            written.append(_PLACEHOLDERS["connections"])
+            written.append(_NO_CONNECTION)
     return {**data, "connections": written}
 
 
@@ -398,9 +408,8 @@ def _without(value: Plain, wrong: AbstractSet[str], path: str) -> Plain:
             return []
         pairs = zip(value, places_of_items, strict=True)
         kept = [placeholder if place in wrong else _without(item, wrong, place) for item, place in pairs]
-        filling = _mapping(placeholder)
         return [
-            {**filling, **item} if isinstance(item, dict) and item.get(KIND) == filling.get(KIND) else item
+            {**_FILLING.get(item.get(KIND), _mapping(placeholder)), **item} if isinstance(item, dict) else item
             for item in kept
         ]
     return value

@@ -94,14 +94,25 @@ def status_message(status: MeshStatus) -> bytes:
 def topics_by_instance(
     infos: Mapping[str, InstanceInfo], targets: Sequence[Target]
 ) -> dict[str, tuple[str, tuple[str, ...]]]:
-    """For every topic its instance, and the instances that are connected to the variable."""
+    """For every topic its instance or the Zenoh key that feeds it, and the instances and keys that get the variable."""
     readers: dict[str, dict[str, None]] = {}
+    sources: dict[str, str] = {}
     for name, info in infos.items():
         for connection in info.connections:
             element = split_element(connection.source)
             for source in (connection.source, *([element[0]] if element is not None else ())):
                 readers.setdefault(source, {})[name] = None
-    return {topic_of(target): (target.instance, tuple(readers.get(target.name, ()))) for target in targets}
+        for key in info.keys:
+            variable = f"{name}.{key.variable}"
+            if key.direction == "in":
+                sources[variable] = f"key {key.key}"
+                readers[variable] = {name: None}
+            else:
+                readers.setdefault(variable, {})[f"key {key.key}"] = None
+    return {
+        topic_of(target): (sources.get(target.name, target.instance), tuple(readers.get(target.name, ())))
+        for target in targets
+    }
 
 
 def _finite(value: Any) -> Any:  # noqa: ANN401  plain JSON

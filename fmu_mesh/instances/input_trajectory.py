@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..system.schedule import between
 from ..variables.model_description import Value
 
@@ -32,21 +35,19 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self._times)
 
-    def add(self, time: float, value: Value) -> None:
-        """The input has this value from ``time`` (s) on; it replaces the value for the same time."""
-        if time == self._held:
-            self._held = None
+    def add(self, time: float, value: Value, *, holds: bool = False) -> None:
+        """The input has this value from ``time`` (s) on; it replaces the value for the same time.
+
+        If it ``holds``, there is no line to the next one.
+        """
+        if holds or time == self._held:
+            self._held = time if holds else None
         place = bisect_left(self._times, time)
         if place < len(self._times) and self._times[place] == time:
             self._values[place] = value
         else:
             self._times.insert(place, time)
             self._values.insert(place, value)
-
-    def hold(self, time: float, value: Value) -> None:
-        """As `add`, and the input has this value until the next time, also if it is linear."""
-        self.add(time, value)
-        self._held = time
 
     def value(self, time: float, resolution: float) -> Value:
         """The value at ``time``, which is not before the first time; both in s.
@@ -62,6 +63,30 @@ class Trajectory:
             return value
         end, right = self._times[place + 1], self._values[place + 1]
         return between(value, right, (time - start) / (end - start))
+
+    def values(self, times: NDArray[np.float64], resolutions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The values at rising times, bit for bit those of `value`; of a Float64."""
+        first = bisect_right(self._times, times[0] + resolutions[0]) - 1
+        end = bisect_right(self._times, times[-1] + resolutions[-1]) + 1
+        own_times, own_values = np.array(self._times[first:end]), np.array(self._values[first:end], np.float64)
+        place = np.searchsorted(own_times, times + resolutions, side="right") - 1
+        start, values = own_times[place], own_values[place]
+        if not self.linear:
+            return values
+        following = np.minimum(place + 1, len(own_times) - 1)
+        with np.errstate(all="ignore"):  # where two times are equal, the line is not used
+            line = values + (own_values[following] - values) * ((times - start) / (own_times[following] - start))
+        holds = (
+            (following == place)
+            | (start >= times - resolutions)
+            | (start == (np.nan if self._held is None else self._held))
+        )
+        return np.where(holds, values, line)
+
+    @property
+    def last(self) -> float:
+        """The last time in s."""
+        return self._times[-1]
 
     def after(self, time: float) -> float | None:
         """The first time (s) after ``time``; None if no value has a later one."""

@@ -16,6 +16,7 @@ import msgspec
 import zenoh
 
 from ..errors import MessageRefused
+from ..system.live_keys import key_views
 from ..system.plan import NodePlan
 from ..system.start_values import why_not_settable
 from ..variables.model_description import Value, Variable
@@ -34,7 +35,7 @@ from ..wire.values import (
     encode_value,
     json_encoding,
 )
-from ..wire.views import ConnectionView, InstanceInfo, KeyView, LogLine, SetAnswer, VariableView, Way
+from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView, Way
 from ..wire.ways import Ways
 from .activity import Activity
 from .inputs import set_input
@@ -370,8 +371,5 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
         host=socket.gethostname(),
         problems=description.problems,
         clocks=description.clocks,
-        keys=(
-            *(KeyView(k.key, "in", k.variable, k.type or k.encoding, str(k)) for k in runner.plan.keys_in),
-            *(KeyView(k.key, "out", k.variable, k.type or k.encoding, str(k)) for k in runner.plan.keys_out),
-        ),
+        keys=key_views(runner.name, *runner.plan.keys_in, *runner.plan.keys_out),
     )

@@ -7,7 +7,6 @@ Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from types import MappingProxyType
 from typing import Literal
 
@@ -37,6 +36,9 @@ _WAITING = 1 << 16
 _SOON = 64
 """An input that changes within this many steps is calculated ahead."""
 
+_LEAST = 8
+"""For so many steps it takes less time to calculate inputs ahead than to set them in each step."""
+
 _AHEAD = 4096
 """Number of steps that inputs are calculated ahead."""
 
@@ -54,7 +56,7 @@ class TimedInputs(AroundNativeSteps):
 
     Args:
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
-        linear: the inputs that are linear in any case.
+        keys: the inputs that get the values of keys, and whether they are linear in any case.
         recorded: what has come by keys in an earlier run, in the order of its points.
         warn: called with the first fallback of each input.
 
@@ -73,10 +75,11 @@ class TimedInputs(AroundNativeSteps):
         timeouts: Sequence[InputTimeout] = (),
         warn: Callable[[LogMessage], None] = lambda _message: None,
         *,
-        linear: AbstractSet[str] = frozenset(),
+        keys: Mapping[str, bool] = MappingProxyType({}),
         recorded: Iterable[tuple[str, int, float | None, Value]] = (),
     ) -> None:
         super().__init__(instance)
+        self._asked: list[Callable[[], None]] = []
         self._recorded = iter(recorded)
         self._next = next(self._recorded, None)
         self._last = LastValues(timeouts, courses, instance.description)
@@ -90,7 +93,7 @@ class TimedInputs(AroundNativeSteps):
         self._set_in_step = instance.set_in_step if isinstance(instance, Guarded) else instance.set_values
         self._courses = courses
         self._linear = interpolation == "linear"
-        self._linear_names = linear
+        self._keys = keys
         self._trajectories: dict[str, Trajectory] = {}
         self._used: dict[str, Value] = {}
         self._grid: TimeGrid  # from `start` on
@@ -100,7 +103,7 @@ class TimedInputs(AroundNativeSteps):
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Bind the inner instance. From now on there is a time."""
         self._in_row.clear()
-        for name in self._courses.keys() & {*inputs.layout.names}:
+        for name in (self._courses.keys() | self._keys.keys()) & {*inputs.layout.names}:
             place = inputs.layout.place(name)
             self._in_row[name] = inputs.writer(name), inputs.address + inputs.place_in_row(place.part, place.first)
             inputs.put(0, name, self._instance.get_values([name])[0])
@@ -128,11 +131,19 @@ class TimedInputs(AroundNativeSteps):
         """Note that ``step`` own steps are done: `do_step` has not taken those without a change."""
         self._step = step
 
-    def add(self, name: str, value: Value, time: float | None) -> int:
+    def ask(self, source: Callable[[], None]) -> None:
+        """Call ``source``, which may `add` values, before each step that Python takes; `expect` says which it takes."""
+        self._asked.append(source)
+
+    def expect(self, step: int) -> None:
+        """Own step ``step`` may change a value, so Python takes it."""
+        self.python_at = min(self.python_at, step)
+
+    def add(self, name: str, value: Value, time: float | None, most: int = _WAITING) -> int:
         """Give a variable a value from ``time`` (s; None: now) on; return the first own step that uses it.
 
         Raises:
-            TooManyWait: too many values wait for their time.
+            TooManyWait: so many values wait for their time already.
         """
         now = self._time(self._step)
         when = now if time is None else time
@@ -141,23 +152,22 @@ class TimedInputs(AroundNativeSteps):
             variable = self.description.variable(name)
             is_input = variable is not None and variable.causality == "input"
             real = variable is not None and is_input and is_float(variable.type)
-            linear = real and (self._linear or name in self._linear_names)
+            linear = real and (self._linear or self._keys.get(name, False))
             trajectory = Trajectory(linear=linear)
             if when > now:
                 # There is no line to the first value of a key.
-                (trajectory.hold if name in self._linear_names else trajectory.add)(
-                    now, self._instance.get_values([name])[0]
-                )
+                trajectory.add(now, self._instance.get_values([name])[0], holds=self._keys.get(name, False))
             self._trajectories[name] = trajectory
-        if len(self._trajectories[name]) >= _WAITING:
-            raise TooManyWait(f"{_WAITING} values of '{name}' wait for their time already")
+        if len(self._trajectories[name]) >= most:
+            raise TooManyWait(f"{most} values of '{name}' wait for their time already")
         step = max(step, self._step)
+        # A line changes in each step from now on. A value that holds changes nothing before its own step. What was sent
+        # is calculated ahead up to the last value at most.
+        own = self._trajectories[name]
+        is_needed_now = name in self._courses or when <= own.last if name in self._tracked else own.linear
         # The value that it has fallen back to is as if it had been sent, and would be newer than one with a past time.
-        self._trajectories[name].add(max(when, now) if name in self.late else when, value)
+        own.add(max(when, now) if name in self.late else when, value)
         self._last.came(name, step)
-        # A line changes in each step from now on. A value that holds changes nothing before its own step, unless its
-        # input has been calculated ahead.
-        is_needed_now = self._trajectories[name].linear or name in self._tracked
         self.python_at = min(self.python_at, self._step if is_needed_now else step)
         return step
 
@@ -169,11 +179,7 @@ class TimedInputs(AroundNativeSteps):
     def _set_changes(self, step: int) -> None:
         """Set what changes in own step ``step``."""
         time = self._time(step)
-        while self._next is not None and self._next[1] <= step * self._points:
-            name, _, when, kept = self._next
-            self._step = step
-            self.add(name, kept, when)
-            self._next = next(self._recorded, None)
+        self._take_arrived(step)
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
         if self._last.sent:
             changes |= self._fall_back(step, time)
@@ -192,6 +198,16 @@ class TimedInputs(AroundNativeSteps):
         if others := {name: value for name, value in changes.items() if name not in self._in_row}:
             self._set_in_step(others)
         self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
+
+    def _take_arrived(self, step: int) -> None:
+        """Take what has come by keys: in an earlier run, or now."""
+        while self._next is not None and self._next[1] <= step * self._points:
+            name, _, when, value = self._next
+            self._step = step
+            self.add(name, value, when, ENDLESS)  # when the first run took it, there was room
+            self._next = next(self._recorded, None)
+        for ask in self._asked:
+            ask()
 
     def _fall_back(self, step: int, time: float) -> dict[str, Value]:
         """What inputs fall back to in own step ``step``, which begins at ``time`` (s)."""
@@ -217,27 +233,38 @@ class TimedInputs(AroundNativeSteps):
             and name not in self.late
             and self._courses[name].first_step <= step
         ]
-        others = [change for name, change in changes.items() if name not in soon]
+        sent = self._next_sent(step)
+        came = {
+            name: self._grid.step_at(self._trajectories[name].last, self._points)
+            for name, change in sent.items()
+            if change < step + _SOON and name in self._in_row and name not in self._courses and name not in self.late
+        }
+        others = [change for name, change in (*changes.items(), *sent.items()) if name not in {*soon, *came}]
         recorded = self._next[1] // self._points if self._next is not None else ENDLESS
-        sent = min(self._next_sent(step), self._last.next(step), recorded)
-        end = min([*others, sent, step + _AHEAD])
+        others += self._last.next(step), recorded
+        end = min([*others, *came.values(), step + _AHEAD])
         self.tracks, self._tracked, self.tracks_from = [], [], step
-        if not soon or end - step < _SOON:
-            self.python_at = min([*changes.values(), sent])
+        if not (soon or came) or end - step < _LEAST:
+            self.python_at = min([*changes.values(), *sent.values(), *others])
             return
-        self._tracked = soon
+        self._tracked = [*soon, *came]
         self.tracks = [(self._in_row[name][1], self._courses[name].values(step, end - step)) for name in soon]
+        times = self._grid.times(step * self._points, end * self._points, self._points)
+        roundings = 8 * np.spacing(np.maximum(abs(self._grid.start_time), np.abs(times)))
+        for name in came:
+            self.tracks.append((self._in_row[name][1], self._trajectories[name].values(times, roundings)))
+            self._used.pop(name, None)
         self.python_at = end
 
-    def _next_sent(self, step: int) -> int:
-        """The first own step from ``step`` on in which a value that was sent may change."""
-        steps = []
+    def _next_sent(self, step: int) -> dict[str, int]:
+        """The first own step from ``step`` on in which each value that was sent may change; without those that hold."""
+        steps = {}
         time = self._time(step - 1)
-        for own in self._trajectories.values():
+        for name, own in self._trajectories.items():
             later = own.after(time + self._grid.rounding(time))
             if later is not None:
-                steps.append(step if own.linear else max(step, self._grid.step_at(later, self._points)))
-        return min(steps, default=ENDLESS)
+                steps[name] = step if own.linear else max(step, self._grid.step_at(later, self._points))
+        return steps
 
     def _keeper(self) -> KeepsState:
         text = "the state of an instance with inputs over time cannot be kept: the values are not part of it"
@@ -258,19 +285,17 @@ def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid, warn: Cal
     if interpolation is None and not plan.scenario and not plan.timeouts and not plan.keys_in:
         return instance
     courses = courses_of(plan.scenario, instance.description, grid, plan.step_points)
-    linear = {own.variable for own in plan.keys_in if own.linear}
-    fed = {own.variable for own in plan.keys_in}
-    known = {one.name: one for one in instance.description.variables if one.name in fed}
+    keys = {own.variable: own.linear for own in plan.keys_in}
+    known = {one.name: one for one in instance.description.variables if one.name in keys}
     recorded = recorded_values(plan.recorded_keys, plan.name, known) if plan.recorded_keys is not None else ()
-    return TimedInputs(
-        instance, interpolation or "hold", courses, plan.timeouts, warn, linear=linear, recorded=recorded
-    )
+    return TimedInputs(instance, interpolation or "hold", courses, plan.timeouts, warn, keys=keys, recorded=recorded)
 
 
-def set_input(runner: Runner, name: str, value: Value, time: float | None) -> int:
+def set_input(runner: Runner, name: str, value: Value, time: float | None, *, more: bool = False) -> int:
     """On the main thread, between steps: set a variable; return the first own step that uses it.
 
     Only the first value with a time wraps the instance in `TimedInputs`. So steps of other instances do not get slower.
+    If there are ``more``, the caller has to call `Runner.follow_inputs` after the last one, before the next step.
 
     Raises:
         FmuError: the FMU refused it.
@@ -286,7 +311,8 @@ def set_input(runner: Runner, name: str, value: Value, time: float | None) -> in
     if isinstance(runner.instance, TimedInputs) and (time is not None or runner.instance.follows(name)):
         runner.instance.reached(runner.step)
         step = runner.instance.add(name, value, time)
-        runner.follow_inputs()
+        if not more:
+            runner.follow_inputs()
         return step
     runner.instance.set_values({name: value})
     return runner.step

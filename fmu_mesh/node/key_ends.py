@@ -44,7 +44,7 @@ class KeyEnds:
         self,
         plan: NodePlan,
         session: zenoh.Session,
-        post: Callable[[Callable[[], None]], None],
+        post: Callable[..., None],
         log: Callable[[LogLine], None],
         tell: Callable[[Sequence[KeyValue]], None],
     ) -> None:
@@ -62,7 +62,7 @@ class KeyEnds:
         waiting = {
             f"{own.key} > {runner.name}.{own.variable}" for runner in live for own in runner.plan.keys_in if own.wait
         }
-        blocking = {runner.name for runner in live if any(own.blocks for own in runner.plan.keys_out)}
+        blocking = {f"keys of {runner.name}" for runner in live if any(own.blocks for own in runner.plan.keys_out)}
         # A counter for each that limits the node, in memory of its own: only this thread uses it.
         map_, _ = map_memory([self._plan.node, *waiting, *blocking], {})
         counters = HostMemory.private(map_, self._plan.node).progress
@@ -72,13 +72,12 @@ class KeyEnds:
                 self._feeds.append(feed := KeyFeed(own, runner, counter, *self._around))
                 self._subscribers.append(self._subscriber(feed, own))
             if any(not own.blocks for own in runner.plan.keys_out):
-                self.lossy.append(KeyOutputs(runner, self._session, None))
-            if runner.name in blocking:
-                counter = counters[runner.name]
-                self._blocking.append((KeyOutputs(runner, self._session, counter), counter))
+                self.lossy.append(KeyOutputs(runner, self._session, None, self._around[0]))
+            if (counter := counters.get(f"keys of {runner.name}")) is not None:
+                self._blocking.append((KeyOutputs(runner, self._session, counter, self._around[0]), counter))
 
     def _subscriber(self, feed: KeyFeed, own: KeyInput) -> _Subscriber:
-        """A subscriber; where steps wait, also for what another mesh has published before, or a link has lost."""
+        """A subscriber; if steps wait for the key, it also gets what was published before, or lost with a link."""
         take = Callback(feed.arrived, indirect=False)
         if not own.wait:
             return self._session.declare_subscriber(own.key, take)
@@ -119,13 +118,15 @@ class KeyEnds:
         return next((f.words for f in self._feeds if f.runner.name == name and f.holds(f.runner.point + 1)), None)
 
     def check(self, granted: int, now: float) -> None:
-        """Look whether the values that steps up to the point ``granted`` need have come in time; ``now`` is in s.
+        """Look whether steps up to the point ``granted`` wait for a key for too long; ``now`` is in s.
 
         Raises:
-            DeadlineExceeded: one has not.
+            DeadlineExceeded: no value has come, or nobody reads one.
         """
         for feed in self._feeds:
             feed.check(granted, now, self._plan.timeouts.step)
+        for outputs, _ in self._blocking:
+            outputs.check(granted, now, self._plan.timeouts.step)
 
     def look(self, now: float) -> None:
         """On the thread of the server: tell of keys that nobody has published for the time of a start."""

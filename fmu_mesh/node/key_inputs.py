@@ -5,20 +5,21 @@ gets its value is `fmu_mesh.node.inputs`, as for values that are set.
 """
 
 # Threads: those of Zenoh, one for each link, call `arrived`, which counts a sample, puts it into a deque and posts
-# `_take` once; `_lock` is theirs alone. The main thread calls `_take` between two steps, and everything that changes an
-# input. The thread of the server calls `look` and `status`, which read numbers that somebody else writes in one
-# assignment.
+# `_take` once; `_lock` is theirs alone. The main thread calls `_take` between two steps, or `_take_newest` before one,
+# and everything that changes an input. The thread of the server calls `look` and `status`, which read numbers that
+# somebody else writes in one assignment.
 #
 # What may go wrong, and what then happens:
-# * A flood. On arrival only the newest value counts, so there is at most one at each point; of values with times
-#   `_MOST_WAITING` may wait, of `_MOST_BYTES` in all. What is more is counted and lost, and the sender is never held
-#   back: it may be a stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
+# * A flood. On arrival only the newest value counts, and a step asks for it, so one is decoded at a point; of values
+#   with times `_MOST_WAITING` may wait, of `_MOST_BYTES` in all. What is more is counted and lost. The sender is never
+#   held back: it may be a stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
 # * Silence. A step that waits ends with the deadline of a step. Else the input holds, or falls back (`timeout`).
 # * A step must not wait inside an instance: the main thread would not see the end of the run. So a key that is waited
 #   for limits the node as the window of another node does, by a counter that only the main thread raises.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -28,24 +29,41 @@ from typing import Any, Final
 
 import zenoh
 import zenoh.ext
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from ..errors import DeadlineExceeded, MeshLost
 from ..rings.host_memory import Counter
-from ..system.live_keys import KeyInput, KeyValue
+from ..system.live_keys import KeyInput, KeyValue, key_views
 from ..variables.value_conversion import to_plain
 from ..wire.values import ValueRefused
 from ..wire.views import KeyStatus, LogLine
-from .inputs import TooManyWait, set_input
+from .inputs import TimedInputs, TooManyWait, set_input
 from .key_payloads import KeyReader
 from .stepping import Runner
 
-__all__ = ["KeyFeed"]
+__all__ = ["KeyFeed", "Patience"]
 
 _MOST_WAITING: Final = 1 << 16
 _MOST_BYTES: Final = 1 << 27
 _MOST_AT_ONCE: Final = 64
 _MOST_BYTES_AT_ONCE: Final = 1 << 16
+
+
+class Patience:
+    """For how long a runner has been held at one point."""
+
+    def __init__(self, runner: Runner) -> None:
+        self._runner = runner
+        self._since: tuple[int, float] | None = None
+
+    def spent_s(self, most: int, granted: int, now: float) -> float:
+        """The time in s; 0 if it may go on, which it may up to the points ``most`` and ``granted``; ``now`` is in s."""
+        point = self._runner.point
+        if min(point + 1, granted, self._runner.grid.last_point) <= most:
+            self._since = None
+        elif self._since is None or self._since[0] != point:
+            self._since = point, now
+        return now - self._since[1] if self._since is not None else 0.0
 
 
 class KeyFeed:
@@ -66,20 +84,25 @@ class KeyFeed:
         own: KeyInput,
         runner: Runner,
         counter: Counter | None,
-        post: Callable[[Callable[[], None]], None],
+        post: Callable[..., None],
         log: Callable[[LogLine], None],
         tell: Callable[[Sequence[KeyValue]], None],
     ) -> None:
         variable = runner.instance.description.variable(own.variable)
         assert variable is not None  # the plan has it
         self.runner, self.counter = runner, counter
-        self.words = f"'{own.key}', which feeds '{runner.name}.{own.variable}'"
+        self._name = f"{runner.name}.{own.variable}"
+        self.words = f"'{own.key}', which feeds '{self._name}'"
         self._own, self._post, self._log, self._tell = own, post, log, tell
         self._reader = KeyReader(own, variable, finite=runner.plan.not_finite == "stop")
         self._only_newest = own.time == "arrival" and not own.wait
         self._waiting: deque[zenoh.Sample] = deque()
+        assert isinstance(runner.instance, TimedInputs)  # `with_times`
+        self._inputs = runner.instance
+        if self._only_newest:
+            self._inputs.ask(self._take_newest)
         self._posted = self._begun = False
-        self._counts = KeyStatus(own.key, own.variable)
+        self._counts = KeyStatus(**asdict(key_views(runner.name, own)[0]))
         self._lock = Lock()
         self._received = self._replaced = self._lost = 0
         self._came_bytes = self._taken_bytes = 0  # each of them is written by one side only
@@ -89,7 +112,7 @@ class KeyFeed:
         self._newest: float | None = None
         self._used = 0
         self._declared_at = time.monotonic()
-        self._blocked: tuple[int, float] | None = None
+        self._patience = Patience(runner)
 
     def arrived(self, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh: each link has its own."""
@@ -115,10 +138,10 @@ class KeyFeed:
         self._lost += miss.nb
         self._post_take()
 
-    def _post_take(self) -> None:
+    def _post_take(self, *, later: bool = False) -> None:
         if not self._posted:
             self._posted = True
-            self._post(self._take)
+            self._post(self._take, later=later)
 
     def begin(self) -> None:
         """At point 0: use what has come before."""
@@ -127,63 +150,85 @@ class KeyFeed:
 
     def _take(self) -> None:
         """On the main thread, between two steps."""
-        self._posted = False
-        values: list[KeyValue] = []
-        for sample in self._some():
-            try:
-                values.append(self._use(sample))
-            except TooManyWait:
-                self._counts = replace(self._counts, lost=self._counts.lost + 1)
-            except ValueRefused as refused:
-                self._counts = replace(self._counts, refused=self._counts.refused + 1)
-                self._say("refused", f"is refused: {refused}. More are only counted in `status`")
-        if values:
-            self._tell(values)
+        if not self._begun:
+            return
+        if self._only_newest:
+            self._inputs.expect(self.runner.step)
+            self.runner.follow_inputs()
+            return
+        self._use()
         if (self._lost or self._counts.lost) and "lost" not in self._told:
             why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
             self._say("lost", f"{why}. More are only counted")
             if self._own.wait:
                 hint = "Its publisher has to wait for this run."
                 raise MeshLost(f"a value of {self.words} {why}", **self._place(), hint=hint)
-        if self._waiting and self._begun:
-            self._post_take()
+        self._posted = False  # not before: each that arrives would end the next steps after one
+        if self._waiting:
+            self._post_take(later=True)
+
+    def _take_newest(self) -> None:
+        """On the main thread, at the begin of a step."""
+        self._posted = False
+        self._use()
+
+    def _use(self) -> None:
+        """Let the first values take effect, each at its time."""
+        values: list[KeyValue] = []
+        at = self.runner.point
+        for sample in self._some():
+            try:
+                values.append(self._used_now(sample, at))
+            except TooManyWait:
+                self._counts = replace(self._counts, lost=self._counts.lost + 1)
+            except ValueRefused as refused:
+                self._counts = replace(self._counts, refused=self._counts.refused + 1)
+                self._say("refused", f"is refused: {refused}. More are only counted in `status`")
+        if values:
+            self.runner.follow_inputs()
+            self._let_step()
+            self._tell(values)
 
     def _some(self) -> Iterator[zenoh.Sample]:
         """Some of those that wait, so that steps go on, and the recorder gets no message that is too large."""
         end = self._taken_bytes + _MOST_BYTES_AT_ONCE
         with suppress(IndexError):  # also if a newer one replaces the last one just now
-            for _ in range(_MOST_AT_ONCE if self._begun else 0):
+            for _ in range(_MOST_AT_ONCE):
                 sample = self._waiting.popleft()
                 self._taken_bytes += len(sample.payload)
                 yield sample
                 if self._taken_bytes > end:
                     break
 
-    def _use(self, sample: zenoh.Sample) -> KeyValue:
-        """Let a value take effect at its time."""
-        runner, own = self.runner, self._own
-        grid, points, at = runner.grid, runner.plan.step_points, runner.point
+    def _used_now(self, sample: zenoh.Sample, at: int) -> KeyValue:
+        own, grid, points = self._own, self.runner.grid, self.runner.plan.step_points
         value, said, is_simulated = self._reader.read(sample)
         if said is None:
             when = grid.time(self._used * points) if own.wait else None
         else:
             if self._shift is None:
                 self._shift = self._first_shift(said, is_simulated=is_simulated)
-            when = said + self._shift + own.delay
+            # Seconds since 1970 have steps of 0.2 us, so that a value would be a point too late as often as not.
+            blur = math.ulp(said) + math.ulp(self._shift)
+            when = grid.snapped(said + self._shift + own.delay, blur)
             if own.wait and not self._used and when > (first := grid.start_time + own.delay) + grid.rounding(first):
                 text = (
                     f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
                 )
                 raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
-        step = set_input(runner, own.variable, value, when)
+        step = set_input(self.runner, own.variable, value, when, more=True)
         self._used += 1
         if when is not None:
-            self._look_at_time(when, late=step > grid.step_at(when, points))
-            if self.counter is not None and when >= grid.start_time - grid.rounding(when):
-                reached = grid.step_at(when, points)
-                reached -= grid.time(reached * points) > when + grid.rounding(when)  # the last step that begins by then
-                self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
-        return f"{runner.name}.{own.variable}", at, when, to_plain(value)
+            self._look_at_time(when, late=step * points == at and step > grid.step_at(when, points))
+        return self._name, at, when, to_plain(value)
+
+    def _let_step(self) -> None:
+        """The steps that begin by the time of the newest value need not wait for the key any more."""
+        grid, points, when = self.runner.grid, self.runner.plan.step_points, self._newest
+        if self.counter is not None and when is not None and when >= grid.start_time - grid.rounding(when):
+            reached = grid.step_at(when, points)
+            reached -= grid.time(reached * points) > when + grid.rounding(when)
+            self.counter.raise_to(max(self.counter.value, (reached + 1) * points))
 
     def _first_shift(self, said: float, *, is_simulated: bool) -> float:
         grid = self.runner.grid
@@ -194,10 +239,10 @@ class KeyFeed:
     def _look_at_time(self, when: float, *, late: bool) -> None:
         if late and not self._own.wait:
             self._counts = replace(self._counts, late=self._counts.late + 1)
-            self._say("late", "has come after its time, and takes effect at once. Is its `delay` too short?")
+            self._say("late", "has come after its time: a later one stays in effect. Is its `delay` too short?")
         if self._newest is not None and when < self._newest:
             self._counts = replace(self._counts, disordered=self._counts.disordered + 1)
-            self._say("disordered", "is for an earlier time than the one before it; it replaces no later value")
+            self._say("disordered", "is for an earlier time than the one before it: has a clock jumped?")
         self._newest = when if self._newest is None else max(when, self._newest)
 
     def holds(self, point: int) -> bool:
@@ -210,12 +255,9 @@ class KeyFeed:
         Raises:
             DeadlineExceeded: it has not.
         """
-        point = self.runner.point
-        if not self.holds(min(point + 1, granted, self.runner.grid.last_point)):
-            self._blocked = None
-        elif self._blocked is None or self._blocked[0] != point:
-            self._blocked = point, now
-        elif (waited_s := now - self._blocked[1]) > limit_s:
+        if self.counter is None:
+            return
+        if (waited_s := self._patience.spent_s(self.counter.value, granted, now)) > limit_s:
             newest = f"; the last one was for {self._newest:.9g} s" if self._newest is not None else ""
             text = f"no value for this point has come in {waited_s:.1f} s by the key {self.words}{newest}"
             hint = "Is its publisher running, and connected? `timeouts.step` is the longest wait."
@@ -229,13 +271,9 @@ class KeyFeed:
     @property
     def status(self) -> KeyStatus:
         """What has come; from any thread."""
-        received, now = self._received, time.monotonic()
-        rate = (
-            (received - 1) / (self._last_at - self._first_at)
-            if received > 1 and self._last_at > self._first_at
-            else 0.0
-        )
-        age = now - self._last_at if received else None
+        received, took_s = self._received, self._last_at - self._first_at
+        rate = (received - 1) / took_s if took_s > 0.0 else 0.0
+        age = time.monotonic() - self._last_at if received else None
         lost = self._counts.lost + self._lost
         return replace(self._counts, received=received, replaced=self._replaced, lost=lost, rate=rate, age=age)
 

@@ -5,6 +5,7 @@ Nothing here is trusted: a payload that is no such value is refused with a reaso
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
@@ -55,6 +56,8 @@ class KeyReader:
         has_field = own.encoding != "cdr" and own.time not in ("arrival", "timestamp")
         self._time = field_parts(own.time) if has_field else None
         self._change = Linear(own.factor, own.offset)
+        bounded = variable.minimum is not None or variable.maximum is not None
+        self._any_float = variable.type == "Float64" and not variable.shape and not bounded
         self._messages = message_reader(own, variable) if own.encoding == "cdr" else None
 
     def read(self, sample: zenoh.Sample) -> TimedValue:
@@ -73,13 +76,15 @@ class KeyReader:
             if sample.timestamp is None:
                 raise ValueRefused("it has no timestamp of Zenoh: its publisher or a router has to add them")
             time = sample.timestamp.get_time_as_ntp64().as_nanos() / 1e9
+        said = plain
         if self._own.map and (word := _word(plain)) in self._own.map:
             plain = self._own.map[word]
-        plain = changed(plain, self._change)
-        try:
-            value = to_value(plain, self._variable, finite=self._finite)
-        except ValueRefused:  # in words, which take longer than a value
-            value = checked_value(plain, self._variable, repr(plain)[:_SHOWN], finite=self._finite)
+        value = changed(plain, self._change)
+        if not (self._any_float and type(value) is float and math.isfinite(value)):  # the usual number needs no check
+            try:
+                value = to_value(value, self._variable, finite=self._finite)
+            except ValueRefused:  # in words, which take longer than a value
+                value = checked_value(value, self._variable, repr(said)[:_SHOWN], finite=self._finite)
         is_simulated = self._own.simulated and not isinstance(time, str)
         return TimedValue(value, seconds_of(time) if time is not None else None, is_simulated)
 
@@ -158,7 +163,7 @@ def key_writer(own: KeyOutput, variable: Variable) -> tuple[Callable[[Value, int
     change = Linear(own.factor, own.offset)
 
     def value_of(value: Value) -> PlainValue:
-        return to_plain(changed(value, change))
+        return own.map.get(_word(value), to_plain(changed(value, change)))
 
     match own.encoding:
         case "json":

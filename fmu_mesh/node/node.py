@@ -369,7 +369,8 @@ class Node:
         left_s = 0.0
         while not self.finished:
             try:
-                wait_s = 0.0 if self._inbox.is_direct else left_s if eager else _LONGEST_SLEEP_S
+                has_more = self._inbox.is_direct or self._inbox.has_posted
+                wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
                 stepped = engine.run(wait_s, eager=eager, quiet=quiet and not self.server.is_followed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True

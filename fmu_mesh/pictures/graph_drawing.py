@@ -40,6 +40,7 @@ class GraphVariable(msgspec.Struct, frozen=True):
     Attributes:
         source: the output; ``target``: the input. ``source_unit``, ``target_unit``: their units; empty without one.
         map: what the input gets instead of a value, such as `0 -> 2, 1 -> 5`; empty without a map.
+        rule: of a Zenoh key, whose end has the encoding of the values: when one takes effect, or when there is one.
         way: `row stream` or `Zenoh` if its values come so from another process, in a mesh that runs; otherwise empty.
     """
 
@@ -51,6 +52,7 @@ class GraphVariable(msgspec.Struct, frozen=True):
     offset: float = 0.0
     map: str = ""
     way: str = ""
+    rule: str = ""
 
     @property
     def unit_text(self) -> str:
@@ -393,9 +395,10 @@ def _wired(names: Sequence[str], edges: Sequence[GraphEdge]) -> tuple[list[_Port
 
 def _tip(edge: GraphEdge, variable: GraphVariable) -> str:
     end = f" ({variable.unit_text}), " if variable.unit_text else ", "
-    end += f"delay {edge.delay}" if edge.delay >= 0 else "in the initialization"
+    end += variable.rule or (f"delay {edge.delay}" if edge.delay >= 0 else "in the initialization")
     end += (", closes a cycle" if edge.closes_cycle else "") + (f", map {variable.map}" if variable.map else "")
-    return f"{edge.source}.{variable.source} -> {edge.target}.{variable.target}{end}"
+    ends = (edge.source, variable.source), (edge.target, variable.target)
+    return " -> ".join(f"{name} ({own})" if name.startswith("key ") else f"{name}.{own}" for name, own in ends) + end
 
 
 def _port_text(name: str, unit: str) -> str:

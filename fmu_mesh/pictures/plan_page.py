@@ -33,6 +33,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Instances", _instances(plan)),
         ("Start values", _start_values(plan, loaded)),
         ("Connections", _connections(plan)),
+        ("Zenoh keys", _keys(plan)),
         ("Execution order within one point", _order(plan)),
         ("Groups", _groups(plan)),
         ("Scenario", _scenario(plan)),
@@ -116,10 +117,17 @@ def _connections(plan: Plan) -> list[str]:
     return table(rows, indent=2)
 
 
+def _keys(plan: Plan) -> list[str]:
+    recorded = plan.system.recorded_keys
+    lines = table([own.cells for own in plan.system.keys], indent=2)
+    return [*lines, f"  their values come from {short_path(recorded.path)}"] if recorded is not None else lines
+
+
 def _free_inputs(plan: Plan) -> list[str]:
     """Inputs that keep their start values unless they are set: a forgotten connection is visible here."""
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
     connected |= {(name, own.variable) for name, item in plan.system.instances.items() for own in item.scenario}
+    connected |= {(own.instance, own.variable) for own in plan.system.keys if own.direction == "in"}
     lines = []
     for name, instance in plan.system.instances.items():
         free = [v for v in instance.description.variables if v.causality == "input" and (name, v.name) not in connected]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from ..config.key_sections import KeyView
 from ..config.loading import LoadedConfig
 from ..config.mesh import SimulationConfig
 from ..config.ros_section import MeshTopic
@@ -95,6 +96,7 @@ class PlanView(msgspec.Struct, frozen=True):
         records: all result files.
         scenario: what the scenario sets, by `instance.variable`.
         topics: those in ROS.
+        keys: the Zenoh keys at ends of connections.
         warnings: findings that do not prevent a run.
         library: why the library of C is not used; None if it is.
     """
@@ -116,6 +118,7 @@ class PlanView(msgspec.Struct, frozen=True):
     warnings: tuple[Finding, ...]
     library: str | None
     topics: tuple[MeshTopic, ...] = ()
+    keys: tuple[KeyView, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.instances), 'instance')}, {counted(len(self.connections), 'connection')}"
@@ -127,6 +130,7 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
     system, grid = plan.system, plan.grid
     closing = {str(connection) for connection in plan.closing}
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
+    connected |= {(own.instance, own.variable) for own in system.keys if own.direction == "in"}
     instances = [
         PlannedInstance(
             own.name,
@@ -194,4 +198,5 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
         warnings=system.warnings,
         library=why_no_library(),
         topics=system.topics,
+        keys=system.keys,
     )

@@ -6,18 +6,20 @@ Owns what the graph says; `graph_layout` has where things lie, and `graph_drawin
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
 
+from ..config.key_sections import KeyView
 from ..config.ros_section import MeshTopic
 from ..printing import page
 from ..system.graph import strongly_connected, topological_order
 from ..system.value_map import map_text
 from ..text import counted
-from .graph_drawing import GraphEdge, GraphNode, GraphVariable, drawing_of
+from .graph_drawing import Drawing, GraphEdge, GraphNode, GraphVariable, drawing_of
 from .graph_layout import INITIAL, going_back
 from .graph_pictures import figure_of_drawing, svg_of_drawing
 from .tables import html_table, shortened, table, wrapped
@@ -62,6 +64,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
         edges: the connections, those from one instance to another with the same delay together.
         cycles: the instances of each cycle.
         topics: those in ROS; a picture has none of them.
+        keys: the Zenoh keys at ends of connections.
     """
 
     mesh: str
@@ -69,6 +72,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
     edges: tuple[GraphEdge, ...]
     cycles: tuple[tuple[str, ...], ...] = ()
     topics: tuple[MeshTopic, ...] = ()
+    keys: tuple[KeyView, ...] = ()
 
     @property
     def title(self) -> str:
@@ -77,13 +81,14 @@ class SystemGraph(msgspec.Struct, frozen=True):
             counted(len(self.nodes), "instance") + f" in {counted(len({n.group for n in self.nodes}), 'process')}",
             counted(sum(len(edge.variables) for edge in self.edges), "connection"),
             *([counted(len(self.cycles), "cycle")] if self.cycles else []),
+            *([counted(len(self.keys), "key")] if self.keys else []),
         ]
         return f"{self.mesh}: {', '.join(counts)}"
 
     def with_status(
         self, instances: Mapping[str, InstanceStatus], before: Mapping[str, InstanceStatus] | None = None
     ) -> SystemGraph:
-        """The same graph with the state of each instance, as `Run.all_status` has it.
+        """The same graph with the state of each instance and key, as `Run.all_status` has it.
 
         Example:
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
@@ -98,7 +103,8 @@ class SystemGraph(msgspec.Struct, frozen=True):
             before: that of an earlier look, for the speed since then; None: the mean speed since the first point.
         """
         nodes = [_live(node, instances.get(node.instance), (before or {}).get(node.instance)) for node in self.nodes]
-        return replace(self, nodes=tuple(nodes))
+        keys = {own.ends: own for status in instances.values() for own in status.keys}
+        return replace(self, nodes=tuple(nodes), keys=tuple(keys.get(own.ends, own) for own in self.keys))
 
     def svg(self) -> str:
         """The picture as the text of an SVG file; needs no library.
@@ -109,9 +115,9 @@ class SystemGraph(msgspec.Struct, frozen=True):
             ('<svg', True)
 
         Every instance is a group of the class `instance` with the attribute `data-instance`. Every edge is one of the
-        class `edge` with `data-source` and `data-target`.
+        class `edge` with `data-source` and `data-target`. A Zenoh key is drawn as an instance `key <key>`.
         """
-        return svg_of_drawing(drawing_of(self.title, self.nodes, self.edges, self.cycles))
+        return svg_of_drawing(self._drawing)
 
     def figure(self) -> Figure:
         """The picture as a figure of matplotlib.
@@ -122,7 +128,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
         Raises:
             ConfigurationError: matplotlib is not installed.
         """
-        return figure_of_drawing(drawing_of(self.title, self.nodes, self.edges, self.cycles))
+        return figure_of_drawing(self._drawing)
 
     def text(self) -> str:
         """The graph as text of at most 80 columns: below each instance, what its outputs are connected to."""
@@ -139,10 +145,29 @@ class SystemGraph(msgspec.Struct, frozen=True):
         lines += [""] if self.cycles else []
         for cycle in self.cycles:
             lines += wrapped([shortened(name, _NAME) for name in cycle], _COLUMNS, "cycle  ")
+        lines += [""] if self.keys else []
+        for own in self.keys:
+            lines += wrapped(own.cells, _COLUMNS, "key  ")
         lines += [""] if self.topics else []
         for topic in self.topics:
             lines += wrapped(topic.cells, _COLUMNS, "ROS  ")
         return page(line.rstrip() for line in lines)
+
+    @property
+    def _drawing(self) -> Drawing:
+        """The shapes; a key is a box, whose ports are the encodings of its values."""
+        boxes: dict[str, list[KeyView]] = {}
+        edges = list(self.edges)
+        for own in self.keys:
+            boxes.setdefault(name := f"key {own.key}", []).append(own)
+            ends = [(name, own.encoding), (own.instance, own.variable)]
+            (source, output), (target, input_) = ends if own.direction == "in" else reversed(ends)
+            edges.append(GraphEdge(source, target, 0, (GraphVariable(output, input_, rule=own.rule),)))
+        nodes = {True: list[GraphNode](), False: list[GraphNode]()}  # whether values come by it
+        for name, keys in boxes.items():
+            rules, activities = (", ".join(dict.fromkeys(map(attrgetter(of), keys))) for of in ("rule", "activity"))
+            nodes[keys[0].direction == "in"].append(GraphNode(name, rules, name, activities or None))
+        return drawing_of(self.title, [*nodes[True], *self.nodes, *nodes[False]], tuple(edges), self.cycles)
 
     def __repr__(self) -> str:
         return f"<SystemGraph of {self.title}>"
@@ -186,7 +211,9 @@ def graph_of_plan(plan: Plan) -> SystemGraph:
         )
         for c in plan.connections
     ]
-    return replace(graph_of(plan.system.config.mesh, nodes, connections), topics=plan.system.topics)
+    return replace(
+        graph_of(plan.system.config.mesh, nodes, connections), topics=plan.system.topics, keys=plan.system.keys
+    )
 
 
 def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
@@ -202,7 +229,7 @@ def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
             mapped = ", ".join(f"{have} -> {want}" for have, want in c.map)
             variable = GraphVariable(output, input_, both[0], both[1], c.factor, c.offset, mapped, c.way_in_words)
             connections.append(((source, target, INITIAL if c.initial_only else c.delay), variable))
-    return graph_of(mesh, nodes, connections)
+    return replace(graph_of(mesh, nodes, connections), keys=tuple(key for own in infos for key in own.keys))
 
 
 def graph_of(

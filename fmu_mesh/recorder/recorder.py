@@ -168,8 +168,8 @@ class Recorder:
         self._thread.join()  # all its waits have deadlines; a slow disk takes its time
         try:
             try:
+                self._take_notes()
                 self._write_rows()
-                self._take_last_values()
                 if isinstance(error, RunReset):
                     self._files.note({"ended_by": error.message})
             finally:
@@ -181,6 +181,13 @@ class Recorder:
         finally:
             self._membership.close()
             self._inbox.close()
+
+    def _take_notes(self) -> None:
+        """All nodes have reported: what they have told before, faster rows may have overtaken."""
+        self._inbox.settle(_LAST_S)
+        while (message := self._inbox.poll()) is not None:
+            if message[1] in (SET, KEYS):
+                self._take(message)
 
     def _end(self, cause: BaseException | None) -> None:
         self._finished, self._cause = True, cause
@@ -342,16 +349,6 @@ class Recorder:
                     return
                 message = self._inbox.wait(left)
             if message is not None and message[1] in (FRAME, LAST, SET, KEYS):
-                self._take(message)
-
-    def _take_last_values(self) -> None:
-        """Take what was set and what came by keys: it may come after the rows, which take other ways.
-
-        The master of this process has the reports of the nodes, which they have sent after it.
-        """
-        self._inbox.close()
-        while (message := self._inbox.poll()) is not None:
-            if message[1] in (SET, KEYS):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:

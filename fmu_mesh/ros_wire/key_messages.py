@@ -8,7 +8,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.mesh import Config, RosTopicConfig
+from ..config.mesh import RosTopicConfig
 from ..errors import ConfigurationError
 from ..system.live_keys import KeyInput, KeyOutput
 from ..system.system import ResolvedSystem
@@ -21,7 +21,7 @@ from .topics import Direction, Port, Topic
 __all__ = ["check_messages", "message_reader", "message_writer"]
 
 
-def check_messages(config: Config, system: ResolvedSystem, findings: Findings) -> None:
+def check_messages(system: ResolvedSystem, findings: Findings) -> None:
     """Add a finding for each message under a key that cannot carry its variable."""
     for name, own in system.instances.items():
         entries: tuple[KeyInput | KeyOutput, ...] = (*own.keys_in, *own.keys_out)
@@ -29,8 +29,7 @@ def check_messages(config: Config, system: ResolvedSystem, findings: Findings) -
             variable = own.description.variable(entry.variable)
             if entry.encoding != "cdr" or variable is None:
                 continue
-            path = next(f"connections[{i}]" for i, one in enumerate(config.connections) if _is(one, name, entry))
-            topic = _topic(entry, variable, name)
+            path, topic = entry.path, _topic(entry, variable, name)
             written = RosTopicConfig(topic=entry.key, type=topic.message, fields={topic.ports[0].path: name})
             try:
                 check_topic(TopicEntry(written, path, path, f"{path}.field"), topic, MessageTypes(), findings, [])
@@ -54,9 +53,3 @@ def _topic(own: KeyInput | KeyOutput, variable: Variable, instance: str = "") ->
         variable = replace(variable, shape=(), dimensions=())  # one element of it
     port = Port(own.field or "data", instance, variable, direction)
     return Topic(own.key, own.type or "", direction, (port,))
-
-
-def _is(entry: object, instance: str, own: KeyInput | KeyOutput) -> bool:
-    """Whether an entry of the file is that of ``own``."""
-    end = getattr(entry, "target" if isinstance(own, KeyInput) else "source", "")
-    return getattr(entry, "key", None) == own.key and end.startswith(f"{instance}.{own.variable}")

@@ -41,7 +41,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "planned", "planned_reset"]
+__all__ = ["KnownModels", "planned", "planned_reset", "without_keys"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -172,7 +172,7 @@ def planned(
 
     checked = partial(check_record, loaded)
     system = build(loaded, descriptions, findings, scenario, claimed, obstacles, checked, base_unit_of)
-    check_messages(loaded.config, system, obstacles)
+    check_messages(system, obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
@@ -235,6 +235,15 @@ def _repeated(system: ResolvedSystem, result: Path) -> ResolvedSystem:
         raise ConfigurationError(text, hint="Write this one to another file with `output=...`.")
     alone = {name: replace(own, keys_out=()) for name, own in system.instances.items()}
     return replace(system, instances=alone, recorded_keys=recorded)
+
+
+def without_keys(run: RunPlan) -> RunPlan:
+    """The plan without keys at ends of connections, for a program that sets inputs itself: they are free."""
+    system = run.plan.system
+    free = {name: replace(own, keys_in=(), keys_out=()) for name, own in system.instances.items()}
+    if free == system.instances:
+        return run
+    return replace(run, plan=make_plan(replace(system, instances=free), contents=run.contents))
 
 
 def _scenario(

@@ -28,7 +28,7 @@ from ..system.system import ResolvedSystem
 from ..text import listed, nearest_file
 from .grammar import NAMESPACES
 from .naming import element_path, instance_name, mesh_name
-from .own_annotation import ANNOTATION_TYPE, names_in, written
+from .own_annotation import ANNOTATION_TYPE, has_key, names_in, written
 from .package import DEFAULT, Package
 from .package_writing import ArchiveEntry, Content, resource_names, write_package
 from .ssd_writing import (
@@ -104,6 +104,7 @@ def _content(data: Any) -> list[Any]:  # noqa: ANN401  values of a file
     connections = [
         {key: value for key, value in one.items() if key in _OF_CONNECTIONS} if isinstance(one, dict) else one
         for one in data.get("connections", ())
+        if not has_key(one)
     ]
     return [instances, connections]
 

@@ -27,6 +27,7 @@ __all__ = [
     "ANNOTATION_TYPE",
     "AnnotationRefused",
     "Merged",
+    "has_key",
     "merged",
     "names_in",
     "written",
@@ -70,7 +71,10 @@ _SECTIONS: Final = (
 )
 """The top-level keys that stand there as they are."""
 
-_KNOWN: Final = ("version", "mesh", "names", "simulation", "instances", "connections", *_SECTIONS)
+_KEYS: Final = "keys"
+"""The connections with a Zenoh key at one end, which stand there as they are."""
+
+_KNOWN: Final = ("version", "mesh", "names", "simulation", "instances", "connections", _KEYS, *_SECTIONS)
 _ABSENT: Final = object()
 _LARGEST_TEXT: Final = 4 * 2**20
 """In characters, as a configuration file."""
@@ -115,13 +119,15 @@ def written(
             leads out of that folder, because a package is given to others.
     """
     simulation, said = data["simulation"], described.get("simulation", {})
+    connections = data.get("connections", ())
     known = {_ends(one): one for one in described.get("connections", ()) if isinstance(one, dict)}
     own = {
         "mesh": data["mesh"] if described.get("mesh") != data["mesh"] else None,
         "names": dict(names),
         "simulation": {key: simulation[key] for key in simulation if key not in said or said[key] != simulation[key]},
         "instances": dict(_own_instances(data["instances"], described.get("instances", {}))),
-        "connections": list(_own_connections(data.get("connections", ()), known)),
+        "connections": list(_own_connections(connections, known)),
+        _KEYS: [one for one in connections if has_key(one)],
     }
     sections = {key: data[key] for key in _SECTIONS if key in data and data[key] != described.get(key, _ABSENT)}
     if "record" in sections:
@@ -182,6 +188,7 @@ def merged(data: Mapping[str, Any], text: str, *, moved: Callable[[str], str] = 
         result.paths.append("mesh")
     _merge_instances(content, result)
     _merge_connections(content, result)
+    _merge_keys(content, result)
     for key in _SECTIONS:
         if key in content:
             made[key] = content[key] if key != "record" else _with_files(content[key], lambda path: moved(_own(path)))
@@ -220,6 +227,11 @@ def _mapping(content: Mapping[str, Any], key: str) -> dict[str, Any]:
     return section
 
 
+def has_key(connection: object) -> bool:
+    """Whether a connection has a Zenoh key at one end."""
+    return isinstance(connection, dict) and "key" in connection
+
+
 def _ends(connection: Mapping[str, Any]) -> tuple[str, str]:
     return connection["from"], connection["to"]
 
@@ -245,8 +257,8 @@ def _own_connections(
 ) -> Iterator[dict[str, Any]]:
     """The connections with keys that SSP does not have, by their ends."""
     for connection in connections:
-        if isinstance(connection, str):
-            continue  # the short form has no keys
+        if isinstance(connection, str) or has_key(connection):
+            continue  # the short form has no keys, and the others stand elsewhere
         said = described.get(_ends(connection), {})
         kept = {key: connection[key] for key in _CONNECTION_KEYS if key in connection}
         kept = {key: value for key, value in kept.items() if value != said.get(key)}
@@ -291,6 +303,20 @@ def _merge_connections(content: Mapping[str, Any], result: Merged) -> None:
             result.paths.extend(f"connections[{number}].{key}" for key in keys)
         else:
             result.gone.append(f"the connection {ends[0]} -> {ends[1]}, which the annotation has {listed([*keys])} for")
+
+
+def _merge_keys(content: Mapping[str, Any], result: Merged) -> None:
+    entries = content.get(_KEYS, [])
+    if not isinstance(entries, list) or not all(map(has_key, entries)):
+        raise AnnotationRefused(f"no list of connections with a key in '{_KEYS}'", "such a list")
+    for entry in entries:
+        end = entry.get("to", entry.get("from"))
+        connections = result.data["connections"] = [*result.data.get("connections", ())]
+        if str(end).partition(".")[0] in result.data["instances"]:
+            result.paths.append(f"connections[{len(connections)}]")
+            connections.append(entry)
+        else:
+            result.gone.append(f"the instance of '{end}', which the annotation has the key '{entry['key']}' for")
 
 
 def _with_files(record: Any, moved: Callable[[str], str]) -> Any:  # noqa: ANN401  a section as in a file

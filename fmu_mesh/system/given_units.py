@@ -25,8 +25,10 @@ def unit_change(  # noqa: PLR0913, PLR0917  what a unit refers to
     variables: Variables,
     unit_of: Callable[[str], BaseUnit | None],
     findings: Findings,
+    *,
+    outwards: bool = False,
 ) -> Linear | None:
-    """What brings values into the unit of a variable; None after a finding about ``path``.
+    """What brings values into the unit of a variable, or out of it (``outwards``); None after a finding about ``path``.
 
     A unit means what a model of this mesh defines, or else what ``unit_of`` says.
     """
@@ -43,9 +45,10 @@ def unit_change(  # noqa: PLR0913, PLR0917  what a unit refers to
         what = f"its model does not define '{variable.unit}'" if variable.unit else "it has no unit"
         found = f"'{unit}' for '{variable.name}', which cannot be converted: {what}"
         findings.add(f"{path}.unit", found, "values in the unit of the variable, and no unit here")
-    elif (change := conversion(base, variable.base_unit, relative=variable.relative_quantity)) is not None:
-        return change
     else:
+        ends = (variable.base_unit, base) if outwards else (base, variable.base_unit)
+        if (change := conversion(*ends, relative=variable.relative_quantity)) is not None:
+            return change
         found = f"'{unit}' ({base}) for '{variable.name}' in {variable.unit} ({variable.base_unit})"
         findings.add(f"{path}.unit", found, "a unit of the same dimension")
     return None

@@ -15,25 +15,39 @@ from typing import Final, Literal
 import msgspec
 
 from ..config.findings import Findings
-from ..config.key_sections import KeyInputConfig, KeyOutputConfig
+from ..config.key_sections import KeyInputConfig, KeyOutputConfig, KeyView
 from ..config.mesh import Config
 from ..simtime import steps_between
 from ..text import listed, shown
 from ..variables.model_description import Variable
 from ..variables.units import BaseUnit, Linear
 from ..variables.value_conversion import ValueRefused, to_value
-from ..variables.value_types import PlainValue, is_float
+from ..variables.value_types import PlainValue, element_name, is_float
 from .connections import Variables, offered, resolve_variable
 from .given_units import type_in_words, unit_change
 from .start_values import why_not_settable
 
-__all__ = ["KeyInput", "KeyOutput", "KeyPath", "KeyValue", "RecordedKeys", "field_parts", "resolve_keys", "seconds_of"]
+__all__ = [
+    "KEY",
+    "KeyInput",
+    "KeyOutput",
+    "KeyPath",
+    "KeyValue",
+    "RecordedKeys",
+    "field_parts",
+    "key_views",
+    "resolve_keys",
+    "seconds_of",
+]
 
 KeyPath = tuple[str | int | tuple[str, str], ...]
 """A path into JSON: names, indexes, and (name, text) for the element whose field of this name has this text."""
 
 KeyValue = tuple[str, int, float | None, PlainValue]
 """Instance and variable, the point at which the instance took it, the time in s from which on it holds, value."""
+
+KEY: Final = "key "
+"""Before the name of a key, where else an instance feeds an input."""
 
 _PART: Final = re.compile(r"""(?:^|\.)([^.\[\]]+)|\[(\d{1,9})\]|\[(\w+)=(["']?)(.+?)\4\]""")
 _CHUNK: Final = re.compile(r"(\*\*?|([^*$#?/]|\$\*)+)")
@@ -51,7 +65,8 @@ class KeyInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The values of a key for one variable.
 
     Attributes:
-        change: the value is factor * number + offset of it, for a unit and the factor of the file together.
+        path: its place in the configuration file; so has an output.
+        factor: the value is factor * number + offset, for a unit and the factor of the file together.
         map: what stands for a value, by the word for it.
         time: `arrival`, `timestamp`, or the path of a field.
         origin: the time of point 0 in s in the clock of ``time``; None: the first value takes effect when it arrives.
@@ -60,6 +75,7 @@ class KeyInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     variable: str
     key: str
+    path: str = ""
     encoding: Literal["auto", "json", "text", "cdr", "float64"] = "auto"
     type: str | None = None
     field: str | None = None
@@ -90,6 +106,7 @@ class KeyOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     variable: str
     key: str
+    path: str = ""
     index: tuple[int, ...] = ()
     on: Literal["point", "change"] = "point"
     every: int = 1
@@ -98,12 +115,24 @@ class KeyOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     field: str | None = None
     factor: float = 1.0
     offset: float = 0.0
+    map: dict[str, PlainValue] = {}
     blocks: bool = False
 
     def __str__(self) -> str:
-        when = "on change" if self.on == "change" else "at each point"
-        rare = f", at most every {self.every} points" if self.every > 1 else ""
-        return when + rare + (", the run waits for who is slow" if self.blocks else "")
+        rare = f"every {self.every} points" if self.every > 1 else "at each point"
+        when = rare if self.on == "point" else "on change" + (f", at most {rare}" if self.every > 1 else "")
+        return when + (", the run waits for who is slow" if self.blocks else "")
+
+
+def key_views(instance: str, *keys: KeyInput | KeyOutput) -> tuple[KeyView, ...]:
+    """What people see of keys of an instance."""
+    views = []
+    for own in keys:
+        index = own.index if isinstance(own, KeyOutput) else ()
+        name = element_name(own.variable, index) if index else own.variable
+        payload = " ".join(filter(None, (own.type or own.encoding, own.field)))
+        views.append(KeyView(instance, own.key, "in" if isinstance(own, KeyInput) else "out", name, payload, str(own)))
+    return tuple(views)
 
 
 def field_parts(path: str) -> KeyPath:
@@ -159,10 +188,10 @@ def resolve_keys(
     outputs: dict[str, list[KeyOutput]] = {}
     for index, entry in enumerate(config.connections):
         path = f"connections[{index}]"
-        if isinstance(entry, KeyInputConfig):
+        if isinstance(entry, KeyInputConfig) and entry.target:
             for own in resolving.input(entry, path):
                 inputs.setdefault(entry.target.partition(".")[0], []).append(own)
-        elif isinstance(entry, KeyOutputConfig):
+        elif isinstance(entry, KeyOutputConfig) and entry.source:
             for sent in resolving.output(entry, path):
                 outputs.setdefault(entry.source.partition(".")[0], []).append(sent)
     return {name: tuple(own) for name, own in inputs.items()}, {name: tuple(own) for name, own in outputs.items()}
@@ -187,7 +216,7 @@ class _Resolving(msgspec.Struct):
             found = f"'{entry.key}', which can match several keys"
             self.findings.add(f"{path}.key", found, "one key, or `take: newest` as well")
         if wild and entry.wait:
-            self.findings.add(f"{path}.wait", "a wait for a key with a wildcard", "one key")
+            self.findings.add(f"{path}.wait", "true for a key with a wildcard", "false, or one key")
         origin = self._origin(entry, path)
         self._check_message(entry, path)
         linear = entry.interpolation == "linear"
@@ -204,6 +233,7 @@ class _Resolving(msgspec.Struct):
             yield KeyInput(
                 variable=variable.name,
                 key=entry.key,
+                path=path,
                 encoding=entry.encoding,
                 type=entry.type,
                 field=entry.field,
@@ -239,18 +269,25 @@ class _Resolving(msgspec.Struct):
         if variable.causality == "independent":
             add(f"{path}.from", f"'{entry.source}', the time", "another variable; each value has its time")
         self._check_factors(entry, variable, path)
+        if entry.map and entry.encoding in ("cdr", "float64"):
+            add(f"{path}.map", f"a map with `encoding: {entry.encoding}`", "json or text")
+        units = self.variables, self.unit_of, self.findings
+        change = unit_change(entry.unit, variable, path, *units, outwards=True) or Linear()
+        both = change.then(Linear(entry.factor, entry.offset))
         if len(self.findings) == before:
             yield KeyOutput(
                 variable=variable.name,
                 key=entry.key,
+                path=path,
                 index=index,
                 on=entry.on,
                 every=every or 1,
                 encoding=entry.encoding,
                 type=entry.type,
                 field=entry.field,
-                factor=entry.factor,
-                offset=entry.offset,
+                factor=both.factor,
+                offset=both.offset,
+                map=dict(entry.map),
                 blocks=entry.congestion == "block",
             )
 
@@ -269,7 +306,7 @@ class _Resolving(msgspec.Struct):
             names = listed(offered(instance, self.variables, may_be_set))
             expected = f"an input that is not connected, or a tunable parameter of '{instance}': {names}"
             self.findings.add(f"{path}.to", f"'{name}', which {why.partition(';')[0]}", expected)
-        self.connected.setdefault(name, f"key {entry.key}")
+        self.connected.setdefault(name, f"{KEY}{entry.key}")
         return variable
 
     def _origin(self, entry: KeyInputConfig, path: str) -> float | None:
@@ -300,8 +337,10 @@ class _Resolving(msgspec.Struct):
 
     def _check_key(self, key: str, path: str) -> bool:
         """Whether a key has wildcards; a finding if it is no key of Zenoh."""
-        if not all(map(_CHUNK.fullmatch, key.split("/"))):
-            self.findings.add(f"{path}.key", f"'{key}'", "a Zenoh key such as plant/pump/flow, without # and ?")
+        if key and not all(map(_CHUNK.fullmatch, key.split("/"))):
+            self.findings.add(
+                f"{path}.key", f"'{key}'", "a Zenoh key such as plant/pump/flow, without #, ? and empty parts"
+            )
         return "*" in key
 
     def _check_message(self, entry: KeyInputConfig | KeyOutputConfig, path: str) -> None:
@@ -323,7 +362,7 @@ class _Resolving(msgspec.Struct):
             self.findings.add(
                 f"{path}.encoding", f"float64 for the {variable.type_name} '{variable.name}'", "a Float64"
             )
-        if changes and isinstance(entry, KeyInputConfig) and entry.map:
+        if changes and entry.map:
             self.findings.add(f"{path}.map", "a map, and factor and offset", "one of the two")
 
     def _map(self, entry: KeyInputConfig, variable: Variable, path: str) -> dict[str, PlainValue]:

@@ -26,7 +26,7 @@ from .initialization_plan import InitializationPlan, Loop, check_loops, plan_ini
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
-from .live_keys import KeyInput, KeyOutput, RecordedKeys
+from .live_keys import KEY, KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
@@ -48,7 +48,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         linear_inputs: the inputs whose connections are extrapolated.
-        row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario.
+        row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario and of keys.
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
         initial_outputs: what is read in Initialization Mode only.
@@ -90,7 +90,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def sources(self) -> dict[str, str]:
         """What feeds each input that is connected, or of which an element is: an instance, or a key in words."""
         fed = {self.inputs.column(own.target).name: feed.source for feed in self.feeds for own in feed.columns}
-        return fed | {own.variable: f"key {own.key}" for own in self.keys_in}
+        return fed | {own.variable: f"{KEY}{own.key}" for own in self.keys_in}
 
     def check_settable(self, variable: Variable) -> None:
         """Check that a variable may be set between two steps.
@@ -311,10 +311,9 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     for node in windows:
         members = [name for name in plan.order if plan.node_of(name) == node]
         within = _units(plan, node, members)
+        # A cycle over several nodes, or another program, waits for each row.
         waits = any(own.wait for name in members for own in system.instances[name].keys_in)
-        shared = waits or any(
-            name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles
-        )
+        shared = any(name in cycle and len(within[name]) < len(cycle) for name in members for cycle in plan.cycles)
         links_in = tuple(link for link in links if link.target_node == node)
         nodes[node] = NodePlan(
             mesh=config.mesh,
@@ -325,9 +324,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             window=windows[node],
             progress_stride=windows[node] // 4 if windows[node] >= 4 * longest_step else 1,
             windows=tuple(windows.items()),
-            batch=1
-            if shared
-            else max(1, plan.window // 16),  # a cycle over several nodes, or another program, waits for each row
+            batch=1 if shared or waits else max(1, plan.window // 16),
             memory=memory,
             rings=tuple(
                 places[name]
@@ -370,6 +367,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
     levels = plan.initialization.levels
     given = {variable.name for variable in instance.description.with_causality("output")}
+    driven = {own.variable for own in instance.scenario} | {own.variable for own in instance.keys_in}
     checked = tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
     return InstancePlan(
         name=instance.name,
@@ -387,7 +385,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
             if c.extrapolation == "linear"
         ),
         scenario=instance.scenario,
-        row=row_of(instance.description, instance.scenario, connected),
+        row=row_of(instance.description, driven, connected),
         parameters=feeds_of(initial),
         initial_inputs=Layout.of(v for v in instance.description.variables if v.name in initialized),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),

@@ -217,12 +217,11 @@ class Course:
         return len(self._steps)
 
 
-def row_of(description: ModelDescription, schedules: Sequence[Schedule], connected: AbstractSet[str]) -> Layout | None:
-    """The inputs that are set in every step: connected ones, and those of a scenario that are a single Float64.
+def row_of(description: ModelDescription, names: AbstractSet[str], connected: AbstractSet[str]) -> Layout | None:
+    """The inputs that are set in every step: connected ones, and those with ``names`` that are a single Float64.
 
     None if these are the connected ones.
     """
-    names = {schedule.variable for schedule in schedules}
     inputs = (v for v in description.with_causality("input") if v.type == "Float64" and not v.shape)
     driven = {v.name for v in inputs if v.name in names}
     return Layout.of(v for v in description.variables if v.name in connected | driven) if driven else None

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from fmu_mesh import files
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
+from fmu_mesh.config.key_sections import KeyView
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.config.ros_section import MeshTopic
@@ -29,7 +30,7 @@ from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.live_keys import KeyInput, KeyOutput, RecordedKeys, resolve_keys
+from fmu_mesh.system.live_keys import KEY, KeyInput, KeyOutput, RecordedKeys, key_views, resolve_keys
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
@@ -92,6 +93,12 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     scenario_files: dict[str, str] = {}
     topics: tuple[MeshTopic, ...] = ()
     recorded_keys: RecordedKeys | None = None
+
+    @property
+    def keys(self) -> tuple[KeyView, ...]:
+        """The Zenoh keys at ends of connections."""
+        own = self.instances.items()
+        return tuple(key for name, one in own for key in key_views(name, *one.keys_in, *one.keys_out))
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
@@ -179,10 +186,10 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     connected = {f"{c.target_instance}.{c.target.name}": c.source_instance for c in connections}
     keys_in, keys_out = resolve_keys(config, variables, connected, unit_of, collected)
     sources = config.sources | connected  # also those of wrong connections
-    free = {f"{name}.{own.variable}" for name, inputs in keys_in.items() for own in inputs}
+    fed = {name for name, source in sources.items() if not source.startswith(KEY)}
     base = grid.step_size if grid is not None else 1.0
     timeouts = {
-        name: tuple(_timeouts(own, config, sources.keys() - free, base, collected))
+        name: tuple(_timeouts(own, config, fed, base, collected))
         for name, own in instances.items()
         if config.instances[name].inputs
     }

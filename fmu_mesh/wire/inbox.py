@@ -88,6 +88,7 @@ class Inbox:
         self.is_direct = self._sleeps = False
         self._alarm = threading.Condition()
         self._alarm_at = self._looks_at = math.inf
+        self._echo = threading.Event()
         self.refusals = Refusals()
 
     def open(
@@ -127,11 +128,20 @@ class Inbox:
         before.ring_bell()
         sleeper.ring_bell()  # for what came meanwhile
 
-    def post(self, action: Callable[[], None], *, first: bool = False) -> None:
-        """From any thread: let the main thread run ``action`` when it next looks into the inbox; ``first`` of all."""
+    def post(self, action: Callable[[], None], *, first: bool = False, later: bool = False) -> None:
+        """From any thread: let the main thread run ``action`` when it next looks into the inbox; ``first`` of all.
+
+        ``later`` is for the main thread itself: it may take its next steps before.
+        """
         (self._posted.appendleft if first else self._posted.append)(action)
-        self._sleeper.ring_bell()
-        self._wake()
+        if not later:
+            self._sleeper.ring_bell()
+            self._wake()
+
+    @property
+    def has_posted(self) -> bool:
+        """Whether there are posted actions."""
+        return bool(self._posted)
 
     def poll(self) -> Message | None:
         """The next message if there is one; also runs posted actions."""
@@ -162,6 +172,13 @@ class Inbox:
             self._take(self._channel.recv())
         self._sleeps = False
         return self.poll()
+
+    def settle(self, timeout_s: float) -> None:
+        """Wait until `poll` has all messages that Zenoh has delivered before; not for an owner that reads directly."""
+        if self._subscriber is not None:
+            self._echo.clear()
+            self._send_wake()  # comes after them
+            self._echo.wait(timeout_s)
 
     def wait_until(self, is_so: Callable[[], bool], timeout_s: float) -> bool:
         """Run what is posted, and drop messages, until something is so; whether it was within ``timeout_s`` seconds."""
@@ -195,7 +212,9 @@ class Inbox:
         key, data = str(sample.key_expr), sample.payload.to_bytes()
         if (sender := self._senders.get(key)) is not None:
             self._arrived.append((sender, data))
-        elif key != self._own_key or data != self._token:
+        elif key == self._own_key and data == self._token:
+            self._echo.set()
+        else:
             self.refusals.add(key, "no participant of this run sends with this key")
 
     def _wake(self) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from ..config.key_sections import KeyView
 from ..config.ros_section import MeshTopic
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
@@ -21,7 +22,6 @@ __all__ = [
     "InstanceInfo",
     "InstanceStatus",
     "KeyStatus",
-    "KeyView",
     "LogLine",
     "MeshInfo",
     "MeshState",
@@ -94,22 +94,7 @@ class ConnectionView(msgspec.Struct, frozen=True):
         return {"stream": "row stream", "zenoh": "Zenoh"}.get(self.way or "", "")
 
 
-class KeyView(msgspec.Struct, frozen=True):
-    """One Zenoh key at an end of a connection, in `info`.
-
-    Attributes:
-        direction: `in`: the values of the key are for the variable; `out`: those of the variable go to the key.
-        rule: when a value takes effect, or when there is one, in words.
-    """
-
-    key: str
-    direction: Literal["in", "out"]
-    variable: str
-    encoding: str
-    rule: str
-
-
-class KeyStatus(msgspec.Struct, frozen=True):
+class KeyStatus(KeyView, frozen=True):
     """What has come by a key, or gone to it, in `status`.
 
     Attributes:
@@ -123,8 +108,6 @@ class KeyStatus(msgspec.Struct, frozen=True):
         age: wall-clock time since the last one in s; None before the first.
     """
 
-    key: str
-    variable: str
     received: int = 0
     replaced: int = 0
     refused: int = 0
@@ -133,6 +116,16 @@ class KeyStatus(msgspec.Struct, frozen=True):
     lost: int = 0
     rate: float = 0.0
     age: float | None = None
+
+    @property
+    def activity(self) -> str:
+        """What came or went so far, in words."""
+        if self.age is None:
+            return "nothing so far"
+        troubles = {name: getattr(self, name) for name in ("refused", "late", "disordered", "lost")}
+        counts = (f"{count} {name}" for name, count in troubles.items() if count)
+        silent = [f"silent for {self.age:.0f} s"] if self.age >= 1.0 else []
+        return ", ".join([f"{self.rate:.3g}/s", *counts, *silent])
 
 
 class InstanceInfo(msgspec.Struct, frozen=True):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.mesh_editing import connections_of
 from tests.helpers import FMUS, write_config
 
 
@@ -103,6 +104,68 @@ def test_an_instance_is_added_once_and_says_what_it_is(keys: dict[str, Any], mes
     mesh = built() if "fmu" in keys else fmu_mesh.Mesh("pair", step_size=0.1, stop_time=1.0)
     with pytest.raises(fmu_mesh.CallRefused, match=message):
         mesh.add("pendulum", **keys)
+
+
+def test_keys_are_connections_that_can_be_changed_and_removed(folder: Path) -> None:
+    mesh = built()
+    mesh.add("gain", fmu=FMUS / "Gain.fmu")
+    mesh.subscribe("plant/flow", "gain.u", factor=2.0)
+    mesh.subscribe("plant/flow", "gain.k")
+    mesh.subscribe("plant/flow", "gain.u", encoding="text")
+    mesh.publish("gain.y", "twin/y", every=0.1)
+    mesh.publish("delay.y", "twin/angle")
+
+    assert [key.ends for key in mesh.check().plan.keys] == [  # type: ignore[union-attr]  # it has one
+        "delay.y -> twin/angle",
+        "plant/flow -> gain.u",
+        "plant/flow -> gain.k",
+        "gain.y -> twin/y",
+    ]
+    mesh.save(folder / "keys.yaml")
+    assert fmu_mesh.load(folder / "keys.yaml").configuration.data == mesh.configuration.data
+
+    mesh.disconnect("plant/flow", "gain.k")
+    mesh.disconnect(target="twin/angle")
+    assert connections_of(mesh.configuration) == [
+        {"from": "pendulum.a", "to": "delay.x"},
+        {"key": "plant/flow", "to": "gain.u", "encoding": "text"},
+        {"from": "gain.y", "key": "twin/y", "every": 0.1},
+    ]
+    mesh.remove("gain")
+    assert connections_of(mesh.configuration) == [{"from": "pendulum.a", "to": "delay.x"}]
+
+
+def test_a_key_with_the_name_of_an_instance_stays_when_that_goes() -> None:
+    mesh = built()
+    mesh.add("gain", fmu=FMUS / "Gain.fmu")
+    mesh.subscribe("pendulum.a", "gain.u")
+
+    mesh.remove("pendulum")
+
+    assert connections_of(mesh.configuration) == [{"key": "pendulum.a", "to": "gain.u"}]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda mesh: mesh.subscribe("a/b", "delay"), r"mesh.subscribe\('a/b', 'delay'\): 'delay'; expected instance"),
+        (lambda mesh: mesh.publish("delay", "a/b"), r"mesh.publish\('delay', 'a/b'\): 'delay'; expected instance"),
+        (lambda mesh: mesh.subscribe("", "delay.x"), "key: ''; expected a Zenoh key"),
+        (lambda mesh: mesh.subscribe("a/b", "delay.x", encodin="text"), "encodin: an unknown key.*'encoding'"),
+        (lambda mesh: mesh.publish("delay.y", "a/b", on="x"), "on: 'x'; expected change or point"),
+        (
+            lambda mesh: mesh.disconnect("delay.y", "twin/z"),
+            "no connection 'delay.y -> twin/z'.*'delay.y -> key twin/y'",
+        ),
+    ],
+)
+def test_a_call_with_a_wrong_key_is_refused(call: Callable[[fmu_mesh.Mesh], None], message: str) -> None:
+    mesh = built()
+    mesh.publish("delay.y", "twin/y")
+
+    with pytest.raises(fmu_mesh.FmuMeshError, match=message):
+        call(mesh)
+    assert len(connections_of(mesh.configuration)) == 2
 
 
 def test_a_mesh_that_is_saved_in_another_folder_has_the_same_files(folder: Path) -> None:

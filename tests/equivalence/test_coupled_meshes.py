@@ -112,7 +112,7 @@ def parts(
                 connections.append({"from": source, "to": target, **more})
             elif here[0] and source not in sent:
                 sent.add(source)
-                connections.append({"from": source, "key": key})
+                connections.append({"from": source, "key": key, "congestion": "block"})
             elif here[1]:
                 connections.append({"key": key, "to": target, "wait": True, **wait, **more})
         instances = {name: section for name, (own, section) in split.instances.items() if own == mesh}

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 from unittest import mock
 from xml.etree import ElementTree as ET
 
@@ -26,6 +26,8 @@ import pytest
 import yaml
 import zenoh
 
+from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.yaml_text import read
 from tests.helpers import Launched, Place, wait_until
 from tests.pages.blocks import LANGUAGES, PAGES, ROOT, Block, Command, blocks_of
 from tests.ros.ros_peer import environment
@@ -41,6 +43,7 @@ WHOLE: dict[str, dict[str, str]] = {
         "motor": "SimpleElectricalActuator",
         "vehicle": "ActiveShuttle",
     },
+    "docs/live-data.md": {"pump": "Gain", "tank": "Integrator"},
     MODEL_EXCHANGE: {"gain": "Gain", "oscillator": "oscillator"},
     "docs/ros.md": {
         "pendulum": "DampedPendulum",
@@ -115,7 +118,7 @@ class PageRun:
                 ET.fromstring(block.text)  # noqa: S314 our own page
 
     def _run_yaml(self, block: Block) -> None:
-        content = yaml.safe_load(block.text)
+        content: Any = read(block.text, Findings(block.place), {})  # YAML 1.2: `on` is a key
         if not content.keys() & {"instances", "connections", "record", "ros"}:
             return  # a file for somebody else, such as parameters of a ROS node, which a command of the page names
         if "mesh" not in content:
@@ -128,7 +131,9 @@ class PageRun:
         launch = "launch --local --no-progress --real-time-factor 0"
         if "real_time_factor" in content.get("simulation", {}):
             launch += " --stop-time 2"  # a reader watches this run, and ends it
-        for words in ("check", launch):
+        ends = [one for one in content.get("connections", ()) if isinstance(one, dict)]
+        fed = any("key" in one and "to" in one for one in ends)  # one process has no Zenoh
+        for words in ("check",) if fed else ("check", launch):
             command = f"{self._exports}fmu-mesh {words} {file}"
             done = self._place.start_command(["bash", "-euo", "pipefail", "-c", command])
             assert done.wait() == 0, f"{block.place}\n{done.story()}"
@@ -142,7 +147,8 @@ class PageRun:
         process = self._place.start_command(["bash", "-euo", "pipefail", "-c", self._exports + line])
         if in_background or command.line.endswith("&"):
             self._meanwhile.append(process)
-            wait_until(lambda: process.errors or not process.running, f"something that '{line}' tells")
+            said = f"something that '{line}' tells"
+            wait_until(lambda: process.errors or process.output or not process.running, said)
             return
         if UNTIL_CTRL_C.match(line):
             wait_until(lambda: process.output or not process.running, f"something that '{line}' shows")
@@ -243,6 +249,7 @@ NOT_RUN = [
         "CONFIG and router are yours; tests/faults/test_by_hand.py starts these parts",
     ),
     ("bridges/ros2dds/README.md", "./build", ".ci/long builds it, and tests/ros/test_bridge.py runs it"),
+    ("bridges/zenoh/README.md", "./build", ".ci/long builds it, and tests/mqtt/test_mqtt_and_http.py runs it"),
     (
         "docs/commands.md",
         "$ fmu-mesh launch configs/pendulum_delay.yaml --real-time-factor 1 --restarts 3",
@@ -257,6 +264,66 @@ NOT_RUN = [
         "docs/dashboard.md",
         "fmu-mesh dashboard",
         "it serves until somebody ends it; tests/equivalence/test_dashboard_page.py opens the page in a browser",
+    ),
+    (
+        "docs/digital-twin.md",
+        "connections:",
+        "tests/mqtt/test_digital_twin.py runs configs/pump_twin.yaml, which has these lines",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh-zenoh-bridge bridges/zenoh/config.json5",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh launch configs/pump_twin.yaml --listen tcp/127.0.0.1:7447 --no-progress",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "mosquitto_sub -v -t 'twin/#'",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "mosquitto_pub -q 1 -t plant/pump/speed -m '{\"rpm\": 2400}'",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "curl http://127.0.0.1:8000/fmu_mesh/pump_twin/pump/out/forecast",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "curl -N -H 'accept: text/event-stream' 'http://127.0.0.1:8000/twin/**'",
+        "it needs the bridge; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh dashboard pump_twin",
+        "it needs a running twin; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "fmu-mesh stop pump_twin",
+        "it needs the result of the story; tests/mqtt/test_digital_twin.py runs it",
+    ),
+    (
+        "docs/digital-twin.md",
+        "connections:",
+        "it is a part; tests/mqtt/test_digital_twin.py runs it in a complete file",
+    ),
+    (
+        "docs/digital-twin.md",
+        "connections:",
+        "it is a part; tests/mqtt/test_digital_twin.py runs it in a complete file",
+    ),
+    (
+        "docs/digital-twin.md",
+        "docker compose --file docker/twin.compose.yaml up --build",
+        "there is no engine of containers here; tests/mqtt/test_twin_compose.py runs the commands of the services",
     ),
     (
         "docs/foxglove.md",

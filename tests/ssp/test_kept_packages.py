@@ -409,9 +409,34 @@ def test_what_our_annotation_says_about_things_that_are_gone_is_a_warning(own: P
     assert mesh.check().findings == ()
 
 
+def test_keys_of_connections_are_kept_unless_their_instance_is_gone(own: Path, tmp_path: Path) -> None:
+    mesh = loaded(own)
+    mesh.subscribe("plant/flow", "left-gain.u", time="timestamp", delay=0.2)
+    mesh.publish("right.y", "twin/y")
+    assert mesh.to_ssp(tmp_path / "keys.ssp") == ()
+    same = loaded(tmp_path / "keys.ssp")
+    edited(
+        tmp_path / "keys.ssp",
+        lambda text: text.replace('name="right"', 'name="other"').replace('t="right"', 't="other"'),
+    )
+    without = loaded(tmp_path / "keys.ssp")
+
+    assert [key.cells for key in same.plan().plan.system.keys] == [
+        ["plant/flow -> left-gain.u", "auto", "at its timestamp, 0.2 s later"],
+        ["right.y -> twin/y", "json", "at each point"],
+    ]
+    assert same.to_ssp(tmp_path / "again.ssp") == ()
+    assert content_of(tmp_path / "again.ssp")[MAIN].count(b"twin/y") == 1
+    assert [key.ends for key in without.plan().plan.system.keys] == ["plant/flow -> left-gain.u"]
+    gone = "the instance of 'right.y', which the annotation has the key 'twin/y' for is not there any more"
+    assert gone in [one.found for one in without.configuration.warnings]
+
+
 @pytest.mark.parametrize(
     ("content", "found", "expected"),
     [
+        ('{"version": 1, "keys": [{"to": "right.u"}]}', "no list of connections with a key in 'keys'", "such a list"),
+        ('{"version": 1, "keys": {}}', "no list of connections with a key in 'keys'", "such a list"),
         ("{", "no JSON: Expecting property name enclosed in double quotes", "the JSON that fmu_mesh writes"),
         ("[1]", "no mapping", "the JSON that fmu_mesh writes"),
         ('{"version": 2}', "version 2", "version 1"),

@@ -15,6 +15,7 @@ from benchmarks.commands import RunFailed
 from benchmarks.comparing import Reference, compare
 from benchmarks.first_step import Started
 from benchmarks.jobs import JOBS, OTHER, Entry, Job, with_checkout
+from benchmarks.live_data import Watched, misplaced
 from benchmarks.publishing import BLOCKS, PAGE, PATIENCE_S, Figures, Host, markers, publish
 from benchmarks.recording import main as measure_recording
 from benchmarks.report import Report
@@ -260,6 +261,26 @@ def test_the_program_of_each_block_takes_the_option(
 
     shown = capsys.readouterr().out
     assert [option for option in ("--write-docs", *options) if option not in shown] == []
+
+
+@pytest.mark.parametrize(
+    ("column", "found"),
+    [
+        ([0.0, 0.0, 0.0, 1.0, 2.0, 3.0], (0, 0)),
+        ([0.0, 0.0, 0.0, 1.0, 3.0, 3.0], (1, 0)),
+        ([0.0, 0.0, 1.0, 2.0, 3.0, 3.0], (0, 2)),
+        ([0.0, 0.0, 0.0, 1.0, 2.0], (1, 0)),
+    ],
+    ids=["all", "one is missing", "too early", "the run ended"],
+)
+def test_values_that_are_lost_or_at_another_point_are_counted(column: list[float], found: tuple[int, int]) -> None:
+    assert misplaced(column, first=2, count=3) == found
+
+
+def test_what_a_run_has_grown_is_seen_from_a_part_of_it_on() -> None:
+    seen = Watched([90.0, 100.0, 104.0, 101.0], [30, 40, 41, 40])
+
+    assert seen.grown(0.25) == (100.0, 104.0, 40, 41)
 
 
 UNSEEN = re.compile(

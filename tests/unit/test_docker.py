@@ -1,8 +1,9 @@
 """The files in docker/ keep their promises: small, pinned, not root, and one service per instance.
 
-They are read, not run; `tests/equivalence/test_compose.py` runs the commands.
+They are read, not run; `tests/equivalence/test_compose.py` and `tests/mqtt/test_twin_compose.py` run the commands.
 """
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+import zenoh
 from dockerfile_parse import DockerfileParser
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +28,13 @@ def instructions() -> list[tuple[str, str]]:
 @pytest.fixture(scope="module")
 def compose() -> dict[str, Any]:
     loaded = yaml.safe_load((DOCKER / "compose.yaml").read_text(encoding="utf-8"))
+    assert isinstance(loaded, dict)
+    return loaded
+
+
+@pytest.fixture(scope="module")
+def twin() -> dict[str, Any]:
+    loaded = yaml.safe_load((DOCKER / "twin.compose.yaml").read_text(encoding="utf-8"))
     assert isinstance(loaded, dict)
     return loaded
 
@@ -143,8 +152,10 @@ def test_every_process_meets_the_others_at_the_router(compose: dict[str, Any], m
     assert port in compose["services"]["router"]["healthcheck"]["test"]
 
 
-def test_a_container_that_ended_stays_ended_and_is_stopped_within_seconds(compose: dict[str, Any]) -> None:
-    for service in compose["services"].values():
+def test_a_container_that_ended_stays_ended_and_is_stopped_within_seconds(
+    compose: dict[str, Any], twin: dict[str, Any]
+) -> None:
+    for service in (*compose["services"].values(), *twin["services"].values()):
         assert service["restart"] == "no"
         assert service["init"] is True
         assert int(service["stop_grace_period"].removesuffix("s")) <= 10
@@ -166,8 +177,48 @@ def test_nothing_is_open_to_the_network_of_the_host(compose: dict[str, Any]) -> 
         assert "network_mode" not in service
 
 
-def test_what_is_mounted_exists(compose: dict[str, Any]) -> None:
-    for service in compose["services"].values():
-        for volume in service.get("volumes", []):
-            source = volume.split(":")[0]
-            assert source in compose["volumes"] or (DOCKER / source).exists()
+def test_what_is_mounted_exists(compose: dict[str, Any], twin: dict[str, Any]) -> None:
+    for whole in (compose, twin):
+        for service in whole["services"].values():
+            for volume in service.get("volumes", []):
+                source = volume.split(":")[0]
+                assert source in whole["volumes"] or (DOCKER / source).exists()
+
+
+def test_the_ports_of_the_twin_are_published_for_its_host_only(twin: dict[str, Any]) -> None:
+    services = twin["services"]
+
+    assert services["bridge"]["ports"] == ["127.0.0.1:1883:1883", "127.0.0.1:8000:8000"]
+    assert [name for name, service in services.items() if "ports" in service] == ["bridge"]
+    assert [name for name, service in services.items() if service["networks"] != ["mesh"]] == ["bridge"]
+    assert twin["networks"]["mesh"] == {"internal": True}
+
+
+def test_router_and_image_of_the_twin_are_those_of_the_main_job(compose: dict[str, Any], twin: dict[str, Any]) -> None:
+    router = compose["services"]["router"]
+    version = router["image"].partition(":")[2]
+
+    assert {name: twin["services"]["router"][name] for name in ("image", "command", "healthcheck")} == {
+        name: router[name] for name in ("image", "command", "healthcheck")
+    }
+    assert twin["services"]["bridge"]["image"] == f"eclipse/zenoh-bridge-mqtt:{version}"
+    assert twin["services"]["twin"]["build"] == compose["services"]["master"]["build"]
+
+
+def test_the_bridge_in_docker_has_the_settings_of_the_one_outside() -> None:
+    inside = zenoh.Config.from_file(str(DOCKER / "twin_bridge.json5"))
+    outside = zenoh.Config.from_file(str(ROOT / "bridges" / "zenoh" / "config.json5"))
+
+    for key in (
+        "mode",
+        "connect/timeout_ms",
+        "connect/exit_on_failure",
+        "connect/retry",
+        "scouting",
+        "low_pass_filter",
+    ):
+        assert inside.get_json(key) == outside.get_json(key), key
+    assert json.loads(inside.get_json("plugins/mqtt")) == {"port": "0.0.0.0:1883"}
+    assert json.loads(inside.get_json("plugins/rest")) == {"http_port": "0.0.0.0:8000"}
+    assert json.loads(outside.get_json("plugins/mqtt")) == {"port": "127.0.0.1:1883"}
+    assert json.loads(outside.get_json("plugins/rest")) == {"http_port": "127.0.0.1:8000"}

@@ -93,6 +93,24 @@ def test_a_posted_action_ends_a_wait(both: Both) -> None:
         ran.clear()
 
 
+def test_an_action_posted_for_later_ends_no_step_and_no_wait_misses_it(both: Both) -> None:
+    """A step in C ends when the bell has rung."""
+    ran: list[int] = []
+    before = both.memory.seen()
+
+    both.inbox.post(lambda: ran.append(1), later=True)
+
+    assert both.memory.seen() == before
+    assert both.inbox.has_posted
+    began = time.monotonic()
+    assert both.inbox.wait(DEADLINE_S) is None
+    assert time.monotonic() - began < DEADLINE_S
+    assert ran == [1]
+    assert not both.inbox.has_posted
+    both.inbox.post(lambda: ran.append(2))
+    assert both.memory.seen() != before
+
+
 def test_an_action_posted_just_before_the_wait_is_not_missed(both: Both, monkeypatch: pytest.MonkeyPatch) -> None:
     both.inbox.receive_directly()
     ran: list[int] = []

@@ -18,8 +18,8 @@ from fmu_mesh.pictures.drawing import CYCLE_COLOURS
 from fmu_mesh.pictures.graph_drawing import Box, Drawing, GraphEdge, GraphNode, GraphVariable, drawing_of
 from fmu_mesh.pictures.graph_layout import Wire, arranged
 from fmu_mesh.pictures.system_graph import SystemGraph, graph_of
-from fmu_mesh.wire.views import InstanceStatus
-from tests.helpers import Place
+from fmu_mesh.wire.views import InstanceStatus, KeyStatus
+from tests.helpers import FMUS, Place
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SVG = "{http://www.w3.org/2000/svg}"
@@ -221,6 +221,62 @@ def test_the_picture_shows_the_state_of_each_instance_without_another_layout() -
     assert "failed" in texts
     assert [i.box for i in shapes_of(first).instances] == [i.box for i in shapes_of(second).instances]
     assert "running, 1k points/s, waits 25 %" in first.text()
+
+
+def with_keys() -> SystemGraph:
+    """A graph in which one key feeds two instances, and another one goes out and comes back."""
+    mesh = load(CONFIGS / "pendulum_delay.yaml")
+    mesh.disconnect("pendulum.a", "delay.x")
+    mesh.add("gain", fmu=FMUS / "Gain.fmu")
+    mesh.subscribe("plant/in", "delay.x", time="timestamp", delay=0.5)
+    mesh.subscribe("plant/in", "gain.u", encoding="text")
+    mesh.publish("delay.y", "twin/out", every=0.1)
+    mesh.subscribe("twin/out", "gain.k")
+    return mesh.graph()
+
+
+def boxes_of(graph: SystemGraph) -> dict[str | None, dict[str, str]]:
+    """The box of each instance and key in the SVG."""
+    root = ET.fromstring(graph.svg())  # noqa: S314  it was written here
+    groups = [group for group in root.iter(f"{SVG}g") if group.get("class") == "instance"]
+    return {group.get("data-instance"): dict(next(group.iter(f"{SVG}rect")).attrib) for group in groups}
+
+
+def test_keys_are_boxes_with_wires_to_what_they_feed() -> None:
+    graph = with_keys()
+    root = ET.fromstring(graph.svg())  # noqa: S314  it was written here
+    edges = [group for group in root.iter(f"{SVG}g") if group.get("class") == "edge"]
+
+    assert graph.title == "pendulum_delay: 3 instances in 3 processes, 0 connections, 4 keys"
+    assert {
+        (own.get("data-source"), own.get("data-target"), *(tip.text for tip in own.iter(f"{SVG}title")))
+        for own in edges
+    } == {
+        ("key plant/in", "delay", "key plant/in (auto) -> delay.x, at its timestamp, 0.5 s later"),
+        ("delay", "key twin/out", "delay.y -> key twin/out (json), every 50 points"),
+        ("key plant/in", "gain", "key plant/in (text) -> gain.u, on arrival"),
+        ("key twin/out", "gain", "key twin/out (auto) -> gain.k, on arrival"),
+    }
+    assert len(edges) == 4
+    assert sorted(map(str, boxes_of(graph))) == ["delay", "gain", "key plant/in", "key twin/out", "pendulum"]
+    assert "key  delay.y -> twin/out, json, every 50 points\n" in f"{graph.text()}\n"
+
+
+def test_the_picture_shows_what_came_by_keys_without_another_layout() -> None:
+    graph = with_keys()
+    first, *others = graph.keys
+    live = KeyStatus(**msgspec.structs.asdict(first), received=12, refused=3, lost=2, rate=4.0, age=0.5)
+    silent = KeyStatus(**msgspec.structs.asdict(first), received=12, rate=4.0, age=61.0)
+
+    def shown(status: KeyStatus) -> SystemGraph:
+        return graph.with_status({"delay": InstanceStatus("delay", "running", "", 1, 0.1, 0.0, 0.0, keys=(status,))})
+
+    assert first.instance == "delay"
+    assert shown(live).keys == (live, *others)
+    assert "4/s, 3 refused, 2 lost" in shown(live).text()
+    assert "4/s, silent for 61 s" in shown(silent).text()
+    assert "4/s, 3 refused, 2 lost" in shown(live).svg()
+    assert boxes_of(shown(live)) == boxes_of(shown(silent))
 
 
 def test_an_svg_names_its_instances_and_edges_and_escapes_names() -> None:

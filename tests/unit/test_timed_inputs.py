@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
 
 from fmu_mesh.errors import TerminationRequested
@@ -33,12 +35,20 @@ STEP_SIZE = 0.1
 class Steps:
     """A gain of 1 whose input is not connected, from second 1 on in steps of a tenth."""
 
-    def __init__(self, folder: Path, interpolation: Literal["hold", "linear"], *timeouts: InputTimeout) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        interpolation: Literal["hold", "linear"],
+        *timeouts: InputTimeout,
+        by_key: bool = False,
+        in_row: bool = False,
+    ) -> None:
         path = FMUS / "Gain.fmu"
         self.warnings: list[LogMessage] = []
         instance = Fmi2Instance(path, "gain", read_description(path), folder)
-        self.inputs = TimedInputs(instance, interpolation, {}, timeouts, self.warnings.append)
-        self.rings = Ring(Layout.of([]), 64), Ring(Layout.of([("y", "Float64")]), 64)
+        keys = {"u": interpolation == "linear"} if by_key else {}
+        self.inputs = TimedInputs(instance, interpolation, {}, timeouts, self.warnings.append, keys=keys)
+        self.rings = Ring(Layout.of([("u", "Float64")] if in_row else []), 1), Ring(Layout.of([("y", "Float64")]), 64)
         self.inputs.enter_initialization(1.0, None, {"u": 5.0})
         self.inputs.exit_initialization()
         self.step = 0
@@ -51,7 +61,8 @@ class Steps:
         for step in range(self.step, self.step + steps):
             self.inputs.do_step(step)
         self.step += steps
-        values: list[float] = self.rings[1].part("Float64")[self.step - steps + 1 : self.step + 1, 0].tolist()
+        rows = np.arange(self.step - steps + 1, self.step + 1) & self.rings[1].mask
+        values: list[float] = self.rings[1].part("Float64")[rows, 0].tolist()
         return values
 
 
@@ -115,6 +126,49 @@ def test_values_count_by_their_times_and_not_by_their_arrival(hold: Steps) -> No
     hold.inputs.add("u", 1.0, 1.1)
 
     assert hold.go(5) == [5.0, 1.0, 2.0, 3.0, 3.0]
+
+
+@pytest.mark.parametrize("interpolation", ["hold", "linear"])
+def test_values_of_a_key_are_those_that_each_step_would_set(
+    interpolation: Literal["hold", "linear"], tmp_path: Path
+) -> None:
+    """What has come for later steps is calculated ahead, for steps that Python does not take."""
+    numbers, ahead, late = random.Random(40), 0, 0  # noqa: S311  no secret
+    both = [Steps(tmp_path / str(in_row), interpolation, by_key=True, in_row=in_row) for in_row in (False, True)]
+    for steps in both:
+        steps.bind()
+
+    for _ in range(200):
+        now = both[0].step
+        for time in sorted(1.0 + STEP_SIZE * (now + numbers.uniform(-3, 30)) for _ in range(numbers.randrange(4))):
+            value = float(numbers.randrange(3))  # often the one before
+            for steps in both:
+                steps.inputs.add("u", value, time)
+        count = numbers.randrange(1, 12)
+        ahead += bool(both[1].inputs.tracks) and both[1].inputs.python_at > now
+        late += bool(both[1].inputs.tracks) and both[1].inputs.python_at == now
+        assert both[1].go(count) == both[0].go(count)
+
+    assert ahead > 20
+    assert late > 20
+    for steps in both:
+        steps.inputs.close()
+
+
+def test_a_value_for_later_does_not_end_what_was_calculated_ahead(tmp_path: Path) -> None:
+    steps = Steps(tmp_path, "hold", by_key=True, in_row=True)
+    steps.bind()
+    for number in range(20):
+        steps.inputs.add("u", float(number), 1.0 + number * STEP_SIZE)
+    steps.go(1)
+
+    steps.inputs.add("u", 20.0, 1.0 + 20 * STEP_SIZE)
+    assert (steps.inputs.tracks_from, steps.inputs.python_at) == (1, 19)
+    steps.inputs.add("u", -5.0, 1.0 + 5 * STEP_SIZE)
+
+    assert steps.inputs.python_at == 1
+    assert steps.go(21) == [*map(float, range(1, 5)), -5.0, *map(float, range(6, 21)), 20.0]
+    steps.inputs.close()
 
 
 def test_value_whose_time_is_past_holds_unless_later_one_is_in_use(hold: Steps) -> None:
@@ -219,6 +273,23 @@ def test_a_parameter_with_a_time_holds_from_it_and_otherwise_at_once(linear: Ste
         position.step = step + 1
         used += runner.instance.get_values(["y"])
     assert used == [10.0, 10.0, 10.0, 20.0, 20.0]  # a parameter does not change in between, as inputs do here
+
+
+def test_what_an_earlier_run_took_is_never_too_much(tmp_path: Path) -> None:
+    """That run may have forgotten past values some steps earlier."""
+    values = [("u", 0, 1.0 + number * 1e-4, float(number)) for number in range(70_000)]
+    path = FMUS / "Gain.fmu"
+    inputs = TimedInputs(Fmi2Instance(path, "gain", read_description(path), tmp_path), "hold", recorded=values)
+    ring = Ring(Layout.of([("y", "Float64")]), 4)
+    inputs.enter_initialization(1.0, None, {})
+    inputs.exit_initialization()
+    inputs.bind(Ring(Layout.of([]), 1), (ring,), TimeGrid(1.0, STEP_SIZE, 60), 1)
+
+    inputs.do_step(0)
+    inputs.do_step(1)
+
+    assert [ring.value(row, "y") for row in (1, 2)] == [0.0, 1000.0]
+    inputs.close()
 
 
 def test_an_instance_follows_times_from_the_first_value_with_one_on(tmp_path: Path) -> None:

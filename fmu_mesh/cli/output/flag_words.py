@@ -19,6 +19,8 @@ _FLAGS = {name: f"--{name}" for name in ("port", "ssd", "ssv", "start", "timeout
 _OPTION = re.compile(r"`(\w+)(?:=([^`]*))?`")
 _PLACE = re.compile(r"(?:(?<=: )|(?<=  )|(?<=\")|^)`(\w+=[^`]*)`(?=: |\"|$)", re.MULTILINE)
 """An option in the place of a path in a file, where the flag has no quotes."""
+_SUBSCRIBED = re.compile(r"^mesh\.subscribe\('([^']*)', '[^.']*\.([^']*)'\)(?=: |$)")
+_PUBLISHED = re.compile(r"^mesh\.publish\('[^.']*\.([^']*)', '([^']*)'\)(?=: |$)")
 _MAPPING = re.compile(r"\{'([^']*)': (.*)\}", re.DOTALL)
 
 
@@ -29,6 +31,7 @@ def in_flags(text: str) -> str:
         >>> in_flags("m.yaml: `start_values={'gain.k': 2.0}`: 2.0; expected a number, or `allow_code=True`")
         'm.yaml: --set gain.k=2: 2.0; expected a number, or `--allow-code`'
     """
+    text = _PUBLISHED.sub(r"--publish \1=\2", _SUBSCRIBED.sub(r"--subscribe \2=\1", text))
     text = _PLACE.sub(lambda found: _flag(*found[1].split("=", 1)) or found[0], text)
     return _OPTION.sub(lambda found: f"`{flag}`" if (flag := _flag(found[1], found[2])) else found[0], text)
 

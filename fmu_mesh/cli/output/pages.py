@@ -17,6 +17,7 @@ __all__ = [
     "instance_info",
     "instance_status",
     "instances",
+    "keys",
     "mesh_info",
     "mesh_status",
     "progress",
@@ -44,12 +45,19 @@ def variables(info: InstanceInfo) -> list[str]:
 
 
 def instances(statuses: Iterable[InstanceStatus]) -> list[str]:
-    """One line for each instance of a mesh."""
+    """One line for each instance of a mesh, and for each Zenoh key at an end of its connections."""
+    statuses = list(statuses)
     rows = [
         [s.instance, s.state, str(s.point), seconds(s.time), f"{1e6 * s.step_time:.3g} us", s.activity]
         for s in statuses
     ]
-    return table(rows, heading=["instance", "state", "point", "time", "step time", "activity"])
+    return [*table(rows, heading=["instance", "state", "point", "time", "step time", "activity"]), *keys(statuses)]
+
+
+def keys(statuses: Iterable[InstanceStatus]) -> list[str]:
+    """One line for each Zenoh key at an end of a connection, below an empty one; nothing without keys."""
+    rows = [own.cells for status in statuses for own in status.keys]
+    return ["", *table(rows, heading=["key", "encoding", "rule", "activity"])] if rows else []
 
 
 def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
@@ -105,6 +113,7 @@ def instance_status(status: InstanceStatus) -> list[str]:
             ("wait time", f"{status.wait_time:.3g} s"),
             ("overruns", str(status.overruns or "")),
             ("restarts", str(status.restarts or "")),
+            *(("key", "  ".join(own.cells)) for own in status.keys),
         ]
     )
 
@@ -154,6 +163,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("can", ", ".join(can)),
             ("node", f"{info.node}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(map(_connection, info.connections))),
+            *(("key", "  ".join(own.cells)) for own in info.keys),
             ("timeouts", ", ".join(f"{v.name}: {v.timeout}" for v in info.variables if v.timeout)),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
