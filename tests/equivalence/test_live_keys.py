@@ -127,8 +127,9 @@ def test_a_value_by_arrival_takes_effect_at_the_next_point(place: Place, endpoin
 
 
 def test_a_timestamp_counts_from_its_origin(place: Place, endpoint: str) -> None:
-    origin = time.time() - 0.5
-    config = keyed(place, endpoint, {"key": "plant/u", "to": "gain.u", "time": "timestamp", "origin": origin})
+    origin, stop_time = time.time() - 0.5, 2 * DEADLINE_S
+    entry = {"key": "plant/u", "to": "gain.u", "time": "timestamp", "origin": origin}
+    config = keyed(place, endpoint, entry, simulation={"stop_time": stop_time})
     sent: list[tuple[float, float]] = []
     with client(endpoint) as session, fmu_mesh.load(config).start(paused=True) as run:
         publisher = session.declare_publisher("plant/u", congestion_control=zenoh.CongestionControl.BLOCK)
@@ -149,7 +150,7 @@ def test_a_timestamp_counts_from_its_origin(place: Place, endpoint: str) -> None
         assert point == 0
         assert when == pytest.approx(at, abs=1e-6)  # seconds since 1970 have a resolution of 0.2 us
     expected, rows = [0.0], [(when or 0.0, value) for _, _, when, value in kept]
-    for step in range(200):
+    for step in range(round(stop_time / STEP_S)):
         past = [value for when, value in rows if when <= step * STEP_S + 1e-9]
         expected.append(past[-1] if past else 0.0)
     assert column(config, "gain.y") == expected

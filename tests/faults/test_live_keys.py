@@ -47,7 +47,7 @@ def endpoint(place: Place) -> Iterator[str]:
 class Live:
     """A gain of 1 with a key, in a mesh that runs in real time without an end; and what is said of it."""
 
-    def __init__(self, place: Place, endpoint: str, *entries: dict[str, Any], **sections: Any) -> None:  # noqa: ANN401
+    def __init__(self, place: Place, endpoint: str, *entries: dict[str, Any], **sections: Any) -> None:  # noqa: ANN401  as the file has it
         self.place, self.endpoint = place, endpoint
         self.result = place.folder / "live.csv"
         simulation = {"real_time_factor": 1, "stop_time": None, **sections.pop("simulation", {})}
@@ -193,7 +193,8 @@ def test_a_flood_neither_stops_the_run_nor_fills_its_memory(kind: str, place: Pl
                 assert keys["replaced"] > 0
         told = live.stop()
 
-    assert sizes[2] - sizes[0] < 16 * 2**20, sizes
+    # 65,536 samples of 0.6 kB may have waited at once; all that came since the first look would be 120 MB.
+    assert sizes[2] - sizes[0] < 48 * 2**20, sizes
     if kind == "arrival":
         assert len(key_lines(live.result)) == 3 * count - keys["replaced"]
     else:
@@ -353,7 +354,7 @@ def test_a_slow_reader_loses_what_may_be_dropped(place: Place, endpoint: str) ->
     result: Path = place.folder / "live.csv"
     with client(endpoint) as session:
         own = session.declare_subscriber("twin/y", zenoh.handlers.RingChannel(5))
-        next_of: Callable[[], int] = lambda: json.loads(own.recv().payload.to_bytes())["point"]  # noqa: E731
+        next_of: Callable[[], int] = lambda: json.loads(own.recv().payload.to_bytes())["point"]  # noqa: E731  a name for what is called twice
         first = next_of()
         before = row_count(result)
         wait_until(lambda: row_count(result) > before + 2000, "rows")

@@ -107,7 +107,7 @@ def bits(value: Value) -> object:
     """What two values must have alike to be the same in every bit; all NaN are one."""
     if isinstance(value, list):
         return [bits(element) for element in value]
-    return "NaN" if value != value else struct.pack("<d", value) if isinstance(value, float) else (type(value), value)  # noqa: PLR0124
+    return "NaN" if value != value else struct.pack("<d", value) if isinstance(value, float) else (type(value), value)  # noqa: PLR0124  NaN alone differs from itself
 
 
 def assert_comes_back(one: Variable, out: KeyOutput, into: KeyInput, sent: Callable[..., zenoh.Sample]) -> None:
@@ -131,7 +131,7 @@ def assert_comes_back(one: Variable, out: KeyOutput, into: KeyInput, sent: Calla
 @pytest.mark.parametrize("shape", [(), (3,), (2, 2)], ids=str)
 def test_every_value_that_is_written_comes_back(
     written: Any,  # noqa: ANN401  one of the encodings
-    read: Any,  # noqa: ANN401
+    read: Any,  # noqa: ANN401  as the file has it
     shape: tuple[int, ...],
     sent: Callable[..., zenoh.Sample],
 ) -> None:
