@@ -277,7 +277,7 @@ def test_values_that_are_lost_or_at_another_point_are_counted(column: list[float
     assert misplaced(column, first=2, count=3) == found
 
 
-def test_what_a_run_has_grown_is_seen_from_a_part_of_it_on() -> None:
+def test_growth_of_a_run_is_seen_from_a_part_of_it_on() -> None:
     seen = Watched([90.0, 100.0, 104.0, 101.0], [30, 40, 41, 40])
 
     assert seen.grown(0.25) == (100.0, 104.0, 40, 41)

@@ -93,7 +93,7 @@ def test_a_posted_action_ends_a_wait(both: Both) -> None:
         ran.clear()
 
 
-def test_an_action_posted_for_later_ends_no_step_and_no_wait_misses_it(both: Both) -> None:
+def test_an_action_posted_for_later_ends_no_step(both: Both) -> None:
     """A step in C ends when the bell has rung."""
     ran: list[int] = []
     before = both.memory.seen()
