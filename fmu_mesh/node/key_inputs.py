@@ -215,7 +215,11 @@ class KeyFeed:
                 text = (
                     f"the first value that came by {self.words} is for {when:.9g} s: the one for {first:.9g} s is lost"
                 )
-                raise MeshLost(text, **self._place(), hint="Start this run before its publisher.")
+                raise MeshLost(
+                    text,
+                    **self._place(),
+                    hint="Start this run before its publisher, or let that one wait (`congestion: block`).",
+                )
         step = set_input(self.runner, own.variable, value, when, more=True)
         self._used += 1
         if when is not None:

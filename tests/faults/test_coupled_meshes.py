@@ -51,8 +51,12 @@ def started(place: Place, endpoint: str, *, step_s: float, stop_time: float = EN
     }
     wait = {"time": "time", "wait": True}
     into_x, into_v = {"key": "pair/v", "to": "x.u", **wait}, {"key": "pair/x", "to": "v.u", "factor": -1.0, **wait}
-    left = written(place, "left", {"x": X}, [into_x, {"from": "x.y", "key": "pair/x"}], **sections)
-    right = written(place, "right", {"v": V}, [into_v, {"from": "v.y", "key": "pair/v"}], **sections)
+    left = written(
+        place, "left", {"x": X}, [into_x, {"from": "x.y", "key": "pair/x", "congestion": "block"}], **sections
+    )
+    right = written(
+        place, "right", {"v": V}, [into_v, {"from": "v.y", "key": "pair/v", "congestion": "block"}], **sections
+    )
     runs = [place.start("launch", config, "--no-progress") for config in (left, right)]
     for config in (left, right):
         wait_until(partial(has_rows, config.with_suffix(".csv")), f"50 rows of {config.stem}")
