@@ -10,7 +10,7 @@ gets its value is `fmu_mesh.node.inputs`, as for values that are set.
 # somebody else writes in one assignment.
 #
 # What may go wrong, and what then happens:
-# * A flood. On arrival only the newest value counts, and a step asks for it, so one is decoded at a point; of values
+# * A flood. On arrival only the newest value counts, and a step asks for it, so few are decoded at a point; of values
 #   with times `_MOST_WAITING` may wait, of `_MOST_BYTES` in all. What is more is counted and lost. The sender is never
 #   held back: it may be a stranger. `_take` returns after `_MOST_AT_ONCE` values, so steps go on.
 # * Silence. A step that waits ends with the deadline of a step. Else the input holds, or falls back (`timeout`).
@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from threading import Lock
 from typing import Any, Final
@@ -44,6 +44,9 @@ from .stepping import Runner
 __all__ = ["KeyFeed", "Patience"]
 
 _MOST_WAITING: Final = 1 << 16
+_NEWEST: Final = 16
+"""On arrival, the newest values that wait for a step: it uses the newest one that is a value."""
+
 _MOST_BYTES: Final = 1 << 27
 _MOST_AT_ONCE: Final = 64
 _MOST_BYTES_AT_ONCE: Final = 1 << 16
@@ -110,7 +113,7 @@ class KeyFeed:
         self._told: set[str] = set()
         self._shift: float | None = None  # simulation time minus that of the values
         self._newest: float | None = None
-        self._used = 0
+        self._used = self._tried = 0
         self._declared_at = time.monotonic()
         self._patience = Patience(runner)
 
@@ -120,18 +123,19 @@ class KeyFeed:
             self._last_at = time.monotonic()
             self._first_at = self._first_at or self._last_at
             self._received += 1
-            if self._only_newest:
-                with suppress(IndexError):  # the main thread takes them, at any moment
-                    self._came_bytes -= len(self._waiting.pop().payload)
-                    self._replaced += 1
             size = len(sample.payload)
-            is_full = self._came_bytes - self._taken_bytes + size > _MOST_BYTES or len(self._waiting) >= _MOST_WAITING
-            if is_full and self._waiting:
+            while self._only_newest and self._waiting and (len(self._waiting) >= _NEWEST or self._is_full(size)):
+                self._came_bytes -= len(self._waiting.popleft().payload)
+                self._replaced += 1
+            if self._waiting and self._is_full(size):
                 self._lost += 1
             else:
                 self._came_bytes += size
                 self._waiting.append(sample)
         self._post_take()
+
+    def _is_full(self, size: int) -> bool:
+        return self._came_bytes - self._taken_bytes + size > _MOST_BYTES or len(self._waiting) >= _MOST_WAITING
 
     def missed(self, miss: zenoh.ext.Miss) -> None:
         """On a thread of Zenoh: so many values of another mesh were lost on their way, and cannot be had again."""
@@ -156,7 +160,7 @@ class KeyFeed:
             self._inputs.expect(self.runner.step)
             self.runner.follow_inputs()
             return
-        self._use()
+        self._use(self._some())
         if (self._lost or self._counts.lost) and "lost" not in self._told:
             why = f"is lost: {_MOST_WAITING} wait for their points, or the link was cut for too long"
             self._say("lost", f"{why}. More are only counted")
@@ -170,15 +174,25 @@ class KeyFeed:
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
         self._posted = False
-        self._use()
+        with self._lock:
+            found = [*self._waiting]
+            self._waiting.clear()
+            self._came_bytes = 0
+        self._use(reversed(found))  # what is no value does not replace one
+        with self._lock:
+            self._replaced += max(0, len(found) - self._tried)
 
-    def _use(self) -> None:
-        """Let the first values take effect, each at its time."""
+    def _use(self, samples: Iterable[zenoh.Sample]) -> None:
+        """Let values take effect, each at its time; on arrival, the first that is one."""
         values: list[KeyValue] = []
         at = self.runner.point
-        for sample in self._some():
+        self._tried = 0
+        for sample in samples:
+            self._tried += 1
             try:
                 values.append(self._used_now(sample, at))
+                if self._only_newest:
+                    break
             except TooManyWait:
                 self._counts = replace(self._counts, lost=self._counts.lost + 1)
             except ValueRefused as refused:
@@ -279,7 +293,8 @@ class KeyFeed:
         rate = (received - 1) / took_s if took_s > 0.0 else 0.0
         age = time.monotonic() - self._last_at if received else None
         lost = self._counts.lost + self._lost
-        return replace(self._counts, received=received, replaced=self._replaced, lost=lost, rate=rate, age=age)
+        replaced = self._replaced + max(0, len(self._waiting) - 1 if self._only_newest else 0)
+        return replace(self._counts, received=received, replaced=replaced, lost=lost, rate=rate, age=age)
 
     def _say(self, what: str, text: str) -> None:
         """Warn once of each kind of trouble."""
