@@ -119,6 +119,34 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   int64_t outcome;   /* stage and status of a call that Python has to look at */
 } Member;
 
+/* ---- model exchange: see model_exchange.c */
+
+enum Solved { AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER }; /* what `equations_solve` returns */
+
+typedef struct { /* the equations of an FMU for model exchange, and their solver */
+  int64_t kind;
+  void *component;
+  void *set_time, *set_states, *get_states, *get_nominals, *get_derivatives, *get_indicators, *completed_step;
+  const Call *line; /* sets the inputs that change within a step; NULL: there are none */
+  const double *line_values, *line_slopes; /* at `line_start`, and in 1/s */
+  double line_start;
+  int64_t n_states, n_indicators;
+  double *states, *indicators; /* where the model is; `indicators`: before the next step */
+  double *weights;             /* absolute tolerances */
+  double *slopes;              /* of the seven stages, one after another */
+  double *ends, *stage, *sixth; /* the states at the end of a step, of a stage, and of the sixth stage */
+  double *first_indicators, *last_indicators, *next_indicators; /* at the ends of an interval, and within it */
+  double tolerance, longest;    /* relative; longest step in s */
+  double time;
+  double step_size;             /* of the next step in s; 0: not known yet */
+  int64_t is_new;               /* whether the model was changed, so that the slope of the first stage is not known */
+  int64_t tells;                /* whether the FMU learns of completed steps */
+  int64_t asks_event, asks_end; /* what it has said then */
+  int64_t status, function;     /* of a call that has failed, and which one: its place among those above */
+  int64_t steps, rejected;
+  int64_t stiff, not_stiff; /* steps in a row that were so; see `count_stiff` */
+} Equations;
+
 /* ---- streams: see streams.c */
 
 enum StreamState { OPEN, CUT, GAP, TWICE, LATE, REFUSED }; /* Stream.state */

@@ -32,6 +32,7 @@ __all__ = [
     "Call",
     "Change",
     "Entry",
+    "EquationsTable",
     "Gate",
     "HeardTable",
     "IncomingTable",
@@ -48,6 +49,7 @@ __all__ = [
     "Piece",
     "RowBase",
     "Said",
+    "Solved",
     "Span",
     "Stage",
     "StepKind",
@@ -113,6 +115,12 @@ class BurstEnd(IntEnum):
     """Why `node_run` returned."""
 
     SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE = range(8)
+
+
+class Solved(IntEnum):
+    """What `equations_solve` returned."""
+
+    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER = range(5)
 
 
 NUMBER_TYPES: Final[dict[VariableType, int]] = {
@@ -266,6 +274,11 @@ class _WithArrays(Structure):
             setattr(self, f"n_{name}", len(items))
 
 
+@_declared("Equations")
+class EquationsTable(_WithArrays):
+    """The equations of a model-exchange FMU, and their solver."""
+
+
 @_declared("Member")
 class MemberTable(_WithArrays):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
@@ -415,6 +428,8 @@ class _Library:
         self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
         self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
         self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
+        self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
+        self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
         self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
         self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))

@@ -8,13 +8,12 @@ event. The way from one communication point to the next is
 
 from __future__ import annotations
 
-import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from fmpy.fmi1 import FMICallException, FMU1Model
+from fmpy.fmi1 import FMU1Model
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
@@ -22,13 +21,13 @@ from numpy.typing import NDArray
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
-from ..calls import cffi_function, memory
+from ...contract import LogMessage
+from ..calls import cffi_function
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping, FmuInstance
-from ..fmu_values import WARNING
 from ..loaded_fmu import FmuFunctions
-from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
+from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
 
 __all__ = ["ContinuousInstance", "Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
@@ -60,6 +59,7 @@ class ContinuousInstance(FmuInstance):
     """The columns of the other ones among those of type Float64."""
     _slopes: Mapping[str, float] = {}
     _goes_on = False  # whether the linear inputs begin where the last step has left them
+    _is_doubted = False  # whether the solver has told that another one would be better
     _time_of_start = 0.0
     _stop_time = math.inf
 
@@ -76,6 +76,7 @@ class ContinuousInstance(FmuInstance):
         self._checked(lambda: self._take_inputs(step, self._time_of(step)))
         self._advance(self._time_of(step + 1))
         self._said.note(step=step + 1)
+        self._tell_doubt()
         self._read_outputs(step + 1)
 
     def advance(self, time: float, step_size: float) -> None:
@@ -131,6 +132,7 @@ class ContinuousInstance(FmuInstance):
             next_event if math.isfinite(next_event) else None,
             self._row,
             self._clocks.place,
+            solver=loop.solver.place,
         )
 
     def _restore(self, kept: Bookkeeping) -> None:
@@ -138,7 +140,10 @@ class ContinuousInstance(FmuInstance):
         self._row = kept.row
         self._clocks.resume(kept.ticks)
         next_event = math.inf if kept.next_event is None else kept.next_event
-        self._checked(lambda: (self._loop or self._make_loop()).resume(kept.time or 0.0, next_event))
+        loop = self._loop or self._make_loop()
+        loop.solver.resume(kept.solver)
+        self._is_doubted = loop.solver.doubt() is not None
+        self._checked(lambda: loop.resume(kept.time or 0.0, next_event))
 
     def _make_loop(self) -> EventLoop:
         self._loop = EventLoop(
@@ -161,6 +166,12 @@ class ContinuousInstance(FmuInstance):
         loop = self._event_loop()
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
             raise self._end_requested()
+
+    def _tell_doubt(self) -> None:
+        """Tell once that another solver would be better."""
+        if not self._is_doubted and (doubt := self._event_loop().solver.doubt()) is not None:
+            self._is_doubted = True
+            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step))
 
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.
@@ -190,29 +201,18 @@ class ContinuousInstance(FmuInstance):
             held.append(values.tolist() if row.dtype.hasobject else values.tobytes())
         return tuple(held)
 
-    def _line(self, slot: int, start: float) -> Callable[[float], None] | None:
-        """Sets the linear inputs at a time within the step that starts at ``start`` (s); None if there are none."""
+    def _line(self, slot: int, start: float) -> InputLine | None:
+        """The linear inputs within the step that starts at ``start`` (s); None if there are none."""
         slopes = self._slopes
         if not slopes:
             return None
         assert self._inputs is not None
-        count = len(slopes)
-        variables = [self._variables[name] for name in slopes]
-        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
-        values = (ctypes.c_double * count)()
         functions = self._functions.values
         function = cffi_function(self._function("Set", "Float64"), functions.declaration)
-        arguments = [self._self, memory(references), count, memory(values), *([count] if functions.sized else [])]
-        at_start = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
-        pairs = list(zip(at_start, slopes.values(), strict=True))
-
-        def set_inputs(time: float) -> None:
-            values[:] = [value + (time - start) * slope for value, slope in pairs]
-            status = function(*arguments)
-            if status > WARNING:
-                raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
-
-        return set_inputs
+        setter = InputSetter(function, self._function_name("Set", "Float64"), self._self, functions.sized)
+        begins = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
+        references = [self._variables[name].value_reference for name in slopes]
+        return InputLine(setter, references, start, begins, [*slopes.values()])
 
 
 class Fmi1ModelInstance(ContinuousInstance, Fmi1):

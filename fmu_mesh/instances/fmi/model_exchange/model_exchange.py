@@ -23,8 +23,9 @@ from ....simtime import resolvable
 from ..clocks import EVENT_ITERATIONS, NO_CLOCKS, Clocks
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
-from .model_calls import ModelCalls
-from .solver import make_solver
+from .dormand_prince import DormandPrinceSolver
+from .model_calls import InputLine, ModelCalls
+from .solver import CVodeSolver, EulerSolver, Solver
 
 __all__ = ["EventLoop"]
 
@@ -60,7 +61,7 @@ class EventLoop:
         self._next_event = math.inf
         self._event_time = -math.inf
         self._events_there = 0
-        self._solver = make_solver(settings, calls)
+        self.solver = _solver_for(settings, calls, tells=tell_completed_steps)
 
     def start(self, time: float) -> None:
         """Handle the first event at ``time`` (s), in event mode after Initialization Mode."""
@@ -73,7 +74,7 @@ class EventLoop:
         set_values()
         self._update()
 
-    def set_inputs(self, set_values: Callable[[], None], line: Callable[[float], None] | None) -> None:
+    def set_inputs(self, set_values: Callable[[], None], line: InputLine | None) -> None:
         """Set inputs as an `event` at the start of a step.
 
         ``line`` sets the inputs that change within the step, at a time in s; None if all are constant.
@@ -82,7 +83,7 @@ class EventLoop:
         self.event(set_values)
         self._calls.follow(line)
 
-    def follow(self, line: Callable[[float], None]) -> None:
+    def follow(self, line: InputLine) -> None:
         """Continue with inputs that change continuously: no event, and the solver goes on (FMI 2.0, 3.2.1).
 
         If the small jump of an extrapolated input takes an event indicator over 0, that is an `event`.
@@ -116,22 +117,22 @@ class EventLoop:
 
     def restart(self) -> None:
         """Let the solver start anew here."""
-        self._solver.restart()
+        self.solver.restart()
 
     def close(self) -> None:
         """Free the solver."""
-        self._solver.close()
+        self.solver.close()
 
     def _advance_once(self, end: float) -> None:
         """One solver step, and the events at its end."""
         target = min(end, self._next_event)
         event = False
         if resolvable(self._time, target):
-            self._time, event = self._solver.step(self._time, target)
+            self._time, event = self.solver.step(self._time, target)
             if self._calls.n_states == 0:
                 self._calls.set_time(self._time)
             if self._tell:
-                step_event, self.terminated = self._calls.completed_step()
+                step_event, self.terminated = self.solver.complete()
                 event = event or step_event
         if not resolvable(self._time, self._next_event):
             event = True
@@ -165,4 +166,15 @@ class EventLoop:
         if not self.terminated:
             self._next_event = min(info.next_event, self._clocks.next_tick)
             self._calls.enter_continuous_time_mode()
-            self._solver.restart()
+            self.solver.restart()
+
+
+def _solver_for(settings: SolverSettings, equations: ModelCalls, *, tells: bool) -> Solver:
+    """The solver for these settings; one that does nothing for a model without states and event indicators."""
+    if settings.name == "dopri5":
+        return DormandPrinceSolver(equations, settings, tells=tells)
+    if equations.n_states == 0 and equations.n_indicators == 0:
+        return Solver(equations)
+    if settings.name == "euler":
+        return EulerSolver(equations, settings.maximum_step_size)
+    return CVodeSolver(equations, settings.relative_tolerance, settings.maximum_step_size)

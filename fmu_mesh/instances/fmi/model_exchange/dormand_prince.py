@@ -1,0 +1,126 @@
+"""The method of Dormand and Prince of order 5(4), whose steps are taken by the library of C (`rings/model_exchange.c`).
+
+Owns the memory of the library, and what its results mean. The method has no history, so an input that jumps costs one
+evaluation, and a state keeps little more than the step size.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Final
+
+import numpy as np
+from fmpy.fmi1 import FMICallException
+
+from ....rings import native
+from ....rings.library import why_no_library
+from ....rings.native import EquationsTable, Solved
+from ..fmu_values import SolverFailed
+from ..step_options import SolverSettings
+from .model_calls import ModelCalls
+from .solver import Solver
+
+__all__ = ["DormandPrinceSolver"]
+
+_IS_STIFF: Final = 15
+"""So many steps in a row at the limit of stability, with few others between them (`count_stiff`)."""
+
+_GIVEN_UP: Final = {Solved.TOO_SMALL: "makes no progress", Solved.NOT_A_NUMBER: "cannot go on"}
+
+_DOUBLES: Final = ctypes.POINTER(ctypes.c_double)
+
+
+class DormandPrinceSolver(Solver):
+    """Variable steps of order 5, events on an interpolant of order 4; no step goes beyond ``stop``.
+
+    One `step` takes steps until ``stop``, an event, or a completed step after which the FMU asks for something; if it
+    ``tells`` the FMU of completed steps, it learns of each.
+    """
+
+    def __init__(self, equations: ModelCalls, settings: SolverSettings, *, tells: bool) -> None:
+        super().__init__(equations)
+        if native.library is None:
+            raise SolverFailed(f"it needs the library of C, which is {why_no_library()}")
+        self._library = native.library
+        n, m = equations.n_states, equations.n_indicators
+        functions, self._names = equations.table()
+        self._line = equations.line
+        self._memory = np.zeros(12 * n + 4 * m)
+        at = self._memory.ctypes.data
+        states = [at + 8 * n * number for number in range(12)]
+        indicators = [at + 8 * (12 * n + m * number) for number in range(4)]
+        self._address = states[0]
+        self.table = EquationsTable(
+            n_states=n,
+            n_indicators=m,
+            states=ctypes.cast(states[0], _DOUBLES),
+            weights=states[1],
+            ends=states[2],
+            stage=states[3],
+            sixth=states[4],
+            slopes=states[5],
+            indicators=ctypes.cast(indicators[0], _DOUBLES),
+            first_indicators=indicators[1],
+            last_indicators=indicators[2],
+            next_indicators=indicators[3],
+            tolerance=settings.relative_tolerance,
+            longest=settings.maximum_step_size or np.inf,
+            tells=tells,
+            **functions,
+        )
+
+    @property
+    def place(self) -> tuple[float, ...]:
+        """See `Solver.place`."""
+        own = self.table
+        return own.step_size, own.steps, own.rejected, own.stiff, own.not_stiff
+
+    def resume(self, place: tuple[float, ...]) -> None:
+        """See `Solver.resume`."""
+        own = self.table
+        if not place:  # the state is that of another solver
+            return
+        own.step_size = place[0]
+        own.steps, own.rejected, own.stiff, own.not_stiff = map(int, place[1:])
+
+    def doubt(self) -> str | None:
+        """See `Solver.doubt`."""
+        if self.table.stiff < _IS_STIFF:
+            return None
+        return (
+            f"the model is stiff: stability keeps the steps of dopri5 at {self.table.step_size:.2g} s, and not its "
+            "tolerance. `solver: {name: cvode}` takes longer ones"
+        )
+
+    def restart(self) -> None:
+        """See `Solver.restart`."""
+        if self._library.equations_restart(ctypes.addressof(self.table)):
+            raise self._failure()
+
+    def step(self, time: float, stop: float) -> tuple[float, bool]:
+        """See `Solver.step`."""
+        own = self.table
+        own.time = time
+        self._follow()
+        result = self._library.equations_solve(ctypes.addressof(own), stop)
+        if result == Solved.FAILED:
+            raise self._failure()
+        if result in _GIVEN_UP:
+            self._give_up(f"dopri5 {_GIVEN_UP[result]} at t = {own.time:.12g} s", own.time, self._address)
+        return own.time, result == Solved.AT_EVENT
+
+    def complete(self) -> tuple[bool, bool]:
+        """See `Solver.complete`; `step` has told the FMU."""
+        return bool(self.table.asks_event), bool(self.table.asks_end)
+
+    def _follow(self) -> None:
+        """Let the library set the linear inputs of this step; they are other ones than before."""
+        line, own = self._equations.line, self.table
+        if line is not self._line:
+            self._line, own.is_new = line, True
+            for name, value in (line.table() if line is not None else {"line": None}).items():
+                setattr(own, name, value)
+
+    def _failure(self) -> FMICallException:
+        names = [*self._names, self._line.name] if self._line is not None else self._names
+        return FMICallException(function=names[self.table.function], status=self.table.status)
