@@ -37,7 +37,7 @@ def systems(
         "fast": {"fmu": "Integrator", "start_values": {"y": 1.0}},
         "delayed": {"fmu": "TransportDelay", "start_values": {"d": 0.055}, "step_size": 2 * H},
         "sum": {"fmu": "Adder"},
-        "oscillator": {"fmu": str(event_fmu("Oscillator", 2)), "kind": "model_exchange", "solver": {"name": "euler"}},
+        "oscillator": {"fmu": str(event_fmu("Oscillator", 2)), "kind": "model_exchange", "solver": {"name": "dopri5"}},
         "stairs": {"fmu": str(event_fmu("Stairs", 3)), "start_values": {"period": 0.07}},
         "free": {"fmu": "Gain"},
         "pid": {"controller": "position_pid", "start_values": {"p": 3.0, "i": 2.0}},

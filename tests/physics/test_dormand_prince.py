@@ -1,0 +1,128 @@
+"""The solver `dopri5` against solutions on paper, and what it says of a model that it does not suit."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmu_mesh.instances.contract import LogMessage
+from fmu_mesh.instances.fmi.archive.reading import read_description
+from fmu_mesh.instances.fmi.opening import open_instance
+from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
+from fmu_mesh.rings import native
+from fmu_mesh.rings.ring import Ring
+from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.layout import Layout
+from tests.fmus.event_fmus import Version
+from tests.physics.test_changing_inputs import FLOOR, Driven, driven, sine
+
+pytestmark = pytest.mark.skipif(native.library is None, reason="the library with the solver is not built here")
+
+EventFmu = Callable[..., Path]
+HARMONIC = Driven("Oscillator", "u", ("x", "y"), {"mu": 0.0}, 10.0)
+
+
+def error_of(rows: list[list[float]], exact: list[tuple[float, float]]) -> float:
+    return float(np.max(np.abs(np.subtract(rows, exact))))
+
+
+def free(step_size: float, points: int) -> list[tuple[float, float]]:
+    """The harmonic oscillator from x = 2 at rest, without a force, after each step."""
+    times = [step_size * point for point in range(1, points + 1)]
+    return [(2.0 * math.cos(time), -2.0 * math.sin(time)) for time in times]
+
+
+def held(values: list[float], step_size: float) -> list[tuple[float, float]]:
+    """The same with a force that is held within each step: a turn around the point (u, 0)."""
+    x, y, found = 2.0, 0.0, []
+    cosine, sine_of_step = math.cos(step_size), math.sin(step_size)
+    for u in values[:-1]:
+        x, y = u + (x - u) * cosine + y * sine_of_step, y * cosine - (x - u) * sine_of_step
+        found.append((x, y))
+    return found
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8, 1e-10])
+def test_an_oscillator_is_as_exact_as_its_tolerance(
+    tolerance: float, version: Version, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    settings = SolverSettings("dopri5", tolerance)
+
+    rows = driven(event_fmu("Oscillator", version), tmp_path, HARMONIC, [0.0] * 11, 1.0, "hold", solver=settings)
+
+    assert error_of(rows, free(1.0, 10)) <= FLOOR * tolerance  # type: ignore[arg-type]  # two floats a row
+
+
+def test_half_the_step_has_a_32nd_of_the_error(event_fmu: EventFmu, tmp_path: Path) -> None:
+    """With a tolerance that allows everything, the steps are those between the points."""
+    fmu, errors = event_fmu("Oscillator", 2), []
+    for points in (32, 64, 128):
+        settings = SolverSettings("dopri5", 1e3)
+        rows = driven(fmu, tmp_path, HARMONIC, [0.0] * (points + 1), 8.0 / points, "hold", solver=settings)
+        errors.append(error_of(rows[-1:], free(8.0 / points, points)[-1:]))  # type: ignore[arg-type]  # as above
+
+    orders = [math.log2(before / after) for before, after in itertools.pairwise(errors)]
+    assert all(4.8 <= order <= 5.5 for order in orders), orders
+
+
+@pytest.mark.parametrize("step_size", [0.1, 0.01, 0.001])
+def test_held_inputs_that_jump_at_each_point_cost_no_accuracy(
+    step_size: float, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    fmu, values = event_fmu("Oscillator", 2), sine(4.0, step_size)
+    errors = {}
+    for name in ("cvode", "dopri5"):
+        rows = driven(fmu, tmp_path, HARMONIC, values, step_size, "hold", solver=SolverSettings(name, 1e-6))  # type: ignore[arg-type]  # one of the names
+        errors[name] = error_of(rows, held(values, step_size))  # type: ignore[arg-type]  # two floats a row
+
+    assert errors["dopri5"] <= 1e-6
+    assert errors["dopri5"] <= 0.1 * errors["cvode"]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_each_held_step_costs_seven_evaluations(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+    """Six of a step, and one of the new input; the oscillator counts the steps that are completed."""
+    system = Driven("Oscillator", "u", ("x",), {"mu": 0.0}, 1.0)
+    options = StepOptions(SolverSettings("dopri5"))
+    fmu = event_fmu("Oscillator", version)
+    with closing(open_instance(fmu, "m", read_description(fmu, kind="model_exchange"), tmp_path, options=options)) as m:
+        m.enter_initialization(0.0, None, system.start_values)
+        m.exit_initialization()
+        inputs, outputs = (Ring(Layout.of([(name, "Float64")]), 1) for name in ("u", "x"))
+        m.bind(inputs, (outputs,), TimeGrid(0.0, 0.01, 100), 1)
+        counts = []
+        for step in range(100):
+            inputs.put(0, "u", math.sin(0.01 * step))
+            m.do_step(step)
+            counts += m.get_values(["completed_steps"])
+
+    # The first step size is that of an algorithm; from then on a step between two points is one of the solver.
+    assert {later - before for before, later in itertools.pairwise(counts[2:])} == {1}  # type: ignore[operator]  # integers
+
+
+def test_a_stiff_model_is_told_once_and_solved(event_fmu: EventFmu, tmp_path: Path) -> None:
+    messages: list[LogMessage] = []
+    options = StepOptions(SolverSettings("dopri5"))
+    fmu = event_fmu("Winding", 2)
+    description = read_description(fmu, kind="model_exchange")
+    with closing(open_instance(fmu, "m", description, tmp_path, messages.append, options=options)) as winding:
+        winding.enter_initialization(0.0, None, {"U": 1.0, "w": 2.0, "L": 1e-4})
+        winding.exit_initialization()
+        rings = Ring(Layout.of([("U", "Float64")]), 1), (Ring(Layout.of([("I", "Float64")]), 1),)
+        rings[0].put(0, "U", 1.0)
+        winding.bind(*rings, TimeGrid(0.0, 0.1, 10), 1)
+        for step in range(10):
+            winding.do_step(step)
+        current = winding.get_values(["I"])
+
+    assert current == [pytest.approx(1.0 - 0.1 * 2.0, abs=1e-5)]
+    [told] = [message for message in messages if message.category == "solver"]
+    assert "the model is stiff" in told.message
+    assert "`solver: {name: cvode}`" in told.message
