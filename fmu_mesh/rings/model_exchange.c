@@ -23,8 +23,9 @@
 #define PUBLIC __attribute__((visibility("default")))
 
 enum { WARNING = 1, DISCARD = 2, MISSING = 999 }; /* statuses */
-enum { SET_TIME, SET_STATES, GET_STATES, GET_NOMINALS, GET_DERIVATIVES, GET_INDICATORS, COMPLETED_STEP, SET_LINE };
-enum { STAGES = 7, ENOUGH = 40 };
+enum { SET_TIME, SET_STATES, GET_STATES, GET_NOMINALS, GET_DERIVATIVES, GET_INDICATORS, COMPLETED_STEP, ENTER_EVENT_MODE };
+enum { UPDATE_DISCRETE_STATES = ENTER_EVENT_MODE + 1, ENTER_CONTINUOUS_TIME_MODE, SET }; /* functions in their order */
+enum { STAGES = 7, ENOUGH = 40, STIFF = 15, UPDATES = 1000, LOOK = 102 };
 
 static const double EPSILON = 0x1p-52;
 static const double SAFETY = 0.9, LEAST = 0.2, MOST = 10.0;
@@ -92,18 +93,20 @@ static inline int call_array(Equations *own, int function, void *called, double 
   return n == 0 ? 0 : checked(own, function, ((Array)called)(own->component, values, (size_t)n));
 }
 
+static int set(Equations *own, const Call *call) {
+  void *values = (void *)(intptr_t)call->values, *component = own->component;
+  const size_t n = (size_t)call->count, size = (size_t)call->size;
+  typedef int (*Set)(void *, const void *, size_t, void *);
+  typedef int (*SetSized)(void *, const void *, size_t, void *, size_t);
+  if (call->size < 0) return checked(own, SET, ((Set)call->function)(component, call->references, n, values));
+  return checked(own, SET, ((SetSized)call->function)(component, call->references, n, values, size));
+}
+
 static int set_line(Equations *own, double time) {
-  const Call *line = own->line;
-  double *values = (double *)(intptr_t)line->values;
-  for (int64_t i = 0; i < line->count; i++)
+  double *values = (double *)(intptr_t)own->line->values;
+  for (int64_t i = 0; i < own->line->count; i++)
     values[i] = own->line_values[i] + (time - own->line_start) * own->line_slopes[i];
-  const size_t n = (size_t)line->count;
-  return checked(
-      own, SET_LINE,
-      line->size < 0
-          ? ((int (*)(void *, const void *, size_t, void *))line->function)(own->component, line->references, n, values)
-          : ((int (*)(void *, const void *, size_t, void *, size_t))line->function)(
-                own->component, line->references, n, values, (size_t)line->size));
+  return set(own, own->line);
 }
 
 /* Put the model at a time, at these states and at the inputs of this time. */
@@ -204,7 +207,7 @@ static int guess(Equations *own, double stop) {
   return 0;
 }
 
-/* Steps whose size is at the limit of stability: 15 of them without 6 others in a row, and the system is stiff. */
+/* Steps whose size is at the limit of stability: STIFF of them without 6 others in a row. */
 static void count_stiff(Equations *own, double h) {
   const int64_t n = own->n_states;
   double of_slopes = 0.0, of_states = 0.0;
@@ -216,7 +219,7 @@ static void count_stiff(Equations *own, double h) {
   if (of_states > 0.0 && h * h * of_slopes > 3.25 * 3.25 * of_states) {
     own->not_stiff = 0;
     own->stiff++;
-  } else if (own->stiff < 15 && ++own->not_stiff == 6) {
+  } else if (own->stiff < STIFF && ++own->not_stiff == 6) {
     own->stiff = own->not_stiff = 0;
   }
 }
@@ -366,4 +369,71 @@ PUBLIC int64_t equations_solve(Equations *own, double stop) {
     if (event || own->asks_event || own->asks_end) return AT_EVENT;
     if (own->time >= stop) return AT_STOP;
   }
+}
+
+/* ---- a step of a node */
+
+/* One event iteration, in event mode. */
+static int update(Equations *own, int *again, int *ends) {
+  void *component = own->component, *function = own->update_discrete_states;
+  int status, is_defined;
+  double next = 0.0;
+  if (own->kind == FMI1) {
+    struct { char converged, references, values, terminate, upcoming; double next; } info = {0};
+    status = ((int (*)(void *, char, void *))function)(component, 0, &info);
+    *again = !info.converged, *ends = info.terminate, is_defined = info.upcoming, next = info.next;
+  } else if (own->kind == FMI2) {
+    struct { int again, terminate, nominals, values, is_defined; double next; } info = {0};
+    status = ((int (*)(void *, void *))function)(component, &info);
+    *again = info.again, *ends = info.terminate, is_defined = info.is_defined, next = info.next;
+  } else {
+    typedef int (*Update)(void *, _Bool *, _Bool *, _Bool *, _Bool *, _Bool *, double *);
+    _Bool said[5] = {0};
+    status = ((Update)function)(component, &said[0], &said[1], &said[2], &said[3], &said[4], &next);
+    *again = said[0], *ends = said[1], is_defined = said[4];
+  }
+  own->next_event = is_defined ? next : __builtin_inf();
+  return checked(own, UPDATE_DISCRETE_STATES, status);
+}
+
+static int call_mode(Equations *own, int function, void *called) {
+  return own->kind == FMI1 ? 0 : checked(own, function, ((int (*)(void *))called)(own->component));
+}
+
+/* Set held inputs that have changed: that is an event (FMI 2.0, 3.1). */
+static int set_held(Equations *own) {
+  int again, ends;
+  if (call_mode(own, ENTER_EVENT_MODE, own->enter_event_mode)) return FAILED;
+  for (own->call = 0; own->call < own->n_setters; own->call++)
+    if (set(own, &own->setters[own->call])) return FAILED;
+  for (int i = 0; i < UPDATES; i++) {
+    if (update(own, &again, &ends)) return FAILED;
+    if (ends) return ENDS;
+    if (again) continue;
+    if (call_mode(own, ENTER_CONTINUOUS_TIME_MODE, own->enter_continuous_time_mode)) return FAILED;
+    return equations_restart(own) ? FAILED : AT_STOP;
+  }
+  return UNSETTLED;
+}
+
+/* Whether a time is later by more than rounding, as `resolvable` in simtime.py, or a little more. */
+static inline int is_later(double later, double time) {
+  return later - time > 16.0 * EPSILON * greater(size_of(later), size_of(time)) || later == __builtin_inf();
+}
+
+/* A step up to `end` with the inputs of the row. Returns 0, or LOOK: then Python looks at the result and takes the rest. */
+int equations_step(Equations *own, double end) {
+  own->result = GO_ON;
+  own->call = own->n_setters;
+  if (own->terminated) return LOOK;
+  if (own->row_bytes > 0 && (!own->is_held || memcmp(own->held, own->row, (size_t)own->row_bytes) != 0)) {
+    memcpy(own->held, own->row, (size_t)own->row_bytes);
+    own->is_held = 1;
+    if ((own->result = set_held(own)) != AT_STOP) return LOOK;
+  }
+  own->result = GO_ON;
+  if (!is_later(end, own->time) || !is_later(own->next_event, end)) return LOOK;
+  own->result = equations_solve(own, end);
+  if (own->result == AT_STOP && own->stiff >= STIFF && !own->doubted) own->result = GO_ON;
+  return own->result == AT_STOP ? 0 : LOOK;
 }

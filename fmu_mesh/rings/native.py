@@ -78,7 +78,7 @@ WRONG_ROW: Final = 101
 class StepKind(IntEnum):
     """How a member takes its step."""
 
-    BY_PYTHON, FMI1, FMI2, FMI3 = range(4)
+    BY_PYTHON, FMI1, FMI2, FMI3, EQUATIONS = range(5)
 
 
 class Stage(IntEnum):
@@ -118,9 +118,9 @@ class BurstEnd(IntEnum):
 
 
 class Solved(IntEnum):
-    """What `equations_solve` returned."""
+    """Why the steps of a model-exchange FMU have ended."""
 
-    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER = range(5)
+    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON = range(8)
 
 
 NUMBER_TYPES: Final[dict[VariableType, int]] = {
@@ -277,6 +277,15 @@ class _WithArrays(Structure):
 @_declared("Equations")
 class EquationsTable(_WithArrays):
     """The equations of a model-exchange FMU, and their solver."""
+
+    time: float
+    next_event: float
+    terminated: bool
+
+    def note(self, **changed: float) -> None:
+        """Say where the model is; see `Place`."""
+        for name, value in changed.items():
+            setattr(self, name, value)
 
 
 @_declared("Member")

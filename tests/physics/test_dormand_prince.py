@@ -87,8 +87,8 @@ def test_held_inputs_that_jump_at_each_point_cost_no_accuracy(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_each_held_step_costs_seven_evaluations(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
-    """Six of a step, and one of the new input; the oscillator counts the steps that are completed."""
+def test_each_held_step_is_one_step_of_the_solver(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+    """So it costs seven evaluations: six, and one of the new input. The oscillator counts the completed steps."""
     system = Driven("Oscillator", "u", ("x",), {"mu": 0.0}, 1.0)
     options = StepOptions(SolverSettings("dopri5"))
     fmu = event_fmu("Oscillator", version)

@@ -8,6 +8,7 @@ event. The way from one communication point to the next is
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,6 +19,7 @@ from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
 
+from ....rings.native import NativeStep, Solved, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
@@ -25,14 +27,14 @@ from ...contract import LogMessage
 from ..calls import cffi_function
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
-from ..fmu_instance import Bookkeeping, FmuInstance
+from ..fmu_instance import Bookkeeping
 from ..loaded_fmu import FmuFunctions
+from ..native_instance import NativeInstance
+from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes
 from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
 
 __all__ = ["ContinuousInstance", "Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
-
-_RowBytes = tuple[bytes | list[Any], ...]
 
 _NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
 _NEEDED_1 = "fmiInstantiateModel", "fmiSetTime", "fmiInitialize", "fmiEventUpdate"
@@ -46,20 +48,21 @@ _NEEDED_3 = (
 )
 
 
-class ContinuousInstance(FmuInstance):
+class ContinuousInstance(NativeInstance):
     """The part of model exchange that all versions share; to be named before the base class of the version."""
 
     _calls: type[ModelCalls] = ModelCalls  # those of this version
 
+    _kind = StepKind.EQUATIONS
+    _solver_in_c: DormandPrinceSolver | None = None  # the solver, if the library takes complete steps
+
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
     _clocks: Clocks = NO_CLOCKS
-    _row: _RowBytes = ()  # the inputs of the last step that are held
     _linear_columns: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
     """The columns of the other ones among those of type Float64."""
     _slopes: Mapping[str, float] = {}
     _goes_on = False  # whether the linear inputs begin where the last step has left them
-    _is_doubted = False  # whether the solver has told that another one would be better
     _time_of_start = 0.0
     _stop_time = math.inf
 
@@ -70,14 +73,6 @@ class ContinuousInstance(FmuInstance):
         self._solver = f"solver {self._options.solver.name}: "
         self._time_of_start, self._stop_time = start_time, math.inf if stop_time is None else stop_time
         super().enter_initialization(start_time, stop_time, start_values)
-
-    def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        self._checked(lambda: self._take_inputs(step, self._time_of(step)))
-        self._advance(self._time_of(step + 1))
-        self._said.note(step=step + 1)
-        self._tell_doubt()
-        self._read_outputs(step + 1)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -99,9 +94,16 @@ class ContinuousInstance(FmuInstance):
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
+        solver = self._loop.solver if self._loop is not None else None
+        self._by_calls = bool(self._options.linear_inputs or self._clocks)
+        self._solver_in_c = solver if isinstance(solver, DormandPrinceSolver) and not self._by_calls else None
+        self._by_calls = self._solver_in_c is None
+        is_first, row = self._inputs is None, self._row.get()
         super().bind(inputs, outputs, grid, points, step)
-        if self._inputs is None and any(part.size for part in inputs.parts):
-            self._row = (b"not set yet",)
+        self._row: HeldRow = HeldRow()
+        if self._solver_in_c is not None and self._native is not None:
+            self._row = self._solver_in_c.share([part.in_table for part in self._setters], inputs)
+        self._row.put(NOT_SET if is_first and any(part.size for part in inputs.parts) else row)
         self._inputs = inputs
         linear = [inputs.layout.place(item.name).first for item in self._options.linear_inputs]
         self._linear_columns = np.array(linear, dtype=np.intp)
@@ -112,6 +114,39 @@ class ContinuousInstance(FmuInstance):
         if self._loop is not None:
             self._loop.close()
             self._loop = None
+
+    def _complete(self, step: int, status: int | None) -> None:
+        loop, solver, end = self._event_loop(), self._solver_in_c, self._time_of(step + 1)
+        assert solver is not None
+        if loop.terminated:
+            raise self._end_requested()
+        own = solver.table
+        if own.result == Solved.FAILED and own.call < own.n_setters:
+            raise self._part_failed("Set", self._setters[own.call], own.status)
+        at_event = own.result == Solved.AT_EVENT
+        asks_end = own.result == Solved.ENDS or bool(at_event and own.asks_end)
+        self._checked(lambda: solver.check(own.result))
+        if not self._checked(lambda: loop.go_on(end, asks_event=at_event, asks_end=asks_end)):
+            raise self._end_requested()
+        self._tell_doubt()
+
+    def _step_by_calls(self, step: int) -> None:
+        self._checked(lambda: self._take_inputs(step, self._time_of(step)))
+        self._advance(self._time_of(step + 1))
+        self._said.note(step=step + 1)
+        self._tell_doubt()
+        self._read_outputs(step + 1)
+
+    def _tables(self) -> NativeStep:
+        return super()._tables()._replace(setters=())  # the equations have them
+
+    def _step_address(self) -> int:
+        assert self._solver_in_c is not None
+        return ctypes.addressof(self._solver_in_c.table)
+
+    def _instantiate(self, **arguments: object) -> None:
+        super()._instantiate(**arguments)
+        self._row = HeldRow()
 
     def _tolerance(self) -> float | None:
         return self._options.solver.relative_tolerance
@@ -130,19 +165,18 @@ class ContinuousInstance(FmuInstance):
             self._said.step,
             time,
             next_event if math.isfinite(next_event) else None,
-            self._row,
+            self._row.get(),
             self._clocks.place,
             solver=loop.solver.place,
         )
 
     def _restore(self, kept: Bookkeeping) -> None:
         super()._restore(kept)
-        self._row = kept.row
+        self._row.put(kept.row)
         self._clocks.resume(kept.ticks)
         next_event = math.inf if kept.next_event is None else kept.next_event
         loop = self._loop or self._make_loop()
         loop.solver.resume(kept.solver)
-        self._is_doubted = loop.solver.doubt() is not None
         self._checked(lambda: loop.resume(kept.time or 0.0, next_event))
 
     def _make_loop(self) -> EventLoop:
@@ -169,8 +203,7 @@ class ContinuousInstance(FmuInstance):
 
     def _tell_doubt(self) -> None:
         """Tell once that another solver would be better."""
-        if not self._is_doubted and (doubt := self._event_loop().solver.doubt()) is not None:
-            self._is_doubted = True
+        if (doubt := self._event_loop().solver.doubt()) is not None:
             self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step))
 
     def _take_inputs(self, step: int, time: float) -> None:
@@ -183,13 +216,13 @@ class ContinuousInstance(FmuInstance):
             return
         slot = step & self._input_mask
         row, line = self._held(slot), self._line(slot, time)
-        if row != self._row or (line is not None and not self._goes_on):
-            self._row = row
+        if row != self._row.get() or (line is not None and not self._goes_on):
+            self._row.put(row)
             loop.set_inputs(lambda: self._set_inputs(step), line)
         elif line is not None:
             loop.follow(line)
 
-    def _held(self, slot: int) -> _RowBytes:
+    def _held(self, slot: int) -> RowBytes:
         """A row of inputs, with 0 in the place of the linear ones."""
         assert self._inputs is not None
         held: list[bytes | list[Any]] = []

@@ -7,27 +7,74 @@ evaluation, and a state keeps little more than the step size.
 from __future__ import annotations
 
 import ctypes
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from ....rings import native
 from ....rings.library import why_no_library
-from ....rings.native import EquationsTable, Solved
+from ....rings.native import Call, EquationsTable, Solved
+from ....rings.ring import Ring
+from ..clocks import unsettled
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
 from .model_calls import ModelCalls
 from .solver import Solver
 
-__all__ = ["DormandPrinceSolver"]
+__all__ = ["NOT_SET", "DormandPrinceSolver", "HeldRow", "RowBytes"]
+
+_FUNCTIONS: Final = [field for field, *_ in EquationsTable._fields_][2:12]
+"""The fields that are functions; the library names them by their place."""
 
 _IS_STIFF: Final = 15
 """So many steps in a row at the limit of stability, with few others between them (`count_stiff`)."""
 
-_GIVEN_UP: Final = {Solved.TOO_SMALL: "makes no progress", Solved.NOT_A_NUMBER: "cannot go on"}
+RowBytes = tuple[bytes | list[Any], ...]
+NOT_SET: Final[RowBytes] = (b"not set yet",)
+
+_GIVEN_UP: Final[dict[int, str]] = {Solved.TOO_SMALL: "makes no progress", Solved.NOT_A_NUMBER: "cannot go on"}
 
 _DOUBLES: Final = ctypes.POINTER(ctypes.c_double)
+
+
+class HeldRow:
+    """The inputs of the last step that are held: the bytes of each part."""
+
+    def __init__(self) -> None:
+        self._row: RowBytes = ()
+
+    def get(self) -> RowBytes:
+        """The row."""
+        return self._row
+
+    def put(self, row: RowBytes) -> None:
+        """Another row; one that no inputs have makes the next ones an event."""
+        self._row = row
+
+
+class SharedRow(HeldRow):
+    """The same in memory that the library compares with the row of a ring, and changes."""
+
+    def __init__(self, table: EquationsTable, inputs: Ring) -> None:
+        first = min(inputs.offsets, default=inputs.stride)
+        self._table = table
+        self._bytes = np.zeros(inputs.stride, np.uint8)
+        self._parts = [slice(at, at + part[0].nbytes) for at, part in zip(inputs.offsets, inputs.parts, strict=True)]
+        table.row, table.held = inputs.address + first, self._bytes.ctypes.data + first
+        table.row_bytes = inputs.stride - first if self._parts else 0
+
+    def get(self) -> RowBytes:
+        """See `HeldRow.get`."""
+        return tuple(self._bytes[part].tobytes() for part in self._parts) if self._table.is_held else NOT_SET
+
+    def put(self, row: RowBytes) -> None:
+        """See `HeldRow.put`."""
+        self._table.is_held = row != NOT_SET
+        if self._table.is_held:
+            for part, data in zip(self._parts, row, strict=True):
+                self._bytes[part] = np.frombuffer(data, np.uint8)  # type: ignore[arg-type]  # text is not shared
 
 
 class DormandPrinceSolver(Solver):
@@ -50,7 +97,7 @@ class DormandPrinceSolver(Solver):
         states = [at + 8 * n * number for number in range(12)]
         indicators = [at + 8 * (12 * n + m * number) for number in range(4)]
         self._address = states[0]
-        self.table = EquationsTable(
+        self.table = self.at = EquationsTable(
             n_states=n,
             n_indicators=m,
             states=ctypes.cast(states[0], _DOUBLES),
@@ -66,6 +113,7 @@ class DormandPrinceSolver(Solver):
             tolerance=settings.relative_tolerance,
             longest=settings.maximum_step_size or np.inf,
             tells=tells,
+            next_event=np.inf,
             **functions,
         )
 
@@ -82,20 +130,29 @@ class DormandPrinceSolver(Solver):
             return
         own.step_size = place[0]
         own.steps, own.rejected, own.stiff, own.not_stiff = map(int, place[1:])
+        own.doubted = own.stiff >= _IS_STIFF
 
     def doubt(self) -> str | None:
         """See `Solver.doubt`."""
-        if self.table.stiff < _IS_STIFF:
+        if self.table.stiff < _IS_STIFF or self.table.doubted:
             return None
+        self.table.doubted = True
         return (
             f"the model is stiff: stability keeps the steps of dopri5 at {self.table.step_size:.2g} s, and not its "
             "tolerance. `solver: {name: cvode}` takes longer ones"
         )
 
+    def share(self, setters: Sequence[Call], inputs: Ring) -> HeldRow:
+        """Let the library set the held inputs of a ring with one row, and step up to the end of a step of the node."""
+        own = self.table
+        self._held = SharedRow(own, inputs)
+        own.give(setters=setters)
+        return self._held
+
     def restart(self) -> None:
         """See `Solver.restart`."""
         if self._library.equations_restart(ctypes.addressof(self.table)):
-            raise self._failure()
+            raise self.failure()
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
@@ -103,11 +160,18 @@ class DormandPrinceSolver(Solver):
         own.time = time
         self._follow()
         result = self._library.equations_solve(ctypes.addressof(own), stop)
-        if result == Solved.FAILED:
-            raise self._failure()
-        if result in _GIVEN_UP:
-            self._give_up(f"dopri5 {_GIVEN_UP[result]} at t = {own.time:.12g} s", own.time, self._address)
+        self.check(result)
         return own.time, result == Solved.AT_EVENT
+
+    def check(self, result: int) -> None:
+        """Raise the error of a step of the library that has failed; see `Solver.step`."""
+        if result == Solved.FAILED:
+            raise self.failure()
+        if result == Solved.UNSETTLED:
+            raise SolverFailed(unsettled(self.table.time))
+        if result in _GIVEN_UP:
+            time = self.table.time
+            self._give_up(f"dopri5 {_GIVEN_UP[result]} at t = {time:.12g} s", time, self._address)
 
     def complete(self) -> tuple[bool, bool]:
         """See `Solver.complete`; `step` has told the FMU."""
@@ -121,6 +185,9 @@ class DormandPrinceSolver(Solver):
             for name, value in (line.table() if line is not None else {"line": None}).items():
                 setattr(own, name, value)
 
-    def _failure(self) -> FMICallException:
-        names = [*self._names, self._line.name] if self._line is not None else self._names
+    def failure(self) -> FMICallException:
+        """The call that has failed."""
+        names = [self._names.get(field, "") for field in _FUNCTIONS]
+        if self._line is not None:
+            names.append(self._line.name)
         return FMICallException(function=names[self.table.function], status=self.table.status)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
@@ -28,6 +28,13 @@ _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
 _EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
 _COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
+
+
+_MODES = {
+    "enter_event_mode": "EnterEventMode",
+    "update_discrete_states": "NewDiscreteStates",
+    "enter_continuous_time_mode": "EnterContinuousTimeMode",
+}
 
 
 class InputSetter(NamedTuple):
@@ -94,6 +101,7 @@ class ModelCalls:
     """
 
     _kind = StepKind.FMI2
+    _modes: Mapping[str, str] = _MODES
     _nominals = "GetNominalsOfContinuousStates"
     _derivatives = "GetDerivatives"
 
@@ -118,8 +126,8 @@ class ModelCalls:
         """From now on, ``line`` sets inputs at the time of every `set_point`; None: they stay as they are."""
         self.line = line
 
-    def table(self) -> tuple[dict[str, Any], list[str]]:
-        """The fields of `EquationsTable` that are functions, and the names of these in FMI, in the same order."""
+    def table(self) -> tuple[dict[str, Any], dict[str, str]]:
+        """The fields of `EquationsTable` that are functions, and the names of these in FMI."""
         names = {
             "set_time": "SetTime",
             "set_states": "SetContinuousStates",
@@ -128,6 +136,7 @@ class ModelCalls:
             "get_derivatives": self._derivatives,
             "get_indicators": "GetEventIndicators",
             "completed_step": "CompletedIntegratorStep",
+            **self._modes,
         }
         address = ctypes.c_void_p
         made = {
@@ -135,7 +144,7 @@ class ModelCalls:
             for field, name in names.items()
         }
         prefix = self._symbols.rpartition("_")[2]
-        told = [prefix + name for name in names.values()]
+        told = {field: prefix + name for field, name in names.items()}
         return {"kind": self._kind, "component": self._component, **made}, told
 
     def set_time(self, time: float) -> None:
@@ -199,6 +208,7 @@ class Fmi1Calls(ModelCalls):
     """
 
     _kind = StepKind.FMI1
+    _modes: Mapping[str, str] = {"update_discrete_states": "EventUpdate"}
     _nominals = "GetNominalContinuousStates"
 
     def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped
@@ -236,6 +246,7 @@ class Fmi3Calls(ModelCalls):
     """FMI 3.0, where the FMU says itself how many states and indicators it has: it depends on structural parameters."""
 
     _kind = StepKind.FMI3
+    _modes: Mapping[str, str] = _MODES | {"update_discrete_states": "UpdateDiscreteStates"}
     _derivatives = "GetContinuousStateDerivatives"
 
     def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped

@@ -52,20 +52,18 @@ class EventLoop:
         stop_time: float = math.inf,
         clocks: Clocks = NO_CLOCKS,
     ) -> None:
-        self.terminated = False  # whether the FMU has asked to end the simulation; nothing may be advanced then
         self._clocks = clocks
         self._calls = calls
         self._tell = tell_completed_steps
         self._stop_time = stop_time
-        self._time = 0.0
-        self._next_event = math.inf
         self._event_time = -math.inf
         self._events_there = 0
         self.solver = _solver_for(settings, calls, tells=tell_completed_steps)
+        self._at = self.solver.at
 
     def start(self, time: float) -> None:
         """Handle the first event at ``time`` (s), in event mode after Initialization Mode."""
-        self._time = time
+        self._at.note(time=time)
         self._update()
 
     def event(self, set_values: Callable[[], None]) -> None:
@@ -89,30 +87,41 @@ class EventLoop:
         If the small jump of an extrapolated input takes an event indicator over 0, that is an `event`.
         """
         above = self._above_zero()
-        line(self._time)
+        line(self._at.time)
         if self._above_zero() == above:
             self._calls.follow(line)
         else:
-            self.set_inputs(lambda: line(self._time), line)
+            self.set_inputs(lambda: line(self._at.time), line)
 
     def advance(self, end: float) -> bool:
         """Advance to the time ``end`` in s; False if the FMU asked to end the simulation before."""
-        while resolvable(self._time, end):
+        while resolvable(self._at.time, end):
             self._advance_once(end)
             if self.terminated:
-                return not resolvable(self._time, end)
+                return not resolvable(self._at.time, end)
         return True
+
+    def go_on(self, end: float, *, asks_event: bool, asks_end: bool) -> bool:
+        """As `advance`, after the library has taken the model to where it is, and what was asked for there."""
+        self._at.note(terminated=asks_end)
+        if asks_event and not asks_end:
+            self._handle_event()
+        return not resolvable(self._at.time, end) if self.terminated else self.advance(end)
+
+    @property
+    def terminated(self) -> bool:
+        """Whether the FMU has asked to end the simulation; nothing may be advanced then."""
+        return bool(self._at.terminated)
 
     @property
     def place(self) -> tuple[float, float]:
         """The time where the model is, and that of its next time event, in s."""
-        return self._time, self._next_event
+        return self._at.time, self._at.next_event
 
     def resume(self, time: float, next_event: float) -> None:
         """Continue where `place` was, in continuous-time mode; the solver starts anew."""
-        self.terminated = False
         self._calls.follow(None)
-        self._time, self._next_event = time, next_event
+        self._at.note(time=time, next_event=next_event, terminated=False)
         self.restart()
 
     def restart(self) -> None:
@@ -125,24 +134,29 @@ class EventLoop:
 
     def _advance_once(self, end: float) -> None:
         """One solver step, and the events at its end."""
-        target = min(end, self._next_event)
+        target = min(end, self._at.next_event)
         event = False
-        if resolvable(self._time, target):
-            self._time, event = self.solver.step(self._time, target)
+        if resolvable(self._at.time, target):
+            time, event = self.solver.step(self._at.time, target)
+            self._at.note(time=time)
             if self._calls.n_states == 0:
-                self._calls.set_time(self._time)
+                self._calls.set_time(self._at.time)
             if self._tell:
-                step_event, self.terminated = self.solver.complete()
+                step_event, ends = self.solver.complete()
+                self._at.note(terminated=ends)
                 event = event or step_event
-        if not resolvable(self._time, self._next_event):
+        if not resolvable(self._at.time, self._at.next_event):
             event = True
-            if self._next_event > self._time:  # only by rounding: let the model see the time of its event
-                self._time = min(self._next_event, self._stop_time)
-                self._calls.set_time(self._time)
+            if self._at.next_event > self._at.time:  # only by rounding: let the model see the time of its event
+                self._at.note(time=min(self._at.next_event, self._stop_time))
+                self._calls.set_time(self._at.time)
         if event and not self.terminated:
-            self._count_events()
-            self._calls.enter_event_mode()
-            self._update()
+            self._handle_event()
+
+    def _handle_event(self) -> None:
+        self._count_events()
+        self._calls.enter_event_mode()
+        self._update()
 
     def _above_zero(self) -> list[bool]:
         """Whether each event indicator is above 0."""
@@ -152,19 +166,19 @@ class EventLoop:
         return [*(indicators > 0.0)]
 
     def _count_events(self) -> None:
-        self._events_there = self._events_there + 1 if self._time == self._event_time else 0
-        self._event_time = self._time
+        self._events_there = self._events_there + 1 if self._at.time == self._event_time else 0
+        self._event_time = self._at.time
         if self._events_there > EVENT_ITERATIONS:
             raise SolverFailed(
-                f"more than {EVENT_ITERATIONS} events at t = {self._time:.12g} s, and time does not advance"
+                f"more than {EVENT_ITERATIONS} events at t = {self._at.time:.12g} s, and time does not advance"
             )
 
     def _update(self) -> None:
         """The event iteration, in event mode, and back to continuous-time mode."""
-        info = self._clocks.settle(self._time, self._calls.update_discrete_states)
-        self.terminated = info.terminate
+        info = self._clocks.settle(self._at.time, self._calls.update_discrete_states)
+        self._at.note(terminated=info.terminate)
         if not self.terminated:
-            self._next_event = min(info.next_event, self._clocks.next_tick)
+            self._at.note(next_event=min(info.next_event, self._clocks.next_tick))
             self._calls.enter_continuous_time_mode()
             self.solver.restart()
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, Protocol
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
@@ -70,6 +70,26 @@ _MOST_STALLED: Final = 100
 """Solver steps in a row that do not advance time beyond rounding."""
 
 
+class Place(Protocol):
+    """Where a model is."""
+
+    time: float  # in s
+    next_event: float  # the time of its next time event in s
+    terminated: bool  # whether the FMU has asked to end the simulation; it is not advanced then
+
+    def note(self, **changed: float) -> None:
+        """Change what is given by its name."""
+
+
+class _Place:
+    time = 0.0
+    next_event = math.inf
+    terminated = False
+
+    def note(self, **changed: float) -> None:
+        self.__dict__.update(changed)
+
+
 class Solver:
     """Base of the solvers, and the one for a model with neither continuous states nor event indicators.
 
@@ -78,6 +98,7 @@ class Solver:
     """
 
     def __init__(self, equations: ModelCalls) -> None:
+        self.at: Place = _Place()
         self._equations = equations
 
     @property
@@ -107,7 +128,7 @@ class Solver:
         return self._equations.completed_step()
 
     def doubt(self) -> str | None:
-        """Why another solver would be better for this model, in words; None if nothing says so."""
+        """Why another solver would be better for this model, in words, the first time; None if nothing says so."""
         return None
 
     def close(self) -> None:
