@@ -171,7 +171,7 @@ class DormandPrinceSolver(Solver):
             raise SolverFailed(unsettled(self.table.time))
         if result in _GIVEN_UP:
             time = self.table.time
-            self._give_up(f"dopri5 {_GIVEN_UP[result]} at t = {time:.12g} s", time, self._address)
+            self._give_up(f"it {_GIVEN_UP[result]} at t = {time:.12g} s", time, self._address)
 
     def complete(self) -> tuple[bool, bool]:
         """See `Solver.complete`; `step` has told the FMU."""
