@@ -49,7 +49,6 @@ __all__ = [
     "Piece",
     "RowBase",
     "Said",
-    "Solved",
     "Span",
     "Stage",
     "StepKind",
@@ -115,12 +114,6 @@ class BurstEnd(IntEnum):
     """Why `node_run` returned."""
 
     SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE = range(8)
-
-
-class Solved(IntEnum):
-    """Why the steps of a model-exchange FMU have ended."""
-
-    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON = range(8)
 
 
 NUMBER_TYPES: Final[dict[VariableType, int]] = {
@@ -278,12 +271,8 @@ class _WithArrays(Structure):
 class EquationsTable(_WithArrays):
     """The equations of a model-exchange FMU, and their solver."""
 
-    time: float
-    next_event: float
-    terminated: bool
-
-    def note(self, **changed: float) -> None:
-        """Say where the model is; see `Place`."""
+    def note(self, **changed: float | None) -> None:
+        """Change fields; see `ModelPlace`."""
         for name, value in changed.items():
             setattr(self, name, value)
 

@@ -19,7 +19,7 @@ from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
 
-from ....rings.native import NativeStep, Solved, StepKind
+from ....rings.native import NativeStep, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
@@ -30,7 +30,7 @@ from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
-from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes
+from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
 from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
 

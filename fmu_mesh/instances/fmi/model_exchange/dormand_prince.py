@@ -8,28 +8,36 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any, Final
+from enum import IntEnum
+from typing import Any, Final, cast
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from ....rings import native
 from ....rings.library import why_no_library
-from ....rings.native import Call, EquationsTable, Solved
+from ....rings.native import Call, EquationsTable
 from ....rings.ring import Ring
 from ..clocks import unsettled
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
 from .model_calls import ModelCalls
-from .solver import Solver
+from .solver import ModelPlace, Solver
 
-__all__ = ["NOT_SET", "DormandPrinceSolver", "HeldRow", "RowBytes"]
+__all__ = ["NOT_SET", "DormandPrinceSolver", "HeldRow", "RowBytes", "Solved"]
 
 _FUNCTIONS: Final = [field for field, *_ in EquationsTable._fields_][2:12]
 """The fields that are functions; the library names them by their place."""
 
 _IS_STIFF: Final = 15
 """So many steps in a row at the limit of stability, with few others between them (`count_stiff`)."""
+
+
+class Solved(IntEnum):
+    """Why the steps of the library have ended; `burst.h` has the same names."""
+
+    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON = range(8)
+
 
 RowBytes = tuple[bytes | list[Any], ...]
 NOT_SET: Final[RowBytes] = (b"not set yet",)
@@ -62,8 +70,8 @@ class SharedRow(HeldRow):
         self._table = table
         self._bytes = np.zeros(inputs.stride, np.uint8)
         self._parts = [slice(at, at + part[0].nbytes) for at, part in zip(inputs.offsets, inputs.parts, strict=True)]
-        table.row, table.held = inputs.address + first, self._bytes.ctypes.data + first
-        table.row_bytes = inputs.stride - first if self._parts else 0
+        size = inputs.stride - first if self._parts else 0
+        table.note(row=inputs.address + first, held=self._bytes.ctypes.data + first, row_bytes=size)
 
     def get(self) -> RowBytes:
         """See `HeldRow.get`."""
@@ -71,7 +79,7 @@ class SharedRow(HeldRow):
 
     def put(self, row: RowBytes) -> None:
         """See `HeldRow.put`."""
-        self._table.is_held = row != NOT_SET
+        self._table.note(is_held=row != NOT_SET)
         if self._table.is_held:
             for part, data in zip(self._parts, row, strict=True):
                 self._bytes[part] = np.frombuffer(data, np.uint8)  # type: ignore[arg-type]  # text is not shared
@@ -97,7 +105,7 @@ class DormandPrinceSolver(Solver):
         states = [at + 8 * n * number for number in range(12)]
         indicators = [at + 8 * (12 * n + m * number) for number in range(4)]
         self._address = states[0]
-        self.table = self.at = EquationsTable(
+        self.table = EquationsTable(
             n_states=n,
             n_indicators=m,
             states=ctypes.cast(states[0], _DOUBLES),
@@ -116,6 +124,7 @@ class DormandPrinceSolver(Solver):
             next_event=np.inf,
             **functions,
         )
+        self.at = cast("ModelPlace", self.table)
 
     @property
     def place(self) -> tuple[float, ...]:
@@ -125,18 +134,17 @@ class DormandPrinceSolver(Solver):
 
     def resume(self, place: tuple[float, ...]) -> None:
         """See `Solver.resume`."""
-        own = self.table
         if not place:  # the state is that of another solver
             return
-        own.step_size = place[0]
-        own.steps, own.rejected, own.stiff, own.not_stiff = map(int, place[1:])
-        own.doubted = own.stiff >= _IS_STIFF
+        steps, rejected, stiff, not_stiff = map(int, place[1:])
+        self.table.note(step_size=place[0], steps=steps, rejected=rejected, stiff=stiff, not_stiff=not_stiff)
+        self.table.note(doubted=stiff >= _IS_STIFF)
 
     def doubt(self) -> str | None:
         """See `Solver.doubt`."""
         if self.table.stiff < _IS_STIFF or self.table.doubted:
             return None
-        self.table.doubted = True
+        self.table.note(doubted=True)
         return (
             f"the model is stiff: stability keeps the steps of dopri5 at {self.table.step_size:.2g} s, and not its "
             "tolerance. `solver: {name: cvode}` takes longer ones"
@@ -157,7 +165,7 @@ class DormandPrinceSolver(Solver):
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
         own = self.table
-        own.time = time
+        own.note(time=time)
         self._follow()
         result = self._library.equations_solve(ctypes.addressof(own), stop)
         self.check(result)
@@ -179,11 +187,10 @@ class DormandPrinceSolver(Solver):
 
     def _follow(self) -> None:
         """Let the library set the linear inputs of this step; they are other ones than before."""
-        line, own = self._equations.line, self.table
+        line = self._equations.line
         if line is not self._line:
-            self._line, own.is_new = line, True
-            for name, value in (line.table() if line is not None else {"line": None}).items():
-                setattr(own, name, value)
+            self._line = line
+            self.table.note(is_new=True, **(line.table() if line is not None else {"line": None}))
 
     def failure(self) -> FMICallException:
         """The call that has failed."""

@@ -22,7 +22,7 @@ from ....simtime import resolvable, steps_between
 from ..fmu_values import DISCARD, SolverFailed
 from .model_calls import ModelCalls
 
-__all__ = ["CVodeSolver", "EulerSolver", "Solver"]
+__all__ = ["CVodeSolver", "EulerSolver", "ModelPlace", "Solver"]
 
 # Who meets here: one thread, in three languages. Python calls CVode, CVode calls back (`_RHS`, `_ROOT`), and this calls
 # the FMU. No exception may cross C: it is kept in `_failure`, CVode is told to give up, and it is raised once CVode has
@@ -70,7 +70,7 @@ _MOST_STALLED: Final = 100
 """Solver steps in a row that do not advance time beyond rounding."""
 
 
-class Place(Protocol):
+class ModelPlace(Protocol):
     """Where a model is."""
 
     time: float  # in s
@@ -81,7 +81,7 @@ class Place(Protocol):
         """Change what is given by its name."""
 
 
-class _Place:
+class _PlainPlace:
     time = 0.0
     next_event = math.inf
     terminated = False
@@ -98,7 +98,7 @@ class Solver:
     """
 
     def __init__(self, equations: ModelCalls) -> None:
-        self.at: Place = _Place()
+        self.at: ModelPlace = _PlainPlace()
         self._equations = equations
 
     @property
