@@ -11,16 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.contract import LogMessage
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings import native
+from fmu_mesh.rings.library import LIBRARY_VARIABLE
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from tests.fmus.event_fmus import Version
+from tests.helpers import write_config
 from tests.physics.test_changing_inputs import EXACT, FLOOR, Driven, driven, sine
+from tests.planning import prepare
 
 pytestmark = pytest.mark.skipif(native.library is None, reason="the library with the solver is not built here")
 
@@ -105,6 +109,51 @@ def test_each_held_step_is_one_step_of_the_solver(version: Version, event_fmu: E
 
     # The first step size is that of an algorithm; from then on a step between two points is one of the solver.
     assert {later - before for before, later in itertools.pairwise(counts[2:])} == {1}  # type: ignore[operator]  # integers
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_a_discarded_evaluation_makes_the_step_smaller(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+    """Stages of long steps leave the circle of radius 2 by more than the limit; those of short ones do not."""
+    system = HARMONIC._replace(start_values={"mu": 0.0, "limit": 2.00001})
+    settings = SolverSettings("dopri5", 1e-4)
+
+    rows = driven(event_fmu("Oscillator", version), tmp_path, system, [0.0] * 6, 1.0, "hold", solver=settings)
+
+    assert error_of(rows, free(1.0, 5)) <= FLOOR * 1e-4  # type: ignore[arg-type]  # two floats a row
+
+
+@pytest.mark.parametrize(("longest", "steps"), [(0.05, 20), (0.03, 34), (None, 1)])
+def test_no_step_is_longer_than_the_user_allows(
+    longest: float | None, steps: int, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    """A loose tolerance allows a step from point to point, once the first step size has grown."""
+    fmu = event_fmu("Oscillator", 2)
+    options = StepOptions(SolverSettings("dopri5", 1e3, longest))
+    with closing(open_instance(fmu, "m", read_description(fmu, kind="model_exchange"), tmp_path, options=options)) as m:
+        m.enter_initialization(0.0, None, {"mu": 0.0})
+        m.exit_initialization()
+        counts = [0]
+        for point in range(5):
+            m.advance(1.0 * point, 1.0)
+            counts += m.get_values(["completed_steps"])  # type: ignore[arg-type]  # integers
+
+    assert counts[-1] - counts[-2] == steps
+
+
+def test_without_the_library_the_solver_is_refused(
+    event_fmu: EventFmu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(LIBRARY_VARIABLE, "none")
+    fmu, solver = str(event_fmu("Oscillator", 2)), {"name": "dopri5"}
+    instances = {"m": {"fmu": fmu, "kind": "model_exchange", "solver": solver}}
+
+    with pytest.raises(ConfigurationError) as refused:
+        prepare(write_config(tmp_path, instances=instances, connections=[]))
+
+    text = str(refused.value)
+    assert "instances.m.solver.name" in text
+    assert "dopri5, whose steps the library of C takes; it is not used" in text
+    assert "`cvode`" in text
 
 
 def test_a_stiff_model_is_told_once_and_solved(event_fmu: EventFmu, tmp_path: Path) -> None:

@@ -75,7 +75,10 @@ def test_a_ball_bounces_at_the_times_of_the_formula(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_a_time_event_happens_exactly_where_the_fmu_says(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
+def test_a_time_event_happens_exactly_where_the_fmu_says(
+    solver: str, version: Version, event_fmu: EventFmu, tmp_path: Path
+) -> None:
     rows = simulated(
         tmp_path,
         event_fmu("Stairs", version),
@@ -83,6 +86,7 @@ def test_a_time_event_happens_exactly_where_the_fmu_says(version: Version, event
         stop_time=3.0,
         step_size=0.1,
         kind="model_exchange",
+        solver={"name": solver},
         start_values={"period": 0.25},
     )
 
