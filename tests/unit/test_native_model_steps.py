@@ -137,6 +137,23 @@ def test_states_and_settings_between_native_steps_change_no_float(
             assert first.instance.get_values(names) == other.instance.get_values(names), step
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_state_from_before_the_first_step_is_begun_anew(
+    version: Version, event_fmu: EventFmu, tmp_path: Path
+) -> None:
+    with stepping(event_fmu("Integral", version), tmp_path, 1) as own:
+        state, found = own.instance.get_state(), []
+        for _ in range(2):
+            for step in range(20):
+                give(own, 0, {"u": 0.5})
+                own.instance.do_step(step)
+            found.append(own.rows())
+            own.instance.set_state(state)
+        own.instance.free_state(state)
+
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_only_steps_with_events_are_left_to_python(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
     with stepping(event_fmu("Ball", version), tmp_path, 1) as ball:
@@ -156,7 +173,7 @@ def test_an_input_that_the_fmu_refuses_ends_the_step(
 ) -> None:
     refuse = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 2, ctypes.c_size_t, ctypes.c_void_p)(lambda *_: 3)
     with stepping(event_fmu("Integral", 2), tmp_path, 1) as own:
-        solver = own.instance._solver_in_c  # noqa: SLF001  no FMU of the tests refuses a value
+        solver = own.instance._solver_in_c  # no FMU of the tests refuses a value
         assert solver is not None
         monkeypatch.setattr(solver.table.setters[0], "function", ctypes.cast(refuse, ctypes.c_void_p).value)
 

@@ -79,8 +79,9 @@ class SharedRow(HeldRow):
 
     def put(self, row: RowBytes) -> None:
         """See `HeldRow.put`."""
-        self._table.note(is_held=row != NOT_SET)
-        if self._table.is_held:
+        is_held = row != NOT_SET and len(row) == len(self._parts)  # a state may be from before the first `bind`
+        self._table.note(is_held=is_held)
+        if is_held:
             for part, data in zip(self._parts, row, strict=True):
                 self._bytes[part] = np.frombuffer(data, np.uint8)  # type: ignore[arg-type]  # text is not shared
 
