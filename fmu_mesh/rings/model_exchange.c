@@ -311,8 +311,9 @@ static int begin(Equations *own, double stop) {
 static int step(Equations *own, double stop, int *event) {
   const double time = own->time, shortest = 16.0 * EPSILON * greater(size_of(time), size_of(stop));
   for (double most = MOST;; most = 1.0, own->rejected++) {
-    const double size = lesser(own->step_size, own->longest), most_left = lesser(1.01 * size, 1.000000001 * own->longest);
-    double end = stop - time <= most_left || own->n_states == 0 ? stop : time + size;
+    const double size = greater(lesser(own->step_size, own->longest), shortest);
+    const int is_last = stop - time <= lesser(1.01 * size, 1.000000001 * own->longest) || own->n_states == 0;
+    double end = is_last ? stop : time + size;
     const double h = end - time;
     int status = try_step(own, end);
     const double error = status ? 0.0 : error_of(own, h);

@@ -64,6 +64,19 @@ def test_an_oscillator_is_as_exact_as_its_tolerance(
     assert error_of(rows, free(1.0, 10)) <= FLOOR * tolerance  # type: ignore[arg-type]  # two floats a row
 
 
+def test_steep_slopes_at_a_late_time_do_not_stop_the_solver(event_fmu: EventFmu, tmp_path: Path) -> None:
+    """The first step size would be 1e-15 s, which changes no time of 1000 s."""
+    fmu = event_fmu("Winding", 2)
+    options = StepOptions(SolverSettings("dopri5"))
+    with closing(open_instance(fmu, "m", read_description(fmu, kind="model_exchange"), tmp_path, options=options)) as m:
+        m.enter_initialization(1e3, None, {"L": 1e-9, "U": 1.0, "I": 1e-6})
+        m.exit_initialization()
+        m.advance(1e3, 1e-7)
+        current = m.get_values(["I"])
+
+    assert current == [pytest.approx(1.0, abs=1e-5)]
+
+
 def test_half_the_step_has_a_32nd_of_the_error(event_fmu: EventFmu, tmp_path: Path) -> None:
     """With a tolerance that allows everything, the steps are those between the points."""
     fmu, errors = event_fmu("Oscillator", 2), []

@@ -147,8 +147,8 @@ class DormandPrinceSolver(Solver):
             return None
         self.table.note(doubted=True)
         return (
-            f"the model is stiff: stability keeps the steps of dopri5 at {self.table.step_size:.2g} s, and not its "
-            "tolerance. `solver: {name: cvode}` takes longer ones"
+            f"the model is stiff: dopri5 needs steps of {self.table.step_size:.2g} s to stay stable. "
+            "`solver: {name: cvode}` can take longer ones"
         )
 
     def share(self, setters: Sequence[Call], inputs: Ring) -> HeldRow:
