@@ -33,6 +33,7 @@ PACKAGE: Final = ROOT / "fmu_mesh"
 SOURCES: Final = (
     "rings/burst.c",
     "rings/streams.c",
+    "rings/model_exchange.c",
     "rings/burst.h",
     "rings/counters.h",
     "results/csv_rows.c",

@@ -20,7 +20,9 @@ OTHER = ", other checkout"
 
 _MODULES_NEED = {
     "c_program": ("fmpy",),
+    "c_model_exchange": ("fmpy",),
     "fmpy_loop": ("fmpy",),
+    "fmpy_model_exchange": ("fmpy",),
     "fmpy_arrays": ("fmpy",),
     "zeromq_lockstep": ("fmpy", "pyzmq"),
     "zenoh_lockstep": ("fmpy", "eclipse-zenoh"),
@@ -140,6 +142,7 @@ _STAR5 = System("star", "gauss_seidel", 0.001, _gains(5))
 _CHATTY = System("chain", "gauss_seidel", 0.001, (Member("chatty", CHATTY, "u", "y", {"u": 1.0}),))
 _SIZES = (2, 16, 64)
 _US = "fmu_mesh"
+_DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
 _NO_FILE = "fmu_mesh, nothing recorded"
 _LOCAL = "fmu_mesh, launch --local"
 _FMPY = "FMPy loop, one process"
@@ -378,6 +381,17 @@ JOBS = (
             _kind("FMI 3.0: Float64, Int32, Boolean", "fmi3", 40_000),
             _kind("FMI 2.0, model exchange", "model_exchange", 20_000),
             _kind("component in Python", "component", 100_000),
+        ),
+    ),
+    Job(
+        "model_exchange",
+        "two oscillators for model exchange in a chain, 1 ms, launch --local, nothing recorded",
+        _NOTHING,
+        (
+            Entry(_DOPRI5, KINDS, 100_000, 20_000, {"kind": "model_exchange_in_c"}),
+            Entry("fmu_mesh, cvode", KINDS, 10_000, 5_000, {"kind": "model_exchange"}),
+            Entry(_C_SOLVER, "c_model_exchange", 100_000, 20_000),
+            Entry("FMPy simulate_fmu (CVode), one after the other", "fmpy_model_exchange", 10_000, 5_000),
         ),
     ),
     Job(

@@ -56,6 +56,7 @@ _EIGHT, _TWO = "fmu_mesh, chain of 8", "fmu_mesh, chain of 2"
 _ROUND_TRIP = "shared memory, C: one round trip"
 _STREAMS, _BY_ZENOH, _MEMORY = "fmu_mesh, row streams", "fmu_mesh, Zenoh", "fmu_mesh, shared memory"
 _TCP, _ZENOH = "TCP, C, spinning: one round trip", "Zenoh in Python: one round trip"
+_DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
 _WINDOW1 = "fmu_mesh, gauss_seidel"
 
 TARGETS = (
@@ -76,6 +77,7 @@ TARGETS = (
     Target("chain at a round trip of 50 ms, against 0 ms", "far_chain", "50 ms", "times as fast", 0.5, 0.83, "0 ms"),
     Target("FMI 1.0, against the other checkout", "kinds", _FMI1, "times as fast", 2, 4, _FMI1 + OTHER),
     Target("Boolean, Enumeration, against the other checkout", "kinds", _FMI2, "times as fast", 2, 4, _FMI2 + OTHER),
+    Target("model exchange with dopri5, against C", "model_exchange", _DOPRI5, "times as long", 2.5, 1.2, _C_SOLVER),
     Target("main job, launch --local", "pendulum", "fmu_mesh, launch --local", "points/s", 437_000, 800_000),
     Target("main job, whole command, against --local", "command", _COMMAND, "times as long", 1.5, 1.2, _LOCAL),
     Target(

@@ -391,7 +391,7 @@ ALLOWED: dict[str, dict[str, str]] = {
     },
     "rebound_calls": {
         "instances/call_guard.py: CallWatch._position": "what the present call says of itself: state, no behaviour",
-        "instances/fmi/model_exchange/model_calls.py: ModelCalls._line": "inputs of the present step: state",
+        "instances/fmi/model_exchange/model_calls.py: ModelCalls.line": "inputs of the present step: state",
     },
     "small_modules_with_one_importer": {
         "pictures/shown_figure.py": "it derives from a class of matplotlib, which is an extra, and slow to import",

@@ -15,11 +15,11 @@ from benchmarks.task import Outcome, Task
 from fmus.build import build
 from tests.fmus.event_fmus import build_event_fmu
 
-__all__ = ["KINDS", "run"]
+__all__ = ["BUILT", "KINDS", "STEP_SIZE", "run"]
 
 _ROOT = Path(__file__).resolve().parents[2]
-_BUILT = _ROOT / "build" / "bench-programs"
-_STEP_SIZE = 0.001
+BUILT = _ROOT / "build" / "bench-programs"
+STEP_SIZE = 0.001
 
 KINDS: dict[str, tuple[str, ...]] = {
     "fmi1": ("real_out -> real_in", "integer_out -> integer_in", "boolean_out -> boolean_in"),
@@ -32,6 +32,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     ),
     "fmi3": ("float64_out -> float64_in", "int32_out -> int32_in", "boolean_out -> boolean_in"),
     "model_exchange": ("x -> u",),
+    "model_exchange_in_c": ("x -> u",),
     "component": ("y -> u",),
 }
 """The connections between two instances of each kind."""
@@ -46,7 +47,7 @@ def run(task: Task) -> Outcome:
     pairs = (connection.split(" -> ") for connection in KINDS[kind])
     config = {
         "mesh": "bench",
-        "simulation": {"stop_time": task.points * _STEP_SIZE, "step_size": _STEP_SIZE},
+        "simulation": {"stop_time": task.points * STEP_SIZE, "step_size": STEP_SIZE},
         "instances": {"first": instance, "second": instance},
         "connections": [f"first.{source} -> second.{target}" for source, target in pairs],
         "record": {"file": None},
@@ -58,9 +59,10 @@ def _instance(kind: str) -> dict[str, Any]:
     """The configuration of an instance of this kind."""
     if kind == "component":
         return {"python": f"{_ROOT / 'benchmarks' / 'models' / 'doubling.py'}:Doubling"}
-    if kind == "model_exchange":
-        return {"fmu": str(build_event_fmu("Oscillator", 2, _BUILT)), "kind": "model_exchange"}
-    return {"fmu": str(build(_ROOT / "tests" / "fmus" / "src" / _MODELS[kind], _BUILT))}
+    if kind.startswith("model_exchange"):
+        solver = {"name": "dopri5" if kind == "model_exchange_in_c" else "cvode"}
+        return {"fmu": str(build_event_fmu("Oscillator", 2, BUILT)), "kind": "model_exchange", "solver": solver}
+    return {"fmu": str(build(_ROOT / "tests" / "fmus" / "src" / _MODELS[kind], BUILT))}
 
 
 if __name__ == "__main__":

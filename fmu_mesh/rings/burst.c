@@ -234,8 +234,9 @@ static inline int call_all(const Member *member, const Call *calls, int64_t n) {
   return 0;
 }
 
-static inline int call_do_step(Member *member, double time) {
+static inline int call_do_step(Member *member, double time, double end) {
   switch (member->kind) {
+    case EQUATIONS: return equations_step(member->do_step, end);
     case FMI1:
       return ((int (*)(void *, double, double, char))member->do_step)(member->component, time, member->step_size, 1);
     case FMI2:
@@ -275,7 +276,7 @@ static inline int64_t call_step(Member *member, int64_t step) {
   if ((status = call_all(member, member->setters, member->n_setters)) != 0)
     return (int64_t)SETTING << STAGE_BITS | (status & 0xffffff);
   member->stage = STEPPING;
-  status = call_do_step(member, time_of(member, step));
+  status = call_do_step(member, time_of(member, step), end);
   if (status > WARNING || status < 0 ||
       (member->kind == FMI3 && (said->event_needed || said->terminate || said->early)))
     return (int64_t)STEPPING << STAGE_BITS | (status & 0xffffff);

@@ -24,7 +24,7 @@ typedef struct { /* one value that somebody waits for */
 
 /* ---- one instance */
 
-enum StepKind { BY_PYTHON, FMI1, FMI2, FMI3 };                             /* Member.kind */
+enum StepKind { BY_PYTHON, FMI1, FMI2, FMI3, EQUATIONS };                  /* Member.kind */
 enum Stage { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };    /* Member.stage */
 enum RowBase { FIXED, OUTPUT, WATCHED, FIRST_GATE };                       /* what an offset is relative to: see Move */
 enum Change { UNCHANGED, SCALED, LOOKED_UP };                              /* Move.change */
@@ -100,7 +100,7 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   Move *stores; /* from buffers into the own row */
   int64_t n_gates, n_loads, n_setters, n_getters, n_stores;
   int64_t kind;
-  void *component, *do_step;
+  void *component, *do_step; /* of EQUATIONS, `do_step` is their table */
   Said *said; /* of an FMU */
   double start_time, base_step_size, step_size;
   int64_t points; /* base points per own step */
@@ -118,6 +118,44 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   int64_t step, stage;
   int64_t outcome;   /* stage and status of a call that Python has to look at */
 } Member;
+
+/* ---- model exchange: see model_exchange.c */
+
+enum Solved { AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON }; /* Equations.result */
+
+typedef struct { /* the equations of an FMU for model exchange, and their solver */
+  int64_t kind;
+  void *component;
+  void *set_time, *set_states, *get_states, *get_nominals, *get_derivatives, *get_indicators, *completed_step;
+  void *enter_event_mode, *update_discrete_states, *enter_continuous_time_mode; /* FMI 1.0 has no modes */
+  const Call *line; /* sets the inputs that change within a step; NULL: there are none */
+  const double *line_values, *line_slopes; /* at `line_start`, and in 1/s */
+  double line_start;
+  int64_t n_states, n_indicators;
+  double *states, *indicators; /* where the model is; `indicators`: before the next step */
+  double *weights;             /* absolute tolerances */
+  double *slopes;              /* of the seven stages, one after another */
+  double *ends, *stage, *sixth; /* the states at the end of a step, of a stage, and of the sixth stage */
+  double *first_indicators, *last_indicators, *next_indicators; /* at the ends of an interval, and within it */
+  double tolerance, longest;    /* relative; longest step in s */
+  double time, next_event;
+  double step_size;             /* of the next step in s; 0: not known yet */
+  int64_t is_new;               /* whether the model was changed, so that the slope of the first stage is not known */
+  int64_t tells;                /* whether the FMU learns of completed steps */
+  int64_t asks_event, asks_end; /* what it has said then */
+  int64_t status, function, call; /* of a call that has failed: its place among those above, and of a setter */
+  int64_t steps, rejected;
+  int64_t stiff, not_stiff; /* steps in a row that were so; see `count_stiff` */
+  int64_t doubted;          /* whether the user knows that the model is stiff */
+  const Call *setters;      /* of held inputs, which are values in a row */
+  int64_t n_setters;
+  const char *row; /* the inputs of the step, and those that the model has */
+  char *held;
+  int64_t row_bytes, is_held;
+  int64_t result, terminated; /* terminated: the FMU has asked to end the simulation */
+} Equations;
+
+int equations_step(Equations *own, double end);
 
 /* ---- streams: see streams.c */
 

@@ -32,6 +32,7 @@ __all__ = [
     "Call",
     "Change",
     "Entry",
+    "EquationsTable",
     "Gate",
     "HeardTable",
     "IncomingTable",
@@ -76,7 +77,7 @@ WRONG_ROW: Final = 101
 class StepKind(IntEnum):
     """How a member takes its step."""
 
-    BY_PYTHON, FMI1, FMI2, FMI3 = range(4)
+    BY_PYTHON, FMI1, FMI2, FMI3, EQUATIONS = range(5)
 
 
 class Stage(IntEnum):
@@ -266,6 +267,16 @@ class _WithArrays(Structure):
             setattr(self, f"n_{name}", len(items))
 
 
+@_declared("Equations")
+class EquationsTable(_WithArrays):
+    """The equations of a model-exchange FMU, and their solver."""
+
+    def note(self, **changed: float | None) -> None:
+        """Change fields; see `ModelPlace`."""
+        for name, value in changed.items():
+            setattr(self, name, value)
+
+
 @_declared("Member")
 class MemberTable(_WithArrays):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
@@ -415,6 +426,8 @@ class _Library:
         self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
         self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
         self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
+        self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
+        self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
         self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
         self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))

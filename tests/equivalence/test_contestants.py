@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from benchmarks.commands import Command, RunFailed, run_command
-from benchmarks.contestants import c_program, fmu_mesh_kinds, ping_pong
+from benchmarks.contestants import c_model_exchange, c_program, fmpy_model_exchange, fmu_mesh_kinds, ping_pong
 from benchmarks.contestants.entry import compiled
 from benchmarks.contestants.reference import rows_of
 from benchmarks.environment import Peers
@@ -20,7 +20,10 @@ from benchmarks.jobs import JOBS, Job
 from benchmarks.running import Bench
 from benchmarks.task import System, Task
 from tests.fmus.helpers import NO_COMPILER
-from tests.helpers import wait_until
+from tests.helpers import Place, wait_until, write_config
+from tests.helpers import rows_of as rows_in
+from tests.plain_run import PlainRun
+from tests.planning import prepare
 
 needs_compiler = pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 BY_NAME = {job.name: job for job in JOBS}
@@ -114,6 +117,28 @@ def test_two_instances_of_each_kind_step_in_one_process(kind: str) -> None:
     outcome = fmu_mesh_kinds.run(Task(System("chain", "jacobi", 1.0, ()), 20, {"kind": kind}))
 
     assert outcome.seconds > 0.0
+
+
+@needs_compiler
+def test_the_c_program_of_model_exchange_has_our_floats(place: Place) -> None:
+    """So the job `model_exchange` compares the same calculation. FMPy interpolates the input, which we hold."""
+    task = Task(System("chain", "jacobi", 1.0, ()), 300, {"kind": "model_exchange_in_c"})
+    fmu_mesh_kinds.run(task)
+    oscillator = {"fmu": str(fmu_mesh_kinds.BUILT / "Oscillator2.fmu"), "kind": "model_exchange"}
+    config = write_config(
+        place.folder,
+        instances={name: {**oscillator, "solver": {"name": "dopri5"}} for name in ("first", "second")},
+        connections=["first.x -> second.u"],
+        stop_time=300 * fmu_mesh_kinds.STEP_SIZE,
+        simulation={"step_size": fmu_mesh_kinds.STEP_SIZE},
+        record={"file": "m.csv", "variables": ["first.x", "second.x"]},
+    )
+    PlainRun(prepare(config)).run()
+    ours = rows_in(place.folder / "m.csv")[-1][1:]
+
+    assert [*c_model_exchange.run(task).last.values()] == [*ours]
+    theirs = [*fmpy_model_exchange.run(task).last.values()]
+    assert theirs == pytest.approx([*ours], abs=1e-3)
 
 
 def started(tmp_path: Path, *labels: str) -> Bench:

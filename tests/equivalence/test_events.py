@@ -32,16 +32,18 @@ def both_ways(place: Place, content: Mapping[str, Any], *arguments: str) -> tupl
     return (place.folder / "launched.csv").read_bytes(), (place.folder / "local.csv").read_bytes()
 
 
-def system(event_fmu: EventFmu, kinds: Mapping[str, tuple[Version, str]], **connection: str) -> dict[str, Any]:
+def system(
+    event_fmu: EventFmu, kinds: Mapping[str, tuple[Version, str]], solver: str = "cvode", **connection: str
+) -> dict[str, Any]:
     """A ball, whose height drives an oscillator, whose state is integrated; and stairs that go up by its events."""
-    solver = {"relative_tolerance": 1e-7}
+    settings = {"name": solver, "relative_tolerance": 1e-7}
     models = {"ball": "Ball", "oscillator": "Oscillator", "integral": "Integral", "stairs": "Stairs"}
     instances = {}
     for name, model in models.items():
         version, kind = kinds[name]
         section: dict[str, Any] = {"fmu": str(event_fmu(model, version)), "kind": kind}
         if kind == "model_exchange":
-            section["solver"] = solver
+            section["solver"] = settings
         instances[name] = section
     instances["stairs"]["start_values"] = {"period": 0.31}
     return {
@@ -69,19 +71,37 @@ MIXED: Kinds = {
 
 
 @pytest.mark.parametrize("kinds", [ALL_1, ALL_2, ALL_3, MIXED], ids=["FMI 1", "FMI 2", "FMI 3", "mixed"])
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
 def test_a_chain_with_events_gives_the_same_floats(
-    kinds: Mapping[str, tuple[Version, str]], place: Place, event_fmu: EventFmu
+    solver: str, kinds: Mapping[str, tuple[Version, str]], place: Place, event_fmu: EventFmu
 ) -> None:
-    launched, local = both_ways(place, system(event_fmu, kinds))
+    launched, local = both_ways(place, system(event_fmu, kinds, solver))
+
+    assert launched == local
+    assert len(launched.splitlines()) == 302
+
+
+@pytest.mark.parametrize("arguments", [("--window", "1"), ("--window", "3"), ("--local",)], ids=" ".join)
+@pytest.mark.parametrize("group", [None, "all"])
+def test_complete_steps_in_c_give_the_same_floats_wherever_they_are(
+    arguments: tuple[str, ...], group: str | None, place: Place, event_fmu: EventFmu
+) -> None:
+    content = system(event_fmu, {**ALL_2, "oscillator": ALL_3["oscillator"], "ball": ALL_1["ball"]}, "dopri5")
+    for section in content["instances"].values():
+        section["group"] = group
+    content["connections"].append({"from": "integral.s", "to": "ball.u", "delay": 1, "factor": -0.5})
+
+    launched, local = both_ways(place, content, *arguments)
 
     assert launched == local
     assert len(launched.splitlines()) == 302
 
 
 @pytest.mark.parametrize("algorithm", ["jacobi", "gauss_seidel"])
-def test_linear_inputs_give_the_same_floats(algorithm: str, place: Place, event_fmu: EventFmu) -> None:
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
+def test_linear_inputs_give_the_same_floats(solver: str, algorithm: str, place: Place, event_fmu: EventFmu) -> None:
     kinds: Kinds = {**ALL_3, "integral": (2, "co_simulation")}
-    content = system(event_fmu, kinds, extrapolation="linear")
+    content = system(event_fmu, kinds, solver, extrapolation="linear")
     content["simulation"] |= {"algorithm": algorithm, "window": 7}
     content["instances"]["ball"]["step_size"] = 0.03  # a line over three steps of its target
 
@@ -116,8 +136,9 @@ def test_the_step_at_whose_end_an_fmu_asks_to_end_is_row(
     assert rows[-1][header.index(b"stairs.counter")] == b"3"
 
 
-def test_fmu_that_asks_to_end_ends_run_at_its_point_for_all(place: Place, event_fmu: EventFmu) -> None:
-    content = system(event_fmu, ALL_2)
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
+def test_fmu_that_asks_to_end_ends_run_at_its_point_for_all(solver: str, place: Place, event_fmu: EventFmu) -> None:
+    content = system(event_fmu, ALL_2, solver)
     content["instances"]["stairs"]["start_values"] |= {"end": 3, "increment": 1}
     content["connections"].pop()
     content["simulation"]["stop_time"] = 1000.0

@@ -24,6 +24,8 @@ from fmu_mesh.variables.value_types import Value
 from tests.fmus.event_fmus import Version
 
 EventFmu = Callable[..., Path]
+Solver = Literal["cvode", "dopri5", "euler"]
+EXACT: tuple[Solver, ...] = ("cvode", "dopri5")
 Extrapolation = Literal["hold", 0, 1]
 """Held inputs, or linear ones over a connection with this delay."""
 
@@ -87,7 +89,10 @@ def sine(stop_time: float, step_size: float) -> list[float]:
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_linear_inputs_are_more_exact_with_smaller_steps(name: str, event_fmu: EventFmu, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", EXACT)
+def test_linear_inputs_are_more_exact_with_smaller_steps(
+    method: Solver, name: str, event_fmu: EventFmu, tmp_path: Path
+) -> None:
     system = SYSTEMS[name]
     fmu = event_fmu(system.name, 2)
     # The co-simulation is good to 1e-11, and the line over 2.5 ms is as good as the sine to 4e-6.
@@ -97,7 +102,7 @@ def test_linear_inputs_are_more_exact_with_smaller_steps(name: str, event_fmu: E
         errors = []
         for step_size in (0.1, 0.025, 0.01):
             values = sine(system.stop_time, step_size)
-            solver = SolverSettings("cvode", tolerance)
+            solver = SolverSettings(method, tolerance)
             end = driven(fmu, tmp_path, system, values, step_size, delay, solver=solver)[-1]
             errors.append(float(np.max(np.abs(np.subtract(end, exact, dtype=np.float64)))))
 
@@ -117,11 +122,9 @@ def test_a_line_that_turns_too_sharply_begins_anew(event_fmu: EventFmu, tmp_path
     assert np.max(np.abs(np.subtract(rows, exact, dtype=np.float64))) <= 1e-8
 
 
-@pytest.mark.parametrize("solver", ["cvode", "euler"])
+@pytest.mark.parametrize("solver", ["cvode", "dopri5", "euler"])
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_a_line_that_goes_on_is_no_event(
-    version: Version, solver: Literal["cvode", "euler"], event_fmu: EventFmu, tmp_path: Path
-) -> None:
+def test_a_line_that_goes_on_is_no_event(version: Version, solver: Solver, event_fmu: EventFmu, tmp_path: Path) -> None:
     system = Driven("Integral", "u", ("s", "events"), {"level": 100.0}, 1.0)
     fmu = event_fmu("Integral", version)
     ramp = [0.1 * point for point in range(11)]
@@ -130,19 +133,21 @@ def test_a_line_that_goes_on_is_no_event(
 
     # One at the end of Initialization Mode, and one at the first step.
     assert {row[1] for row in rows} == {2}
-    if solver == "cvode":
+    if solver in EXACT:
         assert rows[-1][0] == pytest.approx(0.5, rel=1e-5)  # ten steps of a tolerance of 1e-6 each
 
 
 @pytest.mark.parametrize("extrapolation", ["hold", 0, 1])
+@pytest.mark.parametrize("solver", EXACT)
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_an_input_that_jumps_over_a_level_is_an_event(
-    version: Version, extrapolation: Extrapolation, event_fmu: EventFmu, tmp_path: Path
+    version: Version, solver: Solver, extrapolation: Extrapolation, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     system = Driven("Integral", "u", ("above", "last_change"), {"level": 0.5}, 1.0)
     jump = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
 
-    rows = driven(event_fmu("Integral", version), tmp_path, system, jump, 0.5, extrapolation)
+    settings = SolverSettings(solver)
+    rows = driven(event_fmu("Integral", version), tmp_path, system, jump, 0.5, extrapolation, solver=settings)
 
     # A value of the end of a step is the end of a ramp, which crosses the level in its middle.
     before, time = (2, 1.25) if extrapolation == 0 else (3, 1.5)
@@ -150,14 +155,17 @@ def test_an_input_that_jumps_over_a_level_is_an_event(
     assert rows[-1][1] == pytest.approx(time, abs=1e-9)  # the solver locates an event to a few units of rounding
 
 
+@pytest.mark.parametrize("solver", EXACT)
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_a_corrected_extrapolation_that_passes_a_level_is_an_event(
-    version: Version, event_fmu: EventFmu, tmp_path: Path
+    version: Version, solver: Solver, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     """The line ends at 0.46, and the next one begins at 0.52: too little for a jump, and the level is between."""
     system = Driven("Integral", "u", ("above", "last_change", "events"), {"level": 0.5}, 1.0)
 
-    rows = driven(event_fmu("Integral", version), tmp_path, system, [0.1, 0.28, 0.52, 0.76, 1.0], 0.5, 1)
+    ramp = [0.1, 0.28, 0.52, 0.76, 1.0]
+    settings = SolverSettings(solver)
+    rows = driven(event_fmu("Integral", version), tmp_path, system, ramp, 0.5, 1, solver=settings)
 
     assert [row[0] for row in rows] == [0, 0, 1, 1]
     assert rows[-1][1] == pytest.approx(1.0, abs=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -49,12 +50,14 @@ def simulated(
 
 @pytest.mark.parametrize(
     ("version", "kind"),
-    [(1, "model_exchange"), (2, "model_exchange"), (3, "model_exchange"), (2, "co_simulation"), (3, "co_simulation")],
+    [*itertools.product((1, 2, 3), ("cvode", "dopri5")), (2, "co_simulation"), (3, "co_simulation")],
 )
 def test_a_ball_bounces_at_the_times_of_the_formula(
     version: Version, kind: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
-    solver = {"solver": {"relative_tolerance": 1e-8}} if kind == "model_exchange" else {}
+    settings: dict[str, object] = {"kind": kind}
+    if kind != "co_simulation":
+        settings = {"kind": "model_exchange", "solver": {"name": kind, "relative_tolerance": 1e-8}}
 
     rows = simulated(
         tmp_path,
@@ -62,8 +65,7 @@ def test_a_ball_bounces_at_the_times_of_the_formula(
         ["last_bounce", "bounces"],
         stop_time=2.2,
         step_size=0.01,
-        kind=kind,
-        **solver,
+        **settings,
     )
 
     times = sorted({row[1] for row in rows if row[2]})
@@ -73,7 +75,10 @@ def test_a_ball_bounces_at_the_times_of_the_formula(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_a_time_event_happens_exactly_where_the_fmu_says(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
+def test_a_time_event_happens_exactly_where_the_fmu_says(
+    solver: str, version: Version, event_fmu: EventFmu, tmp_path: Path
+) -> None:
     rows = simulated(
         tmp_path,
         event_fmu("Stairs", version),
@@ -81,6 +86,7 @@ def test_a_time_event_happens_exactly_where_the_fmu_says(version: Version, event
         stop_time=3.0,
         step_size=0.1,
         kind="model_exchange",
+        solver={"name": solver},
         start_values={"period": 0.25},
     )
 
@@ -89,7 +95,7 @@ def test_a_time_event_happens_exactly_where_the_fmu_says(version: Version, event
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-@pytest.mark.parametrize("solver", ["cvode", "euler"])
+@pytest.mark.parametrize("solver", ["cvode", "dopri5", "euler"])
 def test_an_input_that_jumps_over_a_level_is_integrated_as_an_event(
     version: Version, solver: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
@@ -121,13 +127,16 @@ def test_an_input_that_jumps_over_a_level_is_integrated_as_an_event(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
 def test_model_exchange_agrees_with_co_simulation_of_the_same_model(
-    version: Version, event_fmu: EventFmu, tmp_path: Path
+    version: Version, solver: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     def run(fmu: Path, **instance: object) -> list[Row]:
         return simulated(tmp_path, fmu, ["x", "y"], stop_time=20.0, step_size=0.1, **instance)
 
-    ours = run(event_fmu("Oscillator", version), kind="model_exchange", solver={"relative_tolerance": 1e-9})
+    ours = run(
+        event_fmu("Oscillator", version), kind="model_exchange", solver={"name": solver, "relative_tolerance": 1e-9}
+    )
     theirs = run(event_fmu("Oscillator", 2), kind="co_simulation")
 
     # The co-simulation is good to 1e-11. A local tolerance of 1e-9 per step becomes a phase error of the cycle.

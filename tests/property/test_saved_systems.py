@@ -16,7 +16,17 @@ from tests.helpers import FMUS
 from tests.planning import plan_run
 
 H = 0.01
-OUTPUTS = ("slow.y", "fast.y", "delayed.y", "sum.y", "oscillator.x", "stairs.counter", "free.y", "pid.effort")
+OUTPUTS = (
+    "slow.y",
+    "fast.y",
+    "delayed.y",
+    "sum.y",
+    "oscillator.x",
+    "level.s",
+    "stairs.counter",
+    "free.y",
+    "pid.effort",
+)
 OTHERS = ("slow.u", "fast.k", "oscillator.y", "pid.p", "sum.u1")  # those that no row has
 KEPT = ("Integrator", "TransportDelay", "Adder", "Gain")
 
@@ -37,7 +47,8 @@ def systems(
         "fast": {"fmu": "Integrator", "start_values": {"y": 1.0}},
         "delayed": {"fmu": "TransportDelay", "start_values": {"d": 0.055}, "step_size": 2 * H},
         "sum": {"fmu": "Adder"},
-        "oscillator": {"fmu": str(event_fmu("Oscillator", 2)), "kind": "model_exchange", "solver": {"name": "euler"}},
+        "oscillator": {"fmu": str(event_fmu("Oscillator", 2)), "kind": "model_exchange", "solver": {"name": "dopri5"}},
+        "level": {"fmu": str(event_fmu("Integral", 3)), "kind": "model_exchange", "solver": {"name": "dopri5"}},
         "stairs": {"fmu": str(event_fmu("Stairs", 3)), "start_values": {"period": 0.07}},
         "free": {"fmu": "Gain"},
         "pid": {"controller": "position_pid", "start_values": {"p": 3.0, "i": 2.0}},
@@ -50,6 +61,7 @@ def systems(
         "slow.y -> sum.u2",
         {"from": "sum.y", "to": "oscillator.u", "extrapolation": "linear"},
         "sum.y -> pid.position",
+        "sum.y -> level.u",
     ]
     for instance in instances.values():
         if instance.get("fmu") in KEPT:

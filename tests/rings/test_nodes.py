@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
+EQUATIONS = HERE.parents[1] / "fmu_mesh/rings/model_exchange.c"  # which `burst.c` calls
 BURST = HERE.parents[1] / "fmu_mesh/rings/burst.c"
 SECONDS = int(os.environ.get("FMU_MESH_BURST_SECONDS", "1"))
 SANITIZERS = {"": ["-O2"], "thread": ["-O1", "-g"], "address,undefined": ["-O1", "-g", "-fno-sanitize-recover=all"]}
@@ -48,7 +49,10 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
             options += [f'-DBURST="{burst}"', f"-I{BURST.parent}"]  # a changed copy includes the header of the original
             command = [compiler, "-std=c11", "-ffp-contract=off", "-pthread", *options]
             made = subprocess.run(
-                [*command, HERE / "nodes.c", "-o", program, "-lm"], capture_output=True, text=True, check=False
+                [*command, HERE / "nodes.c", EQUATIONS, "-o", program, "-lm"],
+                capture_output=True,
+                text=True,
+                check=False,
             )
             if sanitizer and "cannot find" in made.stderr:
                 pytest.skip(f"the compiler has no -fsanitize={sanitizer}")

@@ -20,6 +20,7 @@ from hatchling.builders.wheel import WheelBuilder
 
 import build_library
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.instances.fmi.model_exchange.dormand_prince import Solved
 from fmu_mesh.rings import native
 from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, library_missed, load_library, why_no_library
 from tests.helpers import write_config
@@ -196,7 +197,9 @@ def test_library_of_older_sources_is_error_that_says_how_to_build_it(clone: Path
     )
 
 
-@pytest.mark.parametrize("known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd])
+@pytest.mark.parametrize(
+    "known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd, Solved]
+)
 def test_an_enumeration_has_the_names_of_the_header_in_their_order(known: type[IntEnum]) -> None:
     header = (LIBRARY.parent / "burst.h").read_text()
     declared = re.search(rf"enum {known.__name__} \{{ (.*) \}};", header)

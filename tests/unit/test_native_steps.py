@@ -17,8 +17,8 @@ from fmu_mesh.errors import FmuError, StepFailed, TerminationRequested
 from fmu_mesh.instances.call_guard import Guarded, Unwatched
 from fmu_mesh.instances.contract import LogMessage, StepsNatively
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.instances.fmi.co_simulation.native_instance import NativeInstance
 from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
+from fmu_mesh.instances.fmi.native_instance import NativeInstance
 from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.instances.fmi.step_options import StepOptions
 from fmu_mesh.rings import native

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import pytest
 
@@ -213,8 +213,8 @@ def test_the_inputs_of_the_last_event_come_back_as_they_were(row: tuple[Any, ...
     assert unpacked(packed(kept, b"of the FMU"), Bookkeeping, "m") == (kept, b"of the FMU")
 
 
-def linear(fmu: Path, folder: Path, ring: Ring) -> tuple[FmuInstance, Any]:
-    options = StepOptions(linear_inputs=(LinearInput("u", 1),), solver=SolverSettings("cvode"))
+def linear(fmu: Path, folder: Path, ring: Ring, solver: Literal["cvode", "dopri5"]) -> tuple[FmuInstance, Any]:
+    options = StepOptions(linear_inputs=(LinearInput("u", 1),), solver=SolverSettings(solver))
     inner = open_instance(fmu, "m", read_description(fmu, kind="model_exchange"), folder, options=options)
     instance: Any = stepped(inner, options)
     instance.enter_initialization(0.0, 10.0, {})
@@ -225,12 +225,15 @@ def linear(fmu: Path, folder: Path, ring: Ring) -> tuple[FmuInstance, Any]:
 
 
 @pytest.mark.parametrize("model", ["Integral", "Oscillator", "Ball"])
-def test_a_line_that_began_after_a_state_is_forgotten_with_it(model: str, event_fmu: EventFmu, tmp_path: Path) -> None:
+@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
+def test_a_line_that_began_after_a_state_is_forgotten_with_it(
+    solver: Literal["cvode", "dopri5"], model: str, event_fmu: EventFmu, tmp_path: Path
+) -> None:
     fmu = event_fmu(model, 2)
     ring = Ring(Layout.of(read_description(fmu).with_causality("input")), 32)
     for row in range(32):
         ring.put(row, "u", 1.0 if row < 8 else math.sin(row))
-    inner, instance = linear(fmu, tmp_path, ring)
+    inner, instance = linear(fmu, tmp_path, ring, solver)
     names = [variable.name for variable in inner.description.variables]
 
     def values(first: int, end: int) -> list[list[Value]]:

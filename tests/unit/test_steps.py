@@ -35,6 +35,7 @@ from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 EventFmu = Callable[..., Path]
 CO_SIMULATION: list[tuple[Version, Kind]] = [(2, "co_simulation"), (3, "co_simulation")]
 WITH_STATE: list[tuple[Version, Kind]] = [*CO_SIMULATION, (2, "model_exchange"), (3, "model_exchange")]
+EXACT = [StepOptions(), StepOptions(SolverSettings("dopri5"))]
 ALL: list[tuple[Version, Kind]] = [*WITH_STATE, (1, "model_exchange")]
 
 
@@ -199,13 +200,14 @@ def test_discrete_states_that_never_converge_are_an_error_and_no_hang(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
 def test_where_a_model_cannot_be_evaluated_the_solver_ends_with_its_words(
-    version: Version, event_fmu: EventFmu, tmp_path: Path
+    options: StepOptions, version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     fmu = event_fmu("Oscillator", version)
 
     def run() -> None:
-        with running(fmu, tmp_path, "model_exchange", limit=0.5) as oscillator:
+        with running(fmu, tmp_path, "model_exchange", options=options, limit=0.5) as oscillator:
             for step in range(20):
                 oscillator.do_step(step)
 
@@ -217,12 +219,13 @@ def test_where_a_model_cannot_be_evaluated_the_solver_ends_with_its_words(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
 def test_completed_steps_are_told_and_step_events_are_handled(
-    version: Version, event_fmu: EventFmu, tmp_path: Path
+    options: StepOptions, version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     """The oscillator asks for an event with every hundredth step of the solver."""
-    with running(event_fmu("Oscillator", version), tmp_path, "model_exchange", 2.0) as oscillator:
-        for step in range(5):
+    with running(event_fmu("Oscillator", version), tmp_path, "model_exchange", 2.0, options) as oscillator:
+        for step in range(25):
             oscillator.do_step(step)
 
         completed, events = oscillator.get_values(["completed_steps", "events"])
@@ -265,10 +268,11 @@ def test_euler_takes_as_many_steps_at_late_times_as_at_early_ones(
 
 @pytest.mark.parametrize(("version", "kind"), WITH_STATE)
 @pytest.mark.parametrize("model", ["Ball", "Stairs"])
+@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
 def test_instance_goes_on_bit_by_bit_from_state_that_it_was_in(
-    version: Version, kind: Kind, model: str, event_fmu: EventFmu, tmp_path: Path
+    options: StepOptions, version: Version, kind: Kind, model: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
-    with running(event_fmu(model, version), tmp_path, kind, 0.1) as instance:
+    with running(event_fmu(model, version), tmp_path, kind, 0.1, options) as instance:
         for step in range(6):
             instance.do_step(step)
         state = instance.get_state()
@@ -281,11 +285,12 @@ def test_instance_goes_on_bit_by_bit_from_state_that_it_was_in(
 
 
 @pytest.mark.parametrize(("version", "kind"), WITH_STATE)
+@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
 def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
-    version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path
+    options: StepOptions, version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     fmu = event_fmu("Ball", version)
-    with running(fmu, tmp_path, kind, 0.1) as instance:
+    with running(fmu, tmp_path, kind, 0.1, options) as instance:
         for step in range(6):
             instance.do_step(step)
         state = instance.get_state()
@@ -293,7 +298,7 @@ def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
         instance.free_state(state)
         there = outputs_after(instance, range(6, 20))
 
-    with running(fmu, tmp_path, kind, 0.1) as other:
+    with running(fmu, tmp_path, kind, 0.1, options) as other:
         state = other.deserialize_state(data)
         other.set_state(state)
 

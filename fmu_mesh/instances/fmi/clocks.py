@@ -16,7 +16,7 @@ from ...simtime import resolvable
 from ...variables.model_description import Clock
 from .fmu_values import SolverFailed
 
-__all__ = ["EVENT_ITERATIONS", "NO_CLOCKS", "Clocks", "EventInfo", "updated"]
+__all__ = ["EVENT_ITERATIONS", "NO_CLOCKS", "Clocks", "EventInfo", "unsettled", "updated"]
 
 EVENT_ITERATIONS: Final = 1000
 """After this many event iterations, or events at the same time, a model does not converge."""
@@ -38,6 +38,11 @@ def updated(fmu: Any) -> EventInfo:  # noqa: ANN401 FMPy is untyped
     """One event iteration of FMI 3.0 (fmi3UpdateDiscreteStates)."""
     again, terminate, _nominals, _states, defined, time = fmu.updateDiscreteStates()
     return EventInfo(bool(again), bool(terminate), float(time) if defined else math.inf)
+
+
+def unsettled(time: float) -> str:
+    """Why event mode at ``time`` (s) has no end, in words."""
+    return f"the discrete states at t = {time:.12g} s need more than {EVENT_ITERATIONS} updates"
 
 
 class Clocks:
@@ -100,7 +105,7 @@ class Clocks:
             if not info.again:
                 self._update_intervals(time)
                 return info
-        raise SolverFailed(f"the discrete states at t = {time:.12g} s need more than {EVENT_ITERATIONS} updates")
+        raise SolverFailed(unsettled(time))
 
     def _set_due(self, time: float) -> None:
         """Activate every input clock whose tick is at ``time`` (s)."""

@@ -55,6 +55,7 @@ class Bookkeeping(msgspec.Struct, frozen=True):
     ticks: tuple[float | None, ...] = ()  # the clocks; see `Clocks.place`
     # time of its last event mode in s, where the steps depend on it; None if there was none.
     last_event: float | None = None
+    solver: tuple[float, ...] = ()  # see `Solver.place`
 
 
 class FmuState(NamedTuple):

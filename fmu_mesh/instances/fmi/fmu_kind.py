@@ -27,6 +27,7 @@ from ...config.instance_sections import (
 )
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
+from ...rings.library import why_no_library
 from ...system.process_sharing import Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
@@ -41,13 +42,17 @@ class SolverConfig(Base, frozen=True, kw_only=True):
     """How the continuous states of a model-exchange FMU are solved."""
 
     name: Annotated[
-        Literal["cvode", "euler"],
-        Meta(description="cvode: variable step and order, finds events exactly; euler: fixed steps, for checks."),
+        Literal["cvode", "dopri5", "euler"],
+        Meta(
+            description="cvode: variable step and order, finds events exactly, also for stiff models; dopri5: the same "
+            "with order 5 and in C, for models that are not stiff; euler: fixed steps, for checks."
+        ),
     ] = "cvode"
     relative_tolerance: Annotated[
         float | None,
         Meta(
-            description="Relative tolerance of cvode; default: that of the FMU's default experiment, or 1e-6.",
+            description="Relative tolerance of cvode and dopri5; default: that of the default experiment of the FMU, "
+            "or 1e-6.",
             extra_json_schema=POSITIVE,
             examples=[1e-6],
         ),
@@ -146,6 +151,8 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             name = place.removeprefix("instances.")
             found = f"a solver for '{name}', which runs as co-simulation and has a solver of its own"
             findings.add(f"{place}.solver", found, "`kind: model_exchange`, or no solver")
+        elif self.solver.name == "dopri5" and (why := why_no_library()) is not None:
+            findings.add(f"{place}.solver.name", f"dopri5, whose steps the library of C takes; it is {why}", "`cvode`")
         if self.tolerance is not None and (refusal := _takes_no_tolerance(description)) is not None:
             why, expected = refusal
             findings.add(f"{place}.tolerance", f"{self.tolerance:g}, but {why}", expected)
@@ -158,7 +165,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
         else:
             settings = self.solver_settings(description)
-            tolerance = f" {settings.relative_tolerance:g}" if settings.name == "cvode" else ""
+            tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
         return f"FMI {description.fmi_version}{solver}"
 

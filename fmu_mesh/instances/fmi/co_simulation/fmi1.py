@@ -16,8 +16,8 @@ from ..calls import cffi_function, checked_function
 from ..fmi_versions import Fmi1
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
+from ..native_instance import NativeInstance
 from .discarded_steps import SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
-from .native_instance import NativeInstance
 
 __all__ = ["Fmi1Instance"]
 

@@ -17,8 +17,8 @@ from ..fmi_versions import Fmi2
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING
 from ..loaded_fmu import FmuFunctions
+from ..native_instance import NativeInstance
 from .discarded_steps import RETRY, SMALLER_STEPS, SMALLEST, StepStatus, discarded, take_sub_steps
-from .native_instance import NativeInstance
 
 __all__ = ["Fmi2Instance"]
 

@@ -31,8 +31,8 @@ from ..fmi_versions import Fmi3
 from ..fmu_instance import Bookkeeping
 from ..fmu_values import DISCARD, WARNING, PartCall, SolverFailed, Verb
 from ..loaded_fmu import FmuFunctions
+from ..native_instance import NativeInstance
 from .discarded_steps import SMALLEST
-from .native_instance import NativeInstance
 
 __all__ = ["Fmi3Instance", "Fmi3Steps"]
 

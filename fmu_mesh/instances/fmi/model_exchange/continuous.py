@@ -10,30 +10,31 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from fmpy.fmi1 import FMICallException, FMU1Model
+from fmpy.fmi1 import FMU1Model
 from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
 
+from ....rings.native import NativeStep, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
-from ..calls import cffi_function, memory
+from ...contract import LogMessage
+from ..calls import cffi_function
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
-from ..fmu_instance import Bookkeeping, FmuInstance
-from ..fmu_values import WARNING
+from ..fmu_instance import Bookkeeping
 from ..loaded_fmu import FmuFunctions
-from .model_calls import Fmi1Calls, Fmi3Calls, ModelCalls
+from ..native_instance import NativeInstance
+from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
+from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
 
 __all__ = ["ContinuousInstance", "Fmi1ModelInstance", "Fmi2ModelInstance", "Fmi3ModelInstance"]
-
-_RowBytes = tuple[bytes | list[Any], ...]
 
 _NAMES = {"instantiate": "fmiInstantiateModel", "fmi1FreeModelInstance": "fmiFreeModelInstance"}
 _NEEDED_1 = "fmiInstantiateModel", "fmiSetTime", "fmiInitialize", "fmiEventUpdate"
@@ -47,15 +48,17 @@ _NEEDED_3 = (
 )
 
 
-class ContinuousInstance(FmuInstance):
+class ContinuousInstance(NativeInstance):
     """The part of model exchange that all versions share; to be named before the base class of the version."""
 
     _calls: type[ModelCalls] = ModelCalls  # those of this version
 
+    _kind = StepKind.EQUATIONS
+    _solver_in_c: DormandPrinceSolver | None = None  # the solver, if the library takes complete steps
+
     _loop: EventLoop | None = None
     _inputs: Ring | None = None
     _clocks: Clocks = NO_CLOCKS
-    _row: _RowBytes = ()  # the inputs of the last step that are held
     _linear_columns: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
     """The columns of the other ones among those of type Float64."""
     _slopes: Mapping[str, float] = {}
@@ -70,13 +73,6 @@ class ContinuousInstance(FmuInstance):
         self._solver = f"solver {self._options.solver.name}: "
         self._time_of_start, self._stop_time = start_time, math.inf if stop_time is None else stop_time
         super().enter_initialization(start_time, stop_time, start_values)
-
-    def do_step(self, step: int) -> None:
-        """Set the inputs of row ``step``, advance to own step ``step + 1``, write the outputs to row ``step + 1``."""
-        self._checked(lambda: self._take_inputs(step, self._time_of(step)))
-        self._advance(self._time_of(step + 1))
-        self._said.note(step=step + 1)
-        self._read_outputs(step + 1)
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -98,9 +94,16 @@ class ContinuousInstance(FmuInstance):
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
+        solver = self._loop.solver if self._loop is not None else None
+        self._by_calls = bool(self._options.linear_inputs or self._clocks)
+        self._solver_in_c = solver if isinstance(solver, DormandPrinceSolver) and not self._by_calls else None
+        self._by_calls = self._solver_in_c is None
+        is_first, row = self._inputs is None, self._row.get()
         super().bind(inputs, outputs, grid, points, step)
-        if self._inputs is None and any(part.size for part in inputs.parts):
-            self._row = (b"not set yet",)
+        self._row: HeldRow = HeldRow()
+        if self._solver_in_c is not None and self._native is not None:
+            self._row = self._solver_in_c.share([part.in_table for part in self._setters], inputs)
+        self._row.put(NOT_SET if is_first and any(part.size for part in inputs.parts) else row)
         self._inputs = inputs
         linear = [inputs.layout.place(item.name).first for item in self._options.linear_inputs]
         self._linear_columns = np.array(linear, dtype=np.intp)
@@ -111,6 +114,39 @@ class ContinuousInstance(FmuInstance):
         if self._loop is not None:
             self._loop.close()
             self._loop = None
+
+    def _complete(self, step: int, status: int | None) -> None:
+        loop, solver, end = self._event_loop(), self._solver_in_c, self._time_of(step + 1)
+        assert solver is not None
+        if loop.terminated:
+            raise self._end_requested()
+        own = solver.table
+        if own.result == Solved.FAILED and own.call < own.n_setters:
+            raise self._part_failed("Set", self._setters[own.call], own.status)
+        at_event = own.result == Solved.AT_EVENT
+        asks_end = own.result == Solved.ENDS or bool(at_event and own.asks_end)
+        self._checked(lambda: solver.check(own.result))
+        if not self._checked(lambda: loop.go_on(end, asks_event=at_event, asks_end=asks_end)):
+            raise self._end_requested()
+        self._tell_doubt()
+
+    def _step_by_calls(self, step: int) -> None:
+        self._checked(lambda: self._take_inputs(step, self._time_of(step)))
+        self._advance(self._time_of(step + 1))
+        self._said.note(step=step + 1)
+        self._tell_doubt()
+        self._read_outputs(step + 1)
+
+    def _tables(self) -> NativeStep:
+        return super()._tables()._replace(setters=())  # the equations have them
+
+    def _step_address(self) -> int:
+        assert self._solver_in_c is not None
+        return ctypes.addressof(self._solver_in_c.table)
+
+    def _instantiate(self, **arguments: object) -> None:
+        super()._instantiate(**arguments)
+        self._row = HeldRow()
 
     def _tolerance(self) -> float | None:
         return self._options.solver.relative_tolerance
@@ -129,16 +165,19 @@ class ContinuousInstance(FmuInstance):
             self._said.step,
             time,
             next_event if math.isfinite(next_event) else None,
-            self._row,
+            self._row.get(),
             self._clocks.place,
+            solver=loop.solver.place,
         )
 
     def _restore(self, kept: Bookkeeping) -> None:
         super()._restore(kept)
-        self._row = kept.row
+        self._row.put(kept.row)
         self._clocks.resume(kept.ticks)
         next_event = math.inf if kept.next_event is None else kept.next_event
-        self._checked(lambda: (self._loop or self._make_loop()).resume(kept.time or 0.0, next_event))
+        loop = self._loop or self._make_loop()
+        loop.solver.resume(kept.solver)
+        self._checked(lambda: loop.resume(kept.time or 0.0, next_event))
 
     def _make_loop(self) -> EventLoop:
         self._loop = EventLoop(
@@ -162,6 +201,11 @@ class ContinuousInstance(FmuInstance):
         if loop.terminated or not self._checked(lambda: loop.advance(end)):
             raise self._end_requested()
 
+    def _tell_doubt(self) -> None:
+        """Tell once that another solver would be better."""
+        if (doubt := self._event_loop().solver.doubt()) is not None:
+            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step))
+
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.
 
@@ -172,13 +216,13 @@ class ContinuousInstance(FmuInstance):
             return
         slot = step & self._input_mask
         row, line = self._held(slot), self._line(slot, time)
-        if row != self._row or (line is not None and not self._goes_on):
-            self._row = row
+        if row != self._row.get() or (line is not None and not self._goes_on):
+            self._row.put(row)
             loop.set_inputs(lambda: self._set_inputs(step), line)
         elif line is not None:
             loop.follow(line)
 
-    def _held(self, slot: int) -> _RowBytes:
+    def _held(self, slot: int) -> RowBytes:
         """A row of inputs, with 0 in the place of the linear ones."""
         assert self._inputs is not None
         held: list[bytes | list[Any]] = []
@@ -190,29 +234,18 @@ class ContinuousInstance(FmuInstance):
             held.append(values.tolist() if row.dtype.hasobject else values.tobytes())
         return tuple(held)
 
-    def _line(self, slot: int, start: float) -> Callable[[float], None] | None:
-        """Sets the linear inputs at a time within the step that starts at ``start`` (s); None if there are none."""
+    def _line(self, slot: int, start: float) -> InputLine | None:
+        """The linear inputs within the step that starts at ``start`` (s); None if there are none."""
         slopes = self._slopes
         if not slopes:
             return None
         assert self._inputs is not None
-        count = len(slopes)
-        variables = [self._variables[name] for name in slopes]
-        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
-        values = (ctypes.c_double * count)()
         functions = self._functions.values
         function = cffi_function(self._function("Set", "Float64"), functions.declaration)
-        arguments = [self._self, memory(references), count, memory(values), *([count] if functions.sized else [])]
-        at_start = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
-        pairs = list(zip(at_start, slopes.values(), strict=True))
-
-        def set_inputs(time: float) -> None:
-            values[:] = [value + (time - start) * slope for value, slope in pairs]
-            status = function(*arguments)
-            if status > WARNING:
-                raise FMICallException(function=self._function_name("Set", "Float64"), status=status)
-
-        return set_inputs
+        setter = InputSetter(function, self._function_name("Set", "Float64"), self._self, functions.sized)
+        begins = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
+        references = [self._variables[name].value_reference for name in slopes]
+        return InputLine(setter, references, start, begins, [*slopes.values()])
 
 
 class Fmi1ModelInstance(ContinuousInstance, Fmi1):

@@ -8,24 +8,89 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
+from ....rings.native import Call, StepKind
 from ....variables.model_description import ModelDescription
-from ..calls import checked_function
+from ..calls import Function, Pointer, address_of, checked_function, memory
 from ..clocks import EventInfo, updated
 from ..fmu_library import MISSING
+from ..fmu_values import WARNING
 
-__all__ = ["Fmi1Calls", "Fmi3Calls", "ModelCalls"]
+__all__ = ["Fmi1Calls", "Fmi3Calls", "InputLine", "InputSetter", "ModelCalls"]
 
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
 _EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_void_p)
 _COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
+
+
+_MODES = {
+    "enter_event_mode": "EnterEventMode",
+    "update_discrete_states": "NewDiscreteStates",
+    "enter_continuous_time_mode": "EnterContinuousTimeMode",
+}
+
+
+class InputSetter(NamedTuple):
+    """A function of an FMU that sets Float64 inputs."""
+
+    function: Function
+    name: str
+    component: Pointer
+    is_sized: bool  # whether it takes the number of values
+
+
+class InputLine:
+    """Linear inputs within the step that begins at ``start`` (s); calling it sets them at a time.
+
+    ``begins`` are their values at ``start``, ``slopes`` in 1/s. ``setter`` is the function of the FMU.
+    """
+
+    def __init__(
+        self,
+        setter: InputSetter,
+        references: Sequence[int],
+        start: float,
+        begins: Sequence[float],
+        slopes: Sequence[float],
+    ) -> None:
+        self.name = setter.name  # of the function
+        self._setter = setter
+        self._count = len(references)
+        self._references = (ctypes.c_uint * self._count)(*references)
+        self._values, self._begins, self._slopes = (
+            (ctypes.c_double * self._count)(*numbers) for numbers in (begins, begins, slopes)
+        )
+        self._start = start
+        self._sizes = (self._count,) if setter.is_sized else ()
+        self._arguments = setter.component, memory(self._references), self._count, memory(self._values), *self._sizes
+
+    def __call__(self, time: float) -> None:
+        """Set the inputs at a time in s."""
+        self._values[:] = [
+            begin + (time - self._start) * slope for begin, slope in zip(self._begins, self._slopes, strict=True)
+        ]
+        if (status := self._setter.function(*self._arguments)) > WARNING:
+            raise FMICallException(function=self._setter.name, status=status)
+
+    def table(self) -> dict[str, Any]:
+        """The fields of `EquationsTable`; the line keeps what they point to."""
+        references, values = ctypes.addressof(self._references), ctypes.addressof(self._values)
+        self._call = Call(
+            address_of(self._setter.function), references, self._count, 0, values, *(self._sizes or (-1,))
+        )
+        return {
+            "line": ctypes.addressof(self._call),
+            "line_values": ctypes.addressof(self._begins),
+            "line_slopes": ctypes.addressof(self._slopes),
+            "line_start": self._start,
+        }
 
 
 class ModelCalls:
@@ -35,6 +100,8 @@ class ModelCalls:
         FMICallException: by every method: the FMU returned a status above warning.
     """
 
+    _kind = StepKind.FMI2
+    _modes: Mapping[str, str] = _MODES
     _nominals = "GetNominalsOfContinuousStates"
     _derivatives = "GetDerivatives"
 
@@ -44,7 +111,7 @@ class ModelCalls:
         self._fmu = fmu
         self._component = fmu.component
         self._symbols = symbols
-        self._line: Callable[[float], None] | None = None
+        self.line: InputLine | None = None  # see `follow`
         self._set_time = self._function("SetTime", _TIME)
         self._set_states = self._function("SetContinuousStates", _ARRAY)
         self._get_states = self._function("GetContinuousStates", _ARRAY)
@@ -55,9 +122,30 @@ class ModelCalls:
     def _function(self, name: str, prototype: Any) -> Any:  # noqa: ANN401 ctypes has no types
         return checked_function(self._fmu.dll, self._symbols, name, prototype)
 
-    def follow(self, line: Callable[[float], None] | None) -> None:
+    def follow(self, line: InputLine | None) -> None:
         """From now on, ``line`` sets inputs at the time of every `set_point`; None: they stay as they are."""
-        self._line = line
+        self.line = line
+
+    def table(self) -> tuple[dict[str, Any], dict[str, str]]:
+        """The fields of `EquationsTable` that are functions, and the names of these in FMI."""
+        names = {
+            "set_time": "SetTime",
+            "set_states": "SetContinuousStates",
+            "get_states": "GetContinuousStates",
+            "get_nominals": self._nominals,
+            "get_derivatives": self._derivatives,
+            "get_indicators": "GetEventIndicators",
+            "completed_step": "CompletedIntegratorStep",
+            **self._modes,
+        }
+        address = ctypes.c_void_p
+        made = {
+            field: ctypes.cast(getattr(self._fmu.dll, self._symbols + name), address).value
+            for field, name in names.items()
+        }
+        prefix = self._symbols.rpartition("_")[2]
+        told = {field: prefix + name for field, name in names.items()}
+        return {"kind": self._kind, "component": self._component, **made}, told
 
     def set_time(self, time: float) -> None:
         """Set the time in s."""
@@ -68,8 +156,8 @@ class ModelCalls:
         self._set_time(self._component, time)
         if self.n_states:
             self._set_states(self._component, states, self.n_states)
-        if self._line is not None:
-            self._line(time)
+        if self.line is not None:
+            self.line(time)
 
     def get_states(self, states: int) -> None:
         """The continuous states that the model is at."""
@@ -119,6 +207,8 @@ class Fmi1Calls(ModelCalls):
     FMPy takes the status of these functions for text and does not check it, so they are called by our own prototypes.
     """
 
+    _kind = StepKind.FMI1
+    _modes: Mapping[str, str] = {"update_discrete_states": "EventUpdate"}
     _nominals = "GetNominalContinuousStates"
 
     def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped
@@ -155,6 +245,8 @@ class Fmi1Calls(ModelCalls):
 class Fmi3Calls(ModelCalls):
     """FMI 3.0, where the FMU says itself how many states and indicators it has: it depends on structural parameters."""
 
+    _kind = StepKind.FMI3
+    _modes: Mapping[str, str] = _MODES | {"update_discrete_states": "UpdateDiscreteStates"}
     _derivatives = "GetContinuousStateDerivatives"
 
     def __init__(self, fmu: Any, description: ModelDescription, symbols: str) -> None:  # noqa: ANN401 FMPy is untyped

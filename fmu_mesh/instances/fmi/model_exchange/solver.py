@@ -13,17 +13,16 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, Protocol
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from ....simtime import resolvable, steps_between
 from ..fmu_values import DISCARD, SolverFailed
-from ..step_options import SolverSettings
 from .model_calls import ModelCalls
 
-__all__ = ["Solver", "make_solver"]
+__all__ = ["CVodeSolver", "EulerSolver", "ModelPlace", "Solver"]
 
 # Who meets here: one thread, in three languages. Python calls CVode, CVode calls back (`_RHS`, `_ROOT`), and this calls
 # the FMU. No exception may cross C: it is kept in `_failure`, CVode is told to give up, and it is raised once CVode has
@@ -71,11 +70,44 @@ _MOST_STALLED: Final = 100
 """Solver steps in a row that do not advance time beyond rounding."""
 
 
+class ModelPlace(Protocol):
+    """Where a model is."""
+
+    time: float  # in s
+    next_event: float  # the time of its next time event in s
+    terminated: bool  # whether the FMU has asked to end the simulation; it is not advanced then
+
+    def note(self, **changed: float) -> None:
+        """Change what is given by its name."""
+
+
+class _PlainPlace:
+    time = 0.0
+    next_event = math.inf
+    terminated = False
+
+    def note(self, **changed: float) -> None:
+        self.__dict__.update(changed)
+
+
 class Solver:
     """Base of the solvers, and the one for a model with neither continuous states nor event indicators.
 
-    Call sequence: `restart`, then `step` from where the last one ended; `restart` after every event; `close`.
+    Call sequence: `restart`, then `step` from where the last one ended, and `complete` if the FMU is told of completed
+    steps; `restart` after every event; `close`.
     """
+
+    def __init__(self, equations: ModelCalls) -> None:
+        self.at: ModelPlace = _PlainPlace()
+        self._equations = equations
+
+    @property
+    def place(self) -> tuple[float, ...]:
+        """What a state keeps besides that of the model."""
+        return ()
+
+    def resume(self, place: tuple[float, ...]) -> None:
+        """Continue where `place` was, after `restart`."""
 
     def restart(self) -> None:
         """Begin anew, at the states and nominal values of the model."""
@@ -91,17 +123,26 @@ class Solver:
         """
         return stop, False  # the event loop puts a model without states there
 
+    def complete(self) -> tuple[bool, bool]:
+        """Tell the FMU that the step is completed; whether it asks for event mode, and to end the simulation."""
+        return self._equations.completed_step()
+
+    def doubt(self) -> str | None:
+        """Why another solver would be better for this model, in words, the first time; None if nothing says so."""
+        return None
+
     def close(self) -> None:
         """Free its memory."""
 
-
-def make_solver(settings: SolverSettings, equations: ModelCalls) -> Solver:
-    """The solver for these settings; one that does nothing for a model without states and event indicators."""
-    if equations.n_states == 0 and equations.n_indicators == 0:
-        return Solver()
-    if settings.name == "euler":
-        return EulerSolver(equations, settings.maximum_step_size)
-    return CVodeSolver(equations, settings.relative_tolerance, settings.maximum_step_size)
+    def _give_up(self, why: str, time: float, states: int) -> NoReturn:
+        """End with ``why``, and with a derivative that is not finite at a time in s, at these states."""
+        derivatives = np.zeros(self._equations.n_states)
+        with suppress(FMICallException):
+            self._equations.set_point(time, states)
+            self._equations.get_derivatives(derivatives.ctypes.data)
+        wrong = np.flatnonzero(~np.isfinite(derivatives))
+        told = f"; derivative {wrong[0] + 1} of {len(derivatives)} is {derivatives[wrong[0]]}" if len(wrong) else ""
+        raise SolverFailed(f"{why}{told}")
 
 
 class EulerSolver(Solver):
@@ -111,7 +152,7 @@ class EulerSolver(Solver):
     """
 
     def __init__(self, equations: ModelCalls, maximum_step_size: float | None) -> None:
-        self._equations = equations
+        super().__init__(equations)
         self._maximum = maximum_step_size
         self._states = np.zeros(equations.n_states)
         self._derivatives = np.zeros(equations.n_states)
@@ -164,7 +205,7 @@ class CVodeSolver(Solver):
     """
 
     def __init__(self, equations: ModelCalls, relative_tolerance: float, maximum_step_size: float | None) -> None:
-        self._equations = equations
+        super().__init__(equations)
         self._relative_tolerance = relative_tolerance
         self._n = max(equations.n_states, 1)
         self._api = api = _sundials()
@@ -237,10 +278,10 @@ class CVodeSolver(Solver):
             self._is_new, self._states[:] = True, states
             flag = self._call(time, stop, reached)
         if flag < 0:
-            self._give_up(time, self._said or f"CVode returned {flag}")
+            self._fail(time, self._said or f"CVode returned {flag}")
         self._stalled = 0 if resolvable(time, reached.value) else self._stalled + 1
         if self._stalled > _MOST_STALLED:
-            self._give_up(time, f"CVode makes no progress at t = {time:.12g} s")
+            self._fail(time, f"CVode makes no progress at t = {time:.12g} s")
         self._equations.set_point(reached.value, self._x_data)
         return reached.value, flag == _CV_ROOT_RETURN
 
@@ -264,16 +305,11 @@ class CVodeSolver(Solver):
         self._check(self._api.CVodeSetStopTime(self._memory, stop))
         return int(self._api.CVode(self._memory, stop, self._x, ctypes.byref(reached), _CV_ONE_STEP))
 
-    def _give_up(self, time: float, why: str) -> NoReturn:
-        """End with what the model failed with during this step, or else with ``why``, and a derivative that is NaN."""
+    def _fail(self, time: float, why: str) -> NoReturn:
+        """End with what the model failed with during this step, or else with ``why``."""
         if self._failure is not None:
             raise self._failure
-        derivatives = np.zeros(self._n)
-        with suppress(FMICallException):
-            self._derivatives(time, self._x_data, derivatives.ctypes.data)
-        wrong = np.flatnonzero(~np.isfinite(derivatives))
-        told = f"; derivative {wrong[0] + 1} of {self._n} is {derivatives[wrong[0]]}" if len(wrong) else ""
-        raise SolverFailed(f"{why}{told}")
+        self._give_up(why, time, self._x_data)
 
     def _derivatives(self, time: float, x: int, dx: int) -> None:
         self._equations.set_point(time, x)

@@ -1,4 +1,4 @@
-"""A co-simulation FMU whose step is one call of the library: inputs, doStep and outputs by tables (`burst.c`).
+"""An FMU whose step is one call of the library: inputs, doStep and outputs by tables (`burst.c`).
 
 Owns the tables, and the steps that the library does not take or does not complete: those are taken call by call. A
 version of FMI adds how a step is taken and what its statuses mean.
@@ -11,15 +11,15 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from ....errors import NotFinite
-from ....rings import native
-from ....rings.native import MemberTable, Move, NativeStep, Span, Stage, StepKind
-from ....rings.ring import Ring
-from ....simtime import TimeGrid
-from ..buffers import NumberBuffer
-from ..calls import Function, Pointer, address_of, cffi_function, pointer
-from ..fmu_instance import FmuInstance
-from ..fmu_values import PartCall
+from ...errors import NotFinite
+from ...rings import native
+from ...rings.native import MemberTable, Move, NativeStep, Span, Stage, StepKind
+from ...rings.ring import Ring
+from ...simtime import TimeGrid
+from .buffers import NumberBuffer
+from .calls import Function, Pointer, address_of, cffi_function, pointer
+from .fmu_instance import FmuInstance
+from .fmu_values import PartCall
 
 __all__ = ["NativeInstance"]
 
@@ -27,7 +27,7 @@ _MEMBER_STEP: Final = "int64_t (*)(void *, int64_t)"
 
 
 class NativeInstance(FmuInstance):
-    """The part of co-simulation that all versions share; to be named before the base class of the version.
+    """An FMU of any kind and version; to be named before the base class of the version.
 
     `StepsNatively` without text, and where a step is nothing but setters, doStep and getters.
     """
@@ -124,11 +124,15 @@ class NativeInstance(FmuInstance):
         self._said.note(step=step + 1)
         self._read_outputs(step + 1)
 
+    def _step_address(self) -> int:
+        """What `NativeStep.do_step` is."""
+        return address_of(self._do_step)
+
     def _tables(self) -> NativeStep:
         return NativeStep(
             kind=self._kind,
             component=self._component,
-            do_step=address_of(self._do_step),
+            do_step=self._step_address(),
             said=ctypes.addressof(self._said),
             loads=[move for part in self._setters for move in _moves(part, load=True)],
             setters=[part.in_table for part in self._setters],
