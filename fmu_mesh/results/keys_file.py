@@ -93,7 +93,9 @@ def recorded_keys(path: Path) -> RecordedKeys:
         return RecordedKeys(str(path.absolute()), sha256_of(path))
     except OSError as error:
         text = f"'{path}' cannot be read: {error.strerror}"
-        raise ConfigurationError(text, hint="It is written beside the first result file of a run with keys.") from error
+        raise ConfigurationError(
+            text, hint="`keys_from` takes the first result of a run with keys, which has this file beside it."
+        ) from error
 
 
 def recorded_values(

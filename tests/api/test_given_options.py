@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
@@ -32,6 +33,7 @@ RIGHT: Mapping[str, Any] = {
     "record": ["pendulum.a"],
     "output": "out.csv",
     "scenario": {"events": []},
+    "keys_from": os.devnull,
     "listen": ["tcp/127.0.0.1:0"],
     "connect": ["tcp/127.0.0.1:7447"],
     "paused": False,
@@ -106,7 +108,7 @@ CALLS = {
     "check": Call(PlanOptions, lambda mesh, **options: mesh.check(**options).require(), {}),
     "run": Call(RunOptions, fmu_mesh.Mesh.run, SHORT),
     "start": Call(RunOptions, started, SHORT),
-    "open": Call(OpenOptions, opened, {}),
+    "open": Call(OpenOptions, opened, {}, {**RIGHT, "keys_from": None}),
     "simulate": Call(SimulateOptions, simulated, {**SHORT, "step_size": 0.002}, {**RIGHT, **OF_ONE_FMU}),
     "sweep": Call(SweepOptions, swept, {"stop_time": 0.004, "executor": Nowhere()}),
 }
