@@ -328,7 +328,6 @@ def test_a_run_after_a_reset_is_repeated(place: Place, endpoint: str) -> None:
         other = [{**one, "value": 2.0 * one["value"]} for one in waves(200)]
         wait_until(lambda: run.instance_status("sum").keys[0].received == 0, "a fresh status")
         put_values(session, "plant/u", other)
-        run.resume()
         run.wait(DEADLINE_S)
 
     results = [config.with_suffix(".csv"), config.with_name("live-2.csv")]

@@ -384,6 +384,11 @@ NOT_RUN = [
         "it needs root, and takes minutes; tests/faults/test_far_link.py runs it over one network",
     ),
     (
+        "docs/performance.md",
+        ".venv/bin/python -m benchmarks.live_data --parts clients --seconds 10 --repeat 1",
+        "it takes an hour, and figures of a busy machine mean nothing",
+    ),
+    (
         "docs/profiling.md",
         "$ pgrep -af '^fmu-mesh'",
         "it lists the processes of all meshes of this host; tests/faults/test_fork_server.py reads the titles",

@@ -40,7 +40,7 @@ CDR = {"encoding": "cdr", "type": "std_msgs/msg/Float64"}
 
 WRONG: tuple[tuple[dict[str, Any], str], ...] = (
     ({**IN, "key": "plant/*/u"}, "one key, or `take: newest` as well"),
-    ({**IN, "key": "plant/**", "take": "newest", "wait": True, "time": "t"}, "a wait for a key with a wildcard"),
+    ({**IN, "key": "plant/**", "take": "newest", "wait": True, "time": "t"}, "true for a key with a wildcard"),
     ({**IN, "key": "/plant"}, "a Zenoh key such as plant/pump/flow"),
     ({**IN, "key": "plant//u"}, "a Zenoh key such as plant/pump/flow"),
     ({**IN, "key": "plant/u?x"}, "a Zenoh key such as plant/pump/flow"),
