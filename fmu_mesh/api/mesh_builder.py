@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from ..config.call_options import checked, takes
 from ..config.instance_sections import KIND
+from ..config.key_sections import KEY
 from ..config.loading import PlainConfig, read_text
 from ..config.mesh import LimitsConfig
 from ..config.plain_values import plain
@@ -359,7 +360,7 @@ class Mesh:
 
         def keeps(one: object, other: object) -> bool:
             pairs = (source, one), (target, other)
-            return any(wanted is not None and end not in (wanted, f"key {wanted}") for wanted, end in pairs)
+            return any(wanted is not None and end not in (wanted, f"{KEY}{wanted}") for wanted, end in pairs)
 
         left, there = with_connections(self._plain, keeps), connections_of(self._plain)
         if source is target is None or len(connections_of(left)) == len(there):

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from ..config.findings import ValueOrigin
 from ..config.instance_sections import InstanceSection, key_of, keys_of
+from ..config.key_sections import KEY
 from ..config.loading import PlainConfig
 from ..config.plain_values import plain as plain_value
 from ..errors import CallRefused, ConfigurationError, UnknownName
@@ -162,7 +163,7 @@ def connections_of(plain: PlainConfig) -> list[Any]:
 def ends_of(connection: Any) -> tuple[Any, Any]:  # noqa: ANN401  as a file has it
     """Source and target of a connection in one of its two forms; a Zenoh key is `key <key>`."""
     if isinstance(connection, dict):
-        key = f"key {connection['key']}" if "key" in connection else None
+        key = f"{KEY}{connection['key']}" if "key" in connection else None
         return connection.get("from", key), connection.get("to", key)
     source, _, target = str(connection).partition("->")
     return source.strip(), target.strip()

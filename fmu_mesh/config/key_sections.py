@@ -5,7 +5,7 @@ Owns the keys of the file, and how people see one. What they mean is `fmu_mesh.s
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -13,7 +13,10 @@ from msgspec import Meta
 from fmu_mesh.config.base import NOT_NEGATIVE, POSITIVE, Base
 from fmu_mesh.config.instance_sections import KIND
 
-__all__ = ["KeyInputConfig", "KeyOutputConfig", "KeyView"]
+__all__ = ["KEY", "KeyInputConfig", "KeyOutputConfig", "KeyView"]
+
+KEY: Final = "key "
+"""Before the name of a key, where else an instance feeds an input, or takes an output."""
 
 Key = Annotated[str, Meta(description="A Zenoh key.", examples=["plant/pump/flow"], extra_json_schema={"minLength": 1})]
 Factor = Annotated[float, Meta(description="The value is factor * number + offset; Real only.")]

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection
-from fmu_mesh.config.key_sections import KeyInputConfig, KeyOutputConfig
+from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
 from fmu_mesh.config.scenario_section import ScenarioConfig
 
@@ -407,7 +407,7 @@ def config_type(sections: tuple[type[InstanceSection], ...]) -> type[Config]:
 def sources_of(connections: Iterable[ConnectionConfig | KeyInputConfig | KeyOutputConfig]) -> dict[str, str]:
     """By the name of each input with a connection, right or wrong: the source instance, or the key in words."""
     return {
-        one.target: f"key {one.key}" if isinstance(one, KeyInputConfig) else one.source.partition(".")[0]
+        one.target: f"{KEY}{one.key}" if isinstance(one, KeyInputConfig) else one.source.partition(".")[0]
         for one in connections
         if not isinstance(one, KeyOutputConfig)
     }

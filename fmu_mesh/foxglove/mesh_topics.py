@@ -12,6 +12,7 @@ from typing import Any, Final, cast
 
 import msgspec
 
+from ..config.key_sections import KEY
 from ..variables.value_types import FMI2_TYPES, VariableType, is_float, split_element
 from ..wire.client.readings import Reading, Target
 from ..wire.views import InstanceInfo, MeshStatus, VariableView
@@ -105,10 +106,10 @@ def topics_by_instance(
         for key in info.keys:
             variable = f"{name}.{key.variable}"
             if key.direction == "in":
-                sources[variable] = f"key {key.key}"
+                sources[variable] = f"{KEY}{key.key}"
                 readers[variable] = {name: None}
             else:
-                readers.setdefault(variable, {})[f"key {key.key}"] = None
+                readers.setdefault(variable, {})[f"{KEY}{key.key}"] = None
     return {
         topic_of(target): (sources.get(target.name, target.instance), tuple(readers.get(target.name, ())))
         for target in targets

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
+from ..config.key_sections import KEY
 from .drawing import CYCLE_COLOURS, FAINT, INK, STATE_COLOURS, WIRE
 from .graph_layout import Arrangement, Dot, Wire, arranged
 from .result_drawing import in_unit
@@ -398,7 +399,7 @@ def _tip(edge: GraphEdge, variable: GraphVariable) -> str:
     end += variable.rule or (f"delay {edge.delay}" if edge.delay >= 0 else "in the initialization")
     end += (", closes a cycle" if edge.closes_cycle else "") + (f", map {variable.map}" if variable.map else "")
     ends = (edge.source, variable.source), (edge.target, variable.target)
-    return " -> ".join(f"{name} ({own})" if name.startswith("key ") else f"{name}.{own}" for name, own in ends) + end
+    return " -> ".join(f"{name} ({own})" if name.startswith(KEY) else f"{name}.{own}" for name, own in ends) + end
 
 
 def _port_text(name: str, unit: str) -> str:

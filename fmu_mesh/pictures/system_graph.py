@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec.structs import replace
 
-from ..config.key_sections import KeyView
+from ..config.key_sections import KEY, KeyView
 from ..config.ros_section import MeshTopic
 from ..printing import page
 from ..system.graph import strongly_connected, topological_order
@@ -159,7 +159,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
         boxes: dict[str, list[KeyView]] = {}
         edges = list(self.edges)
         for own in self.keys:
-            boxes.setdefault(name := f"key {own.key}", []).append(own)
+            boxes.setdefault(name := f"{KEY}{own.key}", []).append(own)
             ends = [(name, own.encoding), (own.instance, own.variable)]
             (source, output), (target, input_) = ends if own.direction == "in" else reversed(ends)
             edges.append(GraphEdge(source, target, 0, (GraphVariable(output, input_, rule=own.rule),)))

@@ -15,7 +15,7 @@ from typing import Final, Literal
 import msgspec
 
 from ..config.findings import Findings
-from ..config.key_sections import KeyInputConfig, KeyOutputConfig, KeyView
+from ..config.key_sections import KEY, KeyInputConfig, KeyOutputConfig, KeyView
 from ..simtime import steps_between
 from ..text import listed, shown
 from ..variables.model_description import Variable
@@ -27,7 +27,6 @@ from .given_units import type_in_words, unit_change
 from .start_values import why_not_settable
 
 __all__ = [
-    "KEY",
     "KeyInput",
     "KeyOutput",
     "KeyPath",
@@ -44,9 +43,6 @@ KeyPath = tuple[str | int | tuple[str, str], ...]
 
 KeyValue = tuple[str, int, float | None, PlainValue]
 """Instance and variable, the point at which the instance took it, the time in s from which on it holds, value."""
-
-KEY: Final = "key "
-"""Before the name of a key, where else an instance feeds an input."""
 
 _PART: Final = re.compile(r"""(?:^|\.)([^.\[\]]+)|\[(\d{1,9})\]|\[(\w+)=(["']?)(.+?)\4\]""")
 _CHUNK: Final = re.compile(r"(\*\*?|([^*$#?/]|\$\*)+)")

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, placed
+from ..config.key_sections import KEY
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
 from ..variables.model_description import Variable
@@ -26,7 +27,7 @@ from .initialization_plan import InitializationPlan, Loop, check_loops, plan_ini
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
-from .live_keys import KEY, KeyInput, KeyOutput, RecordedKeys
+from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from fmu_mesh import files
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
-from fmu_mesh.config.key_sections import KeyView
+from fmu_mesh.config.key_sections import KEY, KeyView
 from fmu_mesh.config.loading import LoadedConfig
 from fmu_mesh.config.mesh import Config, sources_of
 from fmu_mesh.config.ros_section import MeshTopic
@@ -30,7 +30,7 @@ from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import check_extrapolation
-from fmu_mesh.system.live_keys import KEY, KeyInput, KeyOutput, RecordedKeys, key_views, resolve_keys
+from fmu_mesh.system.live_keys import KeyInput, KeyOutput, RecordedKeys, key_views, resolve_keys
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
