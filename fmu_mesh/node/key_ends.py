@@ -10,7 +10,7 @@ import zenoh.ext
 from zenoh.handlers import Callback
 
 from ..config.mesh import TimeoutsConfig
-from ..rings.host_memory import Counter, HostMemory
+from ..rings.host_memory import HostMemory
 from ..system.live_keys import KeyInput, KeyValue
 from ..system.memory_map import map_memory
 from ..wire.session import undeclare_all
@@ -55,7 +55,7 @@ class KeyEnds:
         self._around = post, log, tell
         self._feeds: list[KeyFeed] = []
         self._subscribers: list[_Subscriber] = []
-        self._blocking: list[tuple[KeyOutputs, Counter]] = []
+        self._blocking: list[KeyOutputs] = []
 
     def serve(self, runners: Mapping[str, Runner]) -> None:
         """Subscribe and declare publishers; what comes from now on is used from point 0 on."""
@@ -75,7 +75,7 @@ class KeyEnds:
             if any(not own.blocks for own in runner.plan.keys_out):
                 self.lossy.append(KeyOutputs(runner, self._session, None, self._around[0]))
             if (counter := counters.get(f"keys of {runner.name}")) is not None:
-                self._blocking.append((KeyOutputs(runner, self._session, counter, self._around[0]), counter))
+                self._blocking.append(KeyOutputs(runner, self._session, counter, self._around[0]))
 
     def _subscriber(self, feed: KeyFeed, own: KeyInput) -> _Subscriber:
         """A subscriber; if steps wait for the key, it also gets what was published before, or lost with a link."""
@@ -94,7 +94,7 @@ class KeyEnds:
         """At point 0: use what has come before, and publish the first values."""
         for feed in self._feeds:
             feed.begin()
-        for outputs in (*self.lossy, *(own for own, _ in self._blocking)):
+        for outputs in (*self.lossy, *self._blocking):
             outputs.begin()
         self.publish_now()
 
@@ -102,7 +102,8 @@ class KeyEnds:
     def windows(self) -> Windows:
         """How far the node may be ahead: of the values that its steps wait for, and of outputs that block."""
         limits = [(feed.words, feed.counter, 1) for feed in self._feeds if feed.counter is not None]
-        return limits + [(f"the keys of '{own.runner.name}'", counter, own.window) for own, counter in self._blocking]
+        blocking = [(f"the keys of '{own.runner.name}'", own.counter, own.window) for own in self._blocking]
+        return limits + [(words, counter, window) for words, counter, window in blocking if counter is not None]
 
     @property
     def publishes(self) -> bool:
@@ -111,7 +112,7 @@ class KeyEnds:
 
     def publish_now(self) -> None:
         """Publish the rows that may not be lost; waits for who is slow."""
-        for outputs, _ in self._blocking:
+        for outputs in self._blocking:
             outputs.publish_now()
 
     def waits_for(self, name: str) -> str | None:
@@ -126,7 +127,7 @@ class KeyEnds:
         """
         for feed in self._feeds:
             feed.check(granted, now, self._timeouts.step)
-        for outputs, _ in self._blocking:
+        for outputs in self._blocking:
             outputs.check(granted, now, self._timeouts.step)
 
     def look(self, now: float) -> None:
@@ -136,12 +137,12 @@ class KeyEnds:
 
     def statuses(self, name: str) -> tuple[KeyStatus, ...]:
         """What `status` says of the keys of an instance; from any thread."""
-        outputs = (own for own in (*self.lossy, *(own for own, _ in self._blocking)) if own.runner.name == name)
+        outputs = (own for own in (*self.lossy, *self._blocking) if own.runner.name == name)
         feeds = (feed.status for feed in self._feeds if feed.runner.name == name)
         return (*feeds, *(status for own in outputs for status in own.statuses))
 
     def close(self) -> None:
         """Undeclare everything."""
         undeclare_all(self._subscribers)
-        for outputs in (*self.lossy, *(own for own, _ in self._blocking)):
+        for outputs in (*self.lossy, *self._blocking):
             outputs.close()
