@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from threading import Lock
+from typing import Any, Final
 
 import zenoh
 import zenoh.ext
@@ -20,7 +21,10 @@ from .key_inputs import KeyFeed
 from .key_outputs import KeyOutputs
 from .stepping import Runner
 
-__all__ = ["KeyEnds"]
+__all__ = ["FromTheFirst", "KeyEnds"]
+
+_HISTORY_S: Final = 10.0
+_MOST_HELD: Final = 1 << 12
 
 _Subscriber = zenoh.Subscriber[Any] | zenoh.ext.AdvancedSubscriber[Any]
 
@@ -79,9 +83,9 @@ class KeyEnds:
 
     def _subscriber(self, feed: KeyFeed, own: KeyInput) -> _Subscriber:
         """A subscriber; if steps wait for the key, it also gets what was published before, or lost with a link."""
-        take = Callback(feed.arrived, indirect=False)
         if not own.wait:
-            return self._session.declare_subscriber(own.key, take)
+            return self._session.declare_subscriber(own.key, Callback(feed.arrived, indirect=False))
+        take = Callback(FromTheFirst(self._session, feed.arrived), indirect=False)
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
         recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         subscriber = zenoh.ext.declare_advanced_subscriber(
@@ -146,3 +150,65 @@ class KeyEnds:
         undeclare_all(self._subscribers)
         for outputs in (*self.lossy, *self._blocking):
             outputs.close()
+
+
+class FromTheFirst:
+    """What an advanced subscriber calls: passes the samples of each publisher on, from its first one.
+
+    The subscriber of Zenoh asks for what was published before it came. A value that comes meanwhile may be passed on at
+    once, and then the earlier ones are dropped (1.10.2: if the publisher was detected as a late one, too). So this
+    class asks again for what is before the first sample of a publisher. Called on threads of Zenoh.
+    """
+
+    def __init__(self, session: zenoh.Session, pass_on: Callable[[zenoh.Sample], object]) -> None:
+        self._session, self._pass_on = session, pass_on
+        self._lock = Lock()
+        self._held: dict[tuple[str, int], list[zenoh.Sample]] = {}  # of each publisher; empty when nothing is missing
+
+    def __call__(self, sample: zenoh.Sample) -> None:
+        """A sample has come."""
+        info = sample.source_info
+        source = (str(info.source_id.zid), info.source_id.eid) if info is not None else None
+        with self._lock:
+            is_first = source is not None and source not in self._held
+            held = self._held.setdefault(source, []) if source is not None else []
+            if (held or (is_first and info is not None and info.source_sn > 0)) and len(held) < _MOST_HELD:
+                held.append(sample)
+            else:
+                is_first = False
+                self._pass_held(held)
+                self._pass_on(sample)
+        if is_first and held and source is not None:
+            self._ask(f"{sample.key_expr}/@adv/pub/{source[0]}/{source[1]}/**", held)
+
+    def _ask(self, key: str, held: list[zenoh.Sample]) -> None:
+        found: list[zenoh.Sample] = []
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found.append(reply.ok)
+
+        def end() -> None:
+            with self._lock:
+                if held:
+                    first = _number(held[0])
+                    held[:0] = sorted((own for own in found if _number(own) < first), key=_number)
+                    self._pass_held(held)
+
+        self._session.get(
+            key,
+            Callback(take, end, indirect=False),
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_HISTORY_S,
+        )
+
+    def _pass_held(self, held: list[zenoh.Sample]) -> None:
+        for own in held:
+            self._pass_on(own)
+        held.clear()
+
+
+def _number(sample: zenoh.Sample) -> int:
+    """Of a sample among those of its publisher."""
+    return sample.source_info.source_sn if sample.source_info is not None else 0
