@@ -26,7 +26,7 @@ from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
 from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.overriding import memory_file, memory_of
-from ..run.preparing import KnownModels, planned, without_keys
+from ..run.preparing import KnownModels, planned
 from ..run.run_plan import RunPlan
 from ..ssp.configuration_files import read_configuration
 from ..text import counted, listed, shown
@@ -635,7 +635,7 @@ class Mesh:
 
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `system.set`.")
-        return System(without_keys(self.plan(**options.given())))
+        return System(self.plan(**options.given()))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

@@ -34,6 +34,7 @@ __all__ = [
     "Kind",
     "LogMessage",
     "Opening",
+    "Prepares",
     "Showing",
     "StepsNatively",
 ]
@@ -308,6 +309,19 @@ class StepsNatively(Protocol):
             FmuError: the step has failed.
             TerminationRequested: see `Instance.do_step`.
         """
+        ...
+
+
+@runtime_checkable
+class Prepares(Protocol):
+    """An instance that looks up once what it needs to set or get a variable many times, between calls of `do_step`."""
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """What `set_values` does with a variable; None where that is quicker, or other values belong to it."""
+        ...
+
+    def getter(self, name: str) -> Callable[[], Value] | None:
+        """What `get_values` does with a variable; None where that is as quick."""
         ...
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
@@ -47,6 +47,17 @@ class Fmi2Instance(NativeInstance, Fmi2):
         """Set variables by name; an FMU that has asked to end takes no more values (FMI 2.0, 4.2.4)."""
         if not self._terminated:
             super().set_values(values)
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`."""
+        if (put := super().setter(name)) is None:
+            return None
+
+        def put_before_end(value: Value) -> None:
+            if not self._terminated:
+                put(value)
+
+        return put_before_end
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(**arguments)

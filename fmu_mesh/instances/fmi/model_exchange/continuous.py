@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,10 @@ class ContinuousInstance(NativeInstance):
         loop, set_values = self._event_loop(), super().set_values
         if not loop.terminated and repr(self.get_values(list(values))) != repr([*values.values()]):
             self._checked(lambda: loop.event(lambda: set_values(values)))
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`: values that change are an event."""
+        return None
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """See `FmuInstance`."""
