@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -635,7 +636,15 @@ class Mesh:
 
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `system.set`.")
-        return System(self.plan(**options.given()))
+        given = options.given()
+        run, values = self.plan(**given), deepcopy(self._plain._replace(file=self._shown_file))
+        known = KnownModels.of(run)
+
+        def plan_again(start_values: Mapping[str, Any]) -> RunPlan:
+            own = PlanOptions(**given | {"start_values": given.get("start_values", {}) | start_values})
+            return planned(values, own, own.on_notice or log.info, known)
+
+        return System(run, plan_again)
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

@@ -73,14 +73,15 @@ class System:
 
     Args:
         run: the plan of the run.
+        plan_again: plans it again for a reset, with these start values besides; None: from its configuration.
 
     Raises:
         NotInOneProcess: two instances cannot share a process.
         FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
     """
 
-    def __init__(self, run: RunPlan) -> None:
-        self._plans = plans = ResetPlans(run)
+    def __init__(self, run: RunPlan, plan_again: Callable[[Mapping[str, Any]], RunPlan] | None = None) -> None:
+        self._plans = plans = ResetPlans(run, plan_again)
         self._plan = plan = plans.first
         OneProcess().check(plan, run.contents)
         self._run = run

@@ -6,7 +6,7 @@ the names of the start values that are given; other values for these names are c
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from msgspec.structs import replace
@@ -15,7 +15,7 @@ from ..system.plan import InstancePlan, Plan
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_conversion import ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue
-from .preparing import KnownModels, planned_reset, without_keys
+from .preparing import KnownModels, check_reset, planned_reset, without_keys
 from .run_plan import RunPlan
 
 __all__ = ["ResetPlans"]
@@ -26,14 +26,15 @@ class ResetPlans:
 
     Args:
         run: the run as it was opened.
+        plan: plans it again, with these start values besides; None: from the configuration of the run.
 
     Attributes:
         first: its plan.
     """
 
-    def __init__(self, run: RunPlan) -> None:
+    def __init__(self, run: RunPlan, plan: Callable[[Mapping[str, Any]], RunPlan] | None) -> None:
         self._run = run
-        self._known: KnownModels | None = None
+        self._plan_again = plan or self._planned
         self._plans: dict[frozenset[str], Plan] = {}
         self.first = without_keys(run).plan
 
@@ -48,11 +49,13 @@ class ResetPlans:
         names = frozenset(start_values)
         if (before := self._plans.get(names)) is not None and (plan := _with_values(before, start_values)) is not None:
             return plan
-        if self._known is None:
-            self._known = KnownModels.of(self._run)
-        plan = without_keys(planned_reset(self._run, start_values, 0, self._known)).plan
-        self._plans[names] = plan
+        again = self._plan_again(start_values)
+        check_reset(self._run, again)
+        self._plans[names] = plan = without_keys(again).plan
         return plan
+
+    def _planned(self, start_values: Mapping[str, Any]) -> RunPlan:
+        return planned_reset(self._run, start_values, 0, KnownModels.of(self._run))
 
 
 def _with_values(plan: Plan, start_values: Mapping[str, Any]) -> Plan | None:
