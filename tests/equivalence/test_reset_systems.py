@@ -77,7 +77,7 @@ def test_a_reset_system_equals_a_new_one(name: str, tmp_path: Path) -> None:
 def test_other_start_values_give_floats_of_system_opened_with_them(name: str, tmp_path: Path) -> None:
     mesh = fmu_mesh.load(written_system(name, tmp_path))
     with mesh.open() as system:
-        expected = rows_of(system)
+        expected, accepted = rows_of(system), 0
         for seed in range(3):  # the names differ; the second time they are known
             for _ in range(2):
                 values = changed_values(system, seed)
@@ -91,6 +91,8 @@ def test_other_start_values_give_floats_of_system_opened_with_them(name: str, tm
                     wanted = rows_of(other)
                 system.reset(values)
                 assert rows_of(system) == wanted
+                accepted += bool(values)
+        assert accepted or name == "text and arrays"
         system.reset()
         assert rows_of(system) == expected
 
