@@ -23,19 +23,15 @@ from msgspec.structs import replace
 
 from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
-from ..instances.contract import LogMessage
 from ..instances.kept_models import KeptModels
 from ..instances.registry import open_instance
-from ..printing import paragraph
-from ..run.local_system import LocalSystem, SavedSystem, opening_of
+from ..run.local_system import LocalSystem, SavedSystem, forwarded, opening_of
 from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
 from ..run.reset_plans import ResetPlans
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
-from ..system.start_values import why_not_settable
-from ..text import did_you_mean, listed, meant, nearest, option_text, shown
-from ..variables.model_description import Variable
+from ..text import listed, option_text, shown
 from ..variables.value_conversion import ValueRefused, checker
 from ..variables.value_types import DTYPES
 from .system_state import SystemState
@@ -412,7 +408,7 @@ class System:
         self._ended_by = None
 
     def _opened(self, name: str) -> Guarded:
-        opening = opening_of(self._plan, name, self._models.folder, _forward, self._run.showing)
+        opening = opening_of(self._plan, name, self._models.folder, forwarded, self._run.showing)
         opening, before = replace(opening, kept=self._models), self._guards.get(name)
         timeouts, is_harmless = self._plan.system.config.timeouts, before is not None and before.is_harmless
         guard = Guarded(name, lambda: open_instance(opening), Unwatched(), timeouts, is_harmless=is_harmless)
@@ -464,7 +460,7 @@ class System:
         self._mode = "ready"
 
     def _setter(self, name: str) -> _Setter:
-        instance, variable = self._found(name)
+        instance, variable = self._run.variable(name)
         own = self._plan.nodes[self._plan.node_of(instance)].instance(instance)
         try:
             own.check_settable(variable)
@@ -478,32 +474,12 @@ class System:
     def _getter(self, name: str) -> Callable[[int], Any]:
         if not isinstance(name, str):
             raise UnknownName(f"{shown(name)} is no name of a variable.")
-        instance, variable = self._found(name, elements=True)
+        instance, variable = self._run.variable(name, elements=True)
         plain = self._local.getter(instance, name.removeprefix(f"{instance}."))
         is_array, dtype = variable.shape and name == f"{instance}.{variable.name}", DTYPES[variable.type]
         read = (lambda point: np.array(plain(point), dtype)) if is_array else plain
         self._getters[name] = read
         return read
-
-    def _found(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
-        """The instance and the variable with this name; with ``elements``, it may be an element of the variable."""
-        instances = self._plan.system.instances
-        instance, _, rest = str(name).partition(".")
-        if instance not in instances:
-            hint = did_you_mean(instance, instances, f"There are {listed(list(instances))}.")
-            raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
-        description = instances[instance].description
-        variable = description.variable_of(rest) if elements else description.variable(rest)
-        if variable is None or (rest != variable.name and rest not in variable.elements):
-            sources = self._plan.nodes[self._plan.node_of(instance)].instance(instance).sources
-            free = [one.name for one in description.variables if not why_not_settable(one, sources.get(one.name))]
-            names = [one.name for one in description.variables] if elements else free
-            if (clock := description.clock(rest)) is not None:
-                raise UnknownName(f"{clock}.", instance=instance)
-            near = nearest(rest, names)
-            hint = meant(near and f"{instance}.{near}", f"There are {listed(names)}.")
-            raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
-        return instance, variable
 
     def _free_lost(self) -> None:
         """Free the states whose objects are gone, which may have happened on any thread."""
@@ -518,12 +494,6 @@ class _Setter(NamedTuple):
     variable: str
     check: Callable[[object], Any]
     put: Callable[[Any], None]
-
-
-def _forward(message: LogMessage) -> None:
-    level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status.lower(), logging.ERROR)
-    said = map(paragraph, (message.category, message.message))
-    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)
 
 
 def _release(local: LocalSystem, folder: Path, thread: int) -> None:

@@ -7,6 +7,7 @@ order of calls at a point and the state of the whole system. Knows no files, no 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -20,6 +21,7 @@ from ..instances.call_guard import Guarded, doing
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import LOOK_STEPS, kept_state
+from ..printing import paragraph
 from ..rings.value_change import ValueChange
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
@@ -29,7 +31,9 @@ from .local_member import LocalMember, SavedMember, element_at
 from .run_plan import opening_in
 from .threads import LimitedThreads
 
-__all__ = ["LocalSystem", "SavedSystem", "opening_of"]
+__all__ = ["LocalSystem", "SavedSystem", "forwarded", "opening_of"]
+
+log = logging.getLogger("fmu_mesh.api.open_system")  # as docs/stepping.md has it
 
 
 class LocalSystem:
@@ -253,6 +257,13 @@ class SavedSystem(NamedTuple):
 
     point: int
     members: Mapping[str, SavedMember]
+
+
+def forwarded(message: LogMessage) -> None:
+    """Give the log a message of a model."""
+    level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status.lower(), logging.ERROR)
+    said = map(paragraph, (message.category, message.message))
+    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)
 
 
 def opening_of(

@@ -15,14 +15,14 @@ from ..system.plan import InstancePlan, Plan
 from ..variables.model_description import ModelDescription, Value
 from ..variables.value_conversion import ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue
-from .preparing import KnownModels, check_reset, planned_reset, without_keys
+from .preparing import KnownModels, check_reset, planned_reset
 from .run_plan import RunPlan
 
 __all__ = ["ResetPlans"]
 
 
 class ResetPlans:
-    """Plans of one run, without keys at ends of connections.
+    """Plans of one run.
 
     Args:
         run: the run as it was opened.
@@ -36,7 +36,7 @@ class ResetPlans:
         self._run = run
         self._plan_again = plan or self._planned
         self._plans: dict[frozenset[str], Plan] = {}
-        self.first = without_keys(run).plan
+        self.first = run.plan
 
     def plan(self, start_values: Mapping[str, Any]) -> Plan:
         """The plan with the start values of the run and these, by `instance.variable`.
@@ -51,7 +51,7 @@ class ResetPlans:
             return plan
         again = self._plan_again(start_values)
         check_reset(self._run, again)
-        self._plans[names] = plan = without_keys(again).plan
+        self._plans[names] = plan = again.plan
         return plan
 
     def _planned(self, start_values: Mapping[str, Any]) -> RunPlan:

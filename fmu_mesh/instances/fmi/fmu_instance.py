@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
 import msgspec
-import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from ...errors import FmuError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
@@ -24,7 +23,7 @@ from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_conversion import to_value
-from ...variables.value_types import DTYPES, Value, VariableType, flattened, nested
+from ...variables.value_types import Value, VariableType, flattened, nested
 from ..call_guard import call_named, doing
 from ..contract import LogMessage
 from ..instance_wrapper import of_kind, packed, unpacked
@@ -32,7 +31,7 @@ from ..kept_models import KeptModels
 from .archive.system_libraries import missing_libraries
 from .buffers import BinaryBuffer, Buffer
 from .callbacks import recall, register, register_component, tell_counted, unregister
-from .calls import Function, RowPointers, cffi_function, declared, memory, pointer
+from .calls import RowPointers, cffi_function, declared, memory, pointer
 from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
 from .step_options import StepOptions, Terms
@@ -110,6 +109,8 @@ class FmuInstance(ABC):
         fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding)
         left = cast("LoadedFmu | None", kept.take(name, fmu.key)) if kept is not None else None
         self._model = left or LoadedFmu(fmu, folder if kept is None else kept.folder)
+        if left is None and kept is not None:
+            kept.made(name, self._model)
         try:
             self._model.load()
             self._fmu = self._model.calls
@@ -170,33 +171,6 @@ class FmuInstance(ABC):
                 values[variable.name] = nested(elements[first : first + variable.size], variable.shape)
                 first += variable.size
         return [values[name] for name in names]
-
-    def setter(self, name: str) -> Callable[[Value], None] | None:
-        """See `Prepares`; a kind of FMU whose `set_values` does more overrides it."""
-        if (number := self._number("Set", name)) is None:
-            return None
-        variable, call, arguments, cell = number
-
-        def put(value: Value) -> None:
-            cell[0] = value
-            if (status := call(*arguments)) > WARNING:
-                raise self._transfer_failed("Set", variable.type, [variable], status)
-
-        return put
-
-    def getter(self, name: str) -> Callable[[], Value] | None:
-        """See `Prepares`."""
-        if (number := self._number("Get", name)) is None:
-            return None
-        variable, call, arguments, cell = number
-
-        def get() -> Value:
-            if (status := call(*arguments)) > WARNING:
-                raise self._transfer_failed("Get", variable.type, [variable], status)
-            value: Value = cell[0]
-            return value
-
-        return get
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Let `do_step` work on these rings, ``points`` of ``grid`` each; write the current outputs as row ``step``."""
@@ -516,16 +490,6 @@ class FmuInstance(ABC):
         if self._functions.values.sized:
             values.append(sum(variable.size for variable in variables))
         return self._function(verb, type_)(self._component, ctypes.addressof(references), count, *values)
-
-    def _number(self, verb: Verb, name: str) -> tuple[Variable, Function, tuple[Any, ...], Any] | None:
-        """What sets or gets one number: a function, its arguments, and where the number is; None if it is none."""
-        variable, functions = self._variables[name], self._functions.values
-        if variable.shape or not functions.is_direct(variable.type, [variable]):
-            return None
-        cell, references = np.zeros(1, DTYPES[variable.type]), (ctypes.c_uint * 1)(variable.value_reference)
-        size = (1,) if functions.sized else ()
-        call = cffi_function(self._function(verb, variable.type), functions.declaration)
-        return variable, call, (self._self, memory(references), 1, memory(cell), *size), cell.data
 
     def _function_name(self, verb: Verb, type_: VariableType) -> str:
         """The name of a getter or setter, for errors."""

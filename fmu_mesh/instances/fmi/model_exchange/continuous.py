@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from fmpy.fmi1 import FMU1Model
@@ -28,6 +28,7 @@ from ..calls import cffi_function
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping
+from ..fmu_values import Verb
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
 from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
@@ -88,10 +89,6 @@ class ContinuousInstance(NativeInstance):
         if not loop.terminated and repr(self.get_values(list(values))) != repr([*values.values()]):
             self._checked(lambda: loop.event(lambda: set_values(values)))
 
-    def setter(self, name: str) -> Callable[[Value], None] | None:
-        """See `Prepares`: values that change are an event."""
-        return None
-
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """See `FmuInstance`."""
         self._slopes, self._goes_on = derivatives, continuous
@@ -118,6 +115,9 @@ class ContinuousInstance(NativeInstance):
         if self._loop is not None:
             self._loop.close()
             self._loop = None
+
+    def _is_plain(self, verb: Verb | Literal["State"]) -> bool:
+        return verb == "Get"
 
     def _complete(self, step: int, status: int | None) -> None:
         loop, solver, end = self._event_loop(), self._solver_in_c, self._time_of(step + 1)
