@@ -26,7 +26,7 @@ from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
 from ..variables.model_description import Value
-from .contract import ChangesProcess, Instance, Prepares
+from .contract import BeginsAgain, ChangesProcess, Instance, Prepares
 from .instance_wrapper import AroundNativeSteps
 from .process_end import surviving
 from .process_state import floating_point_changed, kept_mode, kept_state, restore_floating_point
@@ -300,6 +300,16 @@ class Guarded(AroundNativeSteps):
     def do_step(self) -> Callable[[int], None]:
         """That of the inner instance: `CallWatch.stepping` watches the steps."""
         return self._step if self._careful else self._instance.do_step
+
+    def begin_again(self) -> bool:
+        """See `BeginsAgain`; False if the inner instance is none. What was harmless until now is taken for it."""
+        own = self._instance
+        if not isinstance(own, BeginsAgain):
+            return False
+        self._trusted = self.is_harmless
+        is_as_new = self._forward(own.begin_again)
+        self._running = False
+        return is_as_new
 
     @property
     def is_harmless(self) -> bool:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..rings.ring import Ring
 
 __all__ = [
+    "BeginsAgain",
     "ChangesProcess",
     "Instance",
     "KeepsFiles",
@@ -322,6 +323,15 @@ class Prepares(Protocol):
 
     def getter(self, name: str) -> Callable[[], Value] | None:
         """What `get_values` does with a variable; None where that is as quick."""
+        ...
+
+
+@runtime_checkable
+class BeginsAgain(Protocol):
+    """An instance that can be as a new one, without being opened again."""
+
+    def begin_again(self) -> bool:
+        """End the simulation; whether `enter_initialization` may follow. Otherwise only `close` may."""
         ...
 
 

@@ -50,14 +50,25 @@ class LocalMember:
         self._looks_at_rows = True
         self._points = self.plan.step_points
         self._feeds: list[_Feed] = []
-        self._set_at = -1
         self._courses: dict[str, Course] = {}
         self._last = LastValues((), {}, instance.description)
         self._parameters: dict[str, str] = {}
-        self.step = 0
         self.settled: set[str] = set()
+        self.step, self._set_at = 0, -1
         self._setters: dict[str, Callable[[Value], None]] = {}
         self._prepared: set[str] = set()  # the variables that need no call together with others
+
+    def begin_again(self, plan: Plan, name: str) -> bool:
+        """Be as a new one, with the start values of a plan; False if the instance cannot be, and has to be closed."""
+        if not self.instance.begin_again():
+            return False
+        self.plan = plan.nodes[plan.node_of(name)].instance(name)
+        self.step, self._set_at = 0, -1
+        self.settled.clear()
+        self._parameters.clear()
+        for ring in (self._inputs, self._outputs):
+            ring.clear()
+        return True
 
     def set_initial_inputs(
         self, known: Mapping[tuple[str, str], Value], assumed: Mapping[tuple[str, str], Value] = MappingProxyType({})
@@ -106,6 +117,8 @@ class LocalMember:
         self.is_finite.check_first(grid, self.instance.get_values)
         self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
         self._do_step = self.instance.do_step
+        self._setters.clear()
+        self._feeds.clear()
         for c in self.connections:
             if c.initial_only:
                 continue

@@ -8,7 +8,7 @@ order of calls at a point and the state of the whole system. Knows no files, no 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -74,13 +74,19 @@ class LocalSystem:
         Raises:
             FmuError: an instance cannot be opened or initialized.
         """
-        self._end()
         self.point, self.stepping, self._look_at = 0, "", 0
-        self._plan = plan or self._plan
-        self._limit_threads()
+        self._plan = plan = plan or self._plan
         with kept_state():
-            for name in self._plan.order:
-                self._members[name] = LocalMember(self._plan, name, open_instance(name))
+            self._free_all()
+            before = {name: member for name, member in self._members.items() if member.begin_again(plan, name)}
+            self._close(name for name in self._members if name not in before)
+            self._members = before
+            self._limit_threads()
+            members: dict[str, LocalMember] = {}
+            for name in plan.order:
+                members[name] = before.get(name) or LocalMember(plan, name, open_instance(name))
+                self._members = before | members
+            self._members = members
             self._limit_threads()  # with the libraries that a component has imported
             self._initialize()
         self._steps = tuple((name, member.step_from) for name, member in self._members.items())
@@ -185,19 +191,23 @@ class LocalSystem:
         """Free all states and close all instances. Never raises; may be called twice."""
         if self._models is not None:
             self._models.close()
-        self._end()
+        with kept_state() if self._members else nullcontext():
+            self._free_all()
+            self._close(self._members)
+        self._members.clear()
         self._threads.close()
 
-    def _end(self) -> None:
-        """Free all states and close all instances, which leave their models to the next ones."""
+    def _free_all(self) -> None:
+        """Free all states."""
         for saved in self._kept.values():
             with suppress(FmuError):  # it has failed before, and now its memory goes anyway
                 self._free(saved)
         self._kept.clear()
-        with kept_state() if self._members else nullcontext():
-            for member in self._members.values():
-                member.instance.close()
-        self._members.clear()
+
+    def _close(self, names: Iterable[str]) -> None:
+        """Close instances, which leave their models to the next ones."""
+        for name in names:
+            self._members[name].instance.close()
 
     def _limit_threads(self) -> None:
         """Let the numeric libraries that are loaded by now use one thread."""
