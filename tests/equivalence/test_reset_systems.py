@@ -97,6 +97,18 @@ def test_other_start_values_give_floats_of_system_opened_with_them(name: str, tm
         assert rows_of(system) == expected
 
 
+@pytest.mark.parametrize("name", ["pendulum_delay", "damped_pendulum", "balance"])
+def test_no_instance_is_opened_again(name: str, tmp_path: Path) -> None:
+    """FMUs of FMI 2.0, worlds of MuJoCo and models in ONNX stay as they are loaded."""
+    with System(plan_run(written_system(name, tmp_path))) as system:
+        opened, expected = dict(system._guards), rows_of(system, 5)
+
+        system.reset()
+
+        assert rows_of(system, 5) == expected
+        assert all(system._guards[instance] is guard for instance, guard in opened.items())
+
+
 # ---- from every mode
 
 
