@@ -49,7 +49,8 @@ def why_no_library() -> str | None:
     if why is None:
         return None
     return (
-        f"not used: {why}. Results are the same, and steps are slower. See 'The library of C' in docs/installation.md."
+        f"not used: {why}. Steps are slower. Results are the same, except with `solver: {{name: auto}}`. "
+        "See 'The library of C' in docs/installation.md."
     )
 
 

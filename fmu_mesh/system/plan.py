@@ -288,15 +288,7 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
         )
         for node in nodes.values()
     ]
-    instances = system.instances.items()
-    models = {name: (own.description.guid, contents.get(name, "")) for name, own in instances}
-    # What `auto` means depends on the host: without the library of C, the same configuration gives other floats.
-    solvers = [
-        system.config.instances[name].summary(own.description)
-        for name, own in instances
-        if own.description.kind == "model_exchange"
-    ]
-    return digest_of([agreed, solvers], models)
+    return digest_of(agreed, system, contents)
 
 
 def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:

@@ -57,8 +57,8 @@ class ModelOrigin(msgspec.Struct, frozen=True):
         path: its file, absolute.
         sha256: the SHA-256 of its content; empty for a model without files.
         guid: the GUID or instantiation token of its model description.
-        computed_by: what computes it, as `fmu-mesh check` shows it: `FMI 3.0 model exchange, auto 1e-06`. Empty in files
-            of older versions.
+        computed_by: what computes it, as `fmu-mesh check` shows it: `FMI 3.0 model exchange, auto 1e-06`. Empty in
+            files of older versions.
     """
 
     path: str

@@ -98,9 +98,7 @@ def test_complete_steps_in_c_give_the_same_floats_wherever_they_are(
     assert len(launched.splitlines()) == 302
 
 
-@pytest.mark.parametrize(
-    "arguments", [(), ("--window", "1"), ("--local",), ("--local", "--window", "3")], ids=" ".join
-)
+@pytest.mark.parametrize("arguments", [(), ("--window", "1"), ("--local",), ("--local", "--window", "3")], ids=" ".join)
 @pytest.mark.parametrize("group", [None, "all"])
 def test_models_that_turn_out_to_be_stiff_give_the_same_floats(
     arguments: tuple[str, ...], group: str | None, place: Place, event_fmu: EventFmu

@@ -89,7 +89,7 @@ def test_a_model_that_is_not_stiff_has_the_floats_of_dopri5(
 ) -> None:
     rows, told = [], []
     for solver in ("auto", "dopri5"):
-        with model(event_fmu(name, version), tmp_path / solver, {}, solver, step_size=0.01) as own:  # type: ignore[arg-type]  # two of its names
+        with model(event_fmu(name, version), tmp_path / solver, {}, solver, step_size=0.01) as own:
             rows.append(own.steps(0, 200))
             told += own.told()
 
@@ -139,7 +139,7 @@ def test_steps_that_get_too_short_are_left_to_cvode(event_fmu: EventFmu, tmp_pat
     """At 1e6 s, times differ by 1e-10 s, and the time constant is 1e-12 s; the current is almost where it goes."""
     fmu, found = event_fmu("Winding", 2), {}
     for solver in ("auto", "dopri5"):
-        options = StepOptions(SolverSettings(solver))  # type: ignore[arg-type]  # two of its names
+        options = StepOptions(SolverSettings(solver))
         description = read_description(fmu, kind="model_exchange")
         with closing(open_instance(fmu, "m", description, tmp_path / solver, options=options)) as own:
             own.enter_initialization(1e6, None, {"L": 1e-12, "U": 1.0, "I": 1.0 - 1e-9})
@@ -156,7 +156,7 @@ def test_steps_that_get_too_short_are_left_to_cvode(event_fmu: EventFmu, tmp_pat
 
 @pytest.mark.parametrize("version", [1, 2, 3])
 @pytest.mark.parametrize(("late", "refused"), [(3.05, 4.0), (5.0, 4.0)], ids=["by CVode", "by dopri5"])
-def test_what_cannot_be_evaluated_ends_the_run_with_the_words_of_the_fmu(
+def test_a_failed_evaluation_ends_the_run_with_the_words_of_the_fmu(
     late: float, refused: float, version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
     def run(solver: SolverName) -> None:
@@ -167,7 +167,7 @@ def test_what_cannot_be_evaluated_ends_the_run_with_the_words_of_the_fmu(
     told = []
     for solver in ("auto", "cvode"):
         with pytest.raises(StepFailed) as caught:
-            run(solver)  # type: ignore[arg-type]  # two of its names
+            run(solver)
         told.append(caught.value.message)
 
     assert told[0] == told[1]

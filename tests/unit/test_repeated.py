@@ -216,10 +216,11 @@ def test_each_run_finds_out_anew_whether_a_model_is_stiff(
     tmp_path: Path, event_fmu: Callable[..., Path], version: int, *, reset: bool
 ) -> None:
     heater = {"fmu": str(event_fmu("Heater", version)), "kind": "model_exchange"}
+    connection: Any = {"from": "one.F", "to": "two.u", "factor": 0.1}
     config = write_config(
         tmp_path,
         instances={"one": heater, "two": heater},
-        connections=[{"from": "one.F", "to": "two.u", "factor": 0.1}],
+        connections=[connection],
         simulation={"step_size": 0.1},
         stop_time=3.0,
     )
