@@ -24,8 +24,8 @@ _CONFIGURATION_DIGITS, _MODEL_DIGITS = 16, 12
 def digest_of(configuration: object, system: ResolvedSystem, contents: Mapping[str, str]) -> str:
     """The digest of a mesh: our version, a hash of the configuration, and one of the model of each instance.
 
-    A model is the GUID and the SHA-256 of its content; the configuration is what must be equal, as JSON can hold it. What
-    the solver `auto` is depends on the host: without the library of C, the same configuration gives other floats.
+    A model is the GUID and the SHA-256 of its content; the configuration is what must be equal, as JSON can hold it.
+    What the solver `auto` is depends on the host: without the library of C, the same configuration gives other floats.
     """
     models = [(name, own.description) for name, own in sorted(system.instances.items())]
     hashes = [_hash((model.guid, contents.get(name, "")))[:_MODEL_DIGITS] for name, model in models]
