@@ -377,6 +377,30 @@ PUBLIC int64_t equations_solve(Equations *own, double stop) {
   }
 }
 
+/* ---- what CVode calls, which gives its vectors and the equations */
+
+typedef double *(*VectorData)(void *);
+
+/* A discarded evaluation asks for a smaller step (FMI 2.0, 2.1.3); Python gives the error of any other. */
+static int for_cvode(int status) { return status == 0 ? 0 : status == DISCARD ? 1 : -1; }
+
+PUBLIC int equations_derivatives(double time, void *states, void *slopes, void *equations) {
+  Equations *own = equations;
+  const VectorData data = (VectorData)own->vector_data;
+  double *to = data(slopes);
+  if (own->n_states == 0) to[0] = 0.0; /* the one state that CVode has for a model without states */
+  return for_cvode(derive(own, time, data(states), to));
+}
+
+PUBLIC int equations_indicators(double time, void *states, double *indicators, void *equations) {
+  Equations *own = equations;
+  int status = put(own, time, ((VectorData)own->vector_data)(states));
+  if (!status) status = indicate(own, indicators);
+  for (int64_t i = 0; !status && i < own->n_indicators; i++)
+    if (indicators[i] == 0.0) indicators[i] = -0x1p-1022; /* as in solver.py: CVode never sees a 0 */
+  return for_cvode(status);
+}
+
 /* ---- a step of a node */
 
 /* One event iteration, in event mode. */

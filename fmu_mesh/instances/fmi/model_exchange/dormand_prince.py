@@ -12,7 +12,6 @@ from enum import IntEnum
 from typing import Any, Final, cast
 
 import numpy as np
-from fmpy.fmi1 import FMICallException
 
 from ....rings import native
 from ....rings.library import why_no_library
@@ -21,13 +20,10 @@ from ....rings.ring import Ring
 from ..clocks import unsettled
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
-from .model_calls import ModelCalls
+from .model_calls import LibraryCalls, ModelCalls
 from .solver import CVodeSolver, ModelPlace, Solver
 
 __all__ = ["NOT_SET", "AutoSolver", "DormandPrinceSolver", "HeldRow", "RowBytes", "Solved"]
-
-_FUNCTIONS: Final = [field for field, *_ in EquationsTable._fields_][2:12]
-"""The fields that are functions; the library names them by their place."""
 
 _IS_STIFF: Final = 15
 """So many steps in a row at the limit of stability, with few others between them; see `count_stiff` in the library."""
@@ -101,16 +97,13 @@ class DormandPrinceSolver(Solver):
             raise SolverFailed(f"it needs the library of C, which is {why_no_library()}")
         self._library = native.library
         n, m = equations.n_states, equations.n_indicators
-        functions, self._names = equations.table()
-        self._line = equations.line
         self._memory = np.zeros(12 * n + 4 * m)
         at = self._memory.ctypes.data
         states = [at + 8 * n * number for number in range(12)]
         indicators = [at + 8 * (12 * n + m * number) for number in range(4)]
         self._address = states[0]
-        self.table = EquationsTable(
-            n_states=n,
-            n_indicators=m,
+        self._calls = LibraryCalls(
+            equations,
             states=ctypes.cast(states[0], _DOUBLES),
             weights=states[1],
             ends=states[2],
@@ -124,9 +117,8 @@ class DormandPrinceSolver(Solver):
             tolerance=settings.relative_tolerance,
             longest=settings.maximum_step_size or np.inf,
             tells=tells,
-            next_event=np.inf,
-            **functions,
         )
+        self.table = self._calls.table
         self.at = cast("ModelPlace", self.table)
 
     @property
@@ -165,13 +157,13 @@ class DormandPrinceSolver(Solver):
     def restart(self) -> None:
         """See `Solver.restart`."""
         if self._library.equations_restart(ctypes.addressof(self.table)):
-            raise self.failure()
+            raise self._calls.failure()
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
         own = self.table
         own.note(time=time)
-        self._follow()
+        self._calls.follow()
         result = self._library.equations_solve(ctypes.addressof(own), stop)
         self.check(result)
         return own.time, result == Solved.AT_EVENT
@@ -179,7 +171,7 @@ class DormandPrinceSolver(Solver):
     def check(self, result: int) -> None:
         """Raise the error of a step of the library that has failed; see `Solver.step`."""
         if result == Solved.FAILED:
-            raise self.failure()
+            raise self._calls.failure()
         if result == Solved.UNSETTLED:
             raise SolverFailed(unsettled(self.table.time))
         if result in _GIVEN_UP:
@@ -189,20 +181,6 @@ class DormandPrinceSolver(Solver):
     def complete(self) -> tuple[bool, bool]:
         """See `Solver.complete`; `step` has told the FMU."""
         return bool(self.table.asks_event), bool(self.table.asks_end)
-
-    def _follow(self) -> None:
-        """Let the library set the linear inputs of this step; they are other ones than before."""
-        line = self._equations.line
-        if line is not self._line:
-            self._line = line
-            self.table.note(is_new=True, **(line.table() if line is not None else {"line": None}))
-
-    def failure(self) -> FMICallException:
-        """The call that has failed."""
-        names = [self._names.get(field, "") for field in _FUNCTIONS]
-        if self._line is not None:
-            names.append(self._line.name)
-        return FMICallException(function=names[self.table.function], status=self.table.status)
 
 
 class AutoSolver(DormandPrinceSolver):
