@@ -62,7 +62,10 @@ def check(values: list[float]) -> None:
 
 def _system(number: int) -> System:
     pendulum = {"a": 1.3, "l": 1.0, "d": FIRST + number * STEP}
-    members = Member("pendulum", "DampedPendulum", "d", "a", pendulum), Member("delay", "TransportDelay", "x", "y", {"d": 2.33})
+    members = (
+        Member("pendulum", "DampedPendulum", "d", "a", pendulum),
+        Member("delay", "TransportDelay", "x", "y", {"d": 2.33}),
+    )
     return System("chain", "gauss_seidel", _STEP_SIZE, members)
 
 

@@ -8,8 +8,9 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -22,9 +23,10 @@ from ..results.recording import Columns, ResultFile, joined
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
+from ..run.preparing import other_start_values
 from ..run.repeated import RepeatedRuns
 from ..run.run_plan import RunPlan
-from ..variables.value_types import DTYPES
+from ..variables.value_types import DTYPES, PlainValue
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
 from .result import Result, types_of
 from .run_thread import check_memory
@@ -70,6 +72,7 @@ class RepeatedMesh:
         self._thread = threading.get_ident()
         self._before_close = before_close
         self._rows: _CollectedRows | None = None
+        self._key, self._last, self._in_memory = b"", cast("RunPlan | None", None), False
         told = self._tell_end if before_close is not None else None
         self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, before_close=told)
         self._loaded: list[tuple[RepeatedRuns, Path]] = []
@@ -103,12 +106,11 @@ class RepeatedMesh:
             raise CallRefused(f"run is not possible, because {why}.")
         if options.output is None and options.record is None:
             options = replace(options, record="memory")
-        plan = self._plan(**options.given())
-        check_memory(plan, sys.maxsize, to_its_end=True)
-        self._rows = rows = _CollectedRows(plan)
+        plan, start_values = self._planned(options)
+        self._rows = rows = _CollectedRows(plan, in_memory=self._in_memory)
         runs = self._runs(plan.mesh)
         try:
-            outcome = runs.run(plan, rows.open)
+            outcome = runs.run(plan, rows.open, start_values)
         except FmuMeshError as error:
             point = runs.point
             time, warnings = plan.plan.grid.time(point), runs.warnings
@@ -125,6 +127,20 @@ class RepeatedMesh:
         assert self._before_close is not None
         self._before_close(self._rows.result(end) if isinstance(end, Outcome) else end)
 
+    def _planned(self, options: PlanOptions) -> tuple[RunPlan, Mapping[str, Mapping[str, PlainValue]]]:
+        """The plan of a run, and the start values that are not as in it: that of the run before, if it is the same."""
+        given = options.given()
+        values: Mapping[str, Any] = given.pop("start_values", {})
+        key = msgspec.json.encode((list(values), given), enc_hook=repr)  # a copy: what was given may change
+        last = self._last if key == self._key else None
+        if last is not None and (others := other_start_values(last, values)) is not None:
+            return last, others
+        self._key, self._last = key, None
+        plan = self._plan(**options.given())
+        check_memory(plan, sys.maxsize, to_its_end=True)
+        self._last, self._in_memory = plan, memory_of(plan) is not None
+        return plan, {}
+
     def _runs(self, mesh: str) -> RepeatedRuns:
         """What runs a plan; made for the first one, whose configuration is right."""
         if not self._loaded:
@@ -139,8 +155,8 @@ class RepeatedMesh:
 class _CollectedRows:
     """The rows of a run in memory, and in its result file if it has one; see `ResultFile`."""
 
-    def __init__(self, plan: RunPlan) -> None:
-        self._plan = plan
+    def __init__(self, plan: RunPlan, *, in_memory: bool) -> None:
+        self._plan, self._in_memory = plan, in_memory
         self._file: ResultFile | None = None
         nothing = {name: np.zeros(0, DTYPES[type_]) for name, type_ in (types_of(plan.plan.system) or {}).items()}
         self._pieces = [Columns(np.zeros(0), nothing)]
@@ -148,7 +164,7 @@ class _CollectedRows:
 
     def open(self) -> list[ResultFile]:
         """This object, whose file is open now."""
-        if memory_of(self._plan) is None:
+        if not self._in_memory:
             self._file = open_result(self._plan.loaded, self._plan.plan.system)
         return [self]
 

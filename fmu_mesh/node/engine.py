@@ -107,6 +107,12 @@ class Engine(ABC):
     def follow_inputs(self, runner: Runner) -> None:  # noqa: B027  an engine whose steps ask the runner needs nothing
         """On the main thread, between steps: inputs over time of the runner change in other steps than before."""
 
+    def begin_again(self, looked_after: ProcessState) -> None:
+        """All runners begin another run (`Runner.bind_again`); ``looked_after`` is the state of the process."""
+        self.waited_s, self.is_blocked, self._looked_after = 0.0, False, looked_after
+        for unit, _ in zip(self._units, self.units, strict=False):
+            unit.begin_again()
+
     def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
@@ -230,6 +236,11 @@ class BurstEngine(Engine):
         self._address = ctypes.addressof(self._node)
         for runner in self.runners:
             runner.refit()
+
+    def begin_again(self, looked_after: ProcessState) -> None:
+        """See `Engine`."""
+        super().begin_again(looked_after)
+        self._node.begin_again()
 
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library

@@ -12,7 +12,8 @@ from typing import NamedTuple, Protocol, cast
 
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
-from ..instances.instance_wrapper import AroundInstance
+from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
+from ..instances.kept_models import BeginsAgain
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -105,6 +106,15 @@ class Runner:
         for part, kept in zip(self.outputs.parts, row, strict=False):
             part[slot] = kept
         self.refit()
+
+    def bind_again(self) -> None:
+        """As `bind`, for an instance that has begun another run; see `BeginsAgain`."""
+        self.outputs.stamps[: self.step + 1] = 0  # of the rows of the run before
+        connected = [own.target for source in self.sources for own in source.transfer.columns]
+        fill_unconnected(self.inputs, connected, self.instance.get_values)
+        cast("BeginsAgain", self.instance).bind_again()
+        own = self.instance.native if isinstance(self.instance, AroundNativeSteps) else None
+        self.table.begin_again(own.component if own is not None else None)
 
     def begin(self) -> None:
         """The outputs after Initialization Mode are complete: row 0.

@@ -196,6 +196,11 @@ class HostMemory:
             self._rung = True
             self._lock.notify_all()
 
+    def begin_again(self) -> None:
+        """Of private memory: all counters are 0, as at the start; the rings have their rows."""
+        for counter in (self.map.grant, self.map.sent, self.map.finish, *self.map.progress, *self.map.rings):
+            self.number(counter)[:] = self.number(counter + 16)[:] = 0  # and what is claimed
+
     def close(self) -> None:
         """Close the descriptor: from now on no other process can open this memory."""
         if self._descriptor is not None:

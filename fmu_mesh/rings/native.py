@@ -281,10 +281,20 @@ class EquationsTable(_WithArrays):
 class MemberTable(_WithArrays):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
+    def begin_again(self, component: int | None) -> None:
+        """Between two bursts: the next step is the first one, of the instance at this address."""
+        self.component, self.step, self.stage, self.outcome = component, 0, 0, 0
+        for number in range(self.n_gates):
+            self.gates[number].known = 0
+
 
 @_declared("Unit")
 class UnitTable(Structure):
     """Members that step together."""
+
+    def begin_again(self) -> None:
+        """Between two bursts: the next tick is the first one; none of the members has stopped."""
+        self.tick, self.next, self.spent_ns, self.blocked_by = 0, 0, 0, None
 
 
 @_declared("Peer")
@@ -387,6 +397,10 @@ class StreamsTable(_WithArrays):
 @_declared("Node")
 class NodeTable(Structure):
     """All units of a process."""
+
+    def begin_again(self) -> None:
+        """Between two bursts: nothing of the grant before is known any more."""
+        self.allowed, self.stride, self.patience = 0, 1, 0
 
 
 class NativeStep(NamedTuple):

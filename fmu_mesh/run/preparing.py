@@ -35,13 +35,14 @@ from ..system.scenario import Scenario
 from ..system.system import ResolvedSystem, build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription
+from ..variables.value_conversion import ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue
 from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "planned", "planned_reset", "without_keys"]
+__all__ = ["KnownModels", "other_start_values", "planned", "planned_reset", "without_keys"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -192,6 +193,39 @@ def planned(
     )
     obstacles.raise_any(run)
     return run
+
+
+def other_start_values(run: RunPlan, start_values: Mapping[str, object]) -> dict[str, dict[str, PlainValue]] | None:
+    """Start values that change nothing else of a plan, by instance and variable; None: plan anew, or see what is wrong.
+
+    That is so if each is a finite number or a truth value for a scalar variable that is no structural parameter, if it
+    replaces another start value of the plan, and if the plan uses start values for nothing else: no loop is iterated in
+    Initialization Mode, and there is no scenario, no input with a timeout or a key. The files of the models have to be
+    as they were.
+
+    Args:
+        run: the plan.
+        start_values: by `instance.variable`.
+    """
+    plan, found = run.plan, dict[str, dict[str, PlainValue]]()
+    items = {item.name: item for node in plan.nodes.values() for item in node.instances}
+    if plan.initialization.loops or any(item.scenario or item.timeouts or item.keys_in for item in items.values()):
+        return None
+    for path, value in start_values.items():
+        name, _, variable_name = path.partition(".")
+        variable = plan.system.instances[name].description.variable(variable_name) if name in items else None
+        is_plain = isinstance(value, float | int) and variable_name in items[name].start_values if variable else False
+        if variable is None or not is_plain or variable.shape or variable.causality == "structuralParameter":
+            return None
+        try:
+            found.setdefault(name, {})[variable_name] = to_plain(to_value(value, variable, finite=True))
+        except ValueRefused:
+            return None
+    try:
+        contents = {name: content(Path(item.fmu), item.section) for name, item in items.items()}
+    except LoadFailed:
+        return None
+    return found if contents == run.contents else None
 
 
 def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: int, known: KnownModels) -> RunPlan:

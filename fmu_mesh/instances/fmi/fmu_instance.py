@@ -98,8 +98,9 @@ class FmuInstance(ABC):
         self._log = log
         self._last_messages: list[str] = []
         self._said = Said(step=-1, quiet_until=math.inf)  # how far the instance is
-        self._state: Literal["instantiated", "initialization", "stepping", "failed", "closed"] = "instantiated"
+        self._state: Literal["instantiated", "initialization", "stepping", "ended", "failed", "closed"] = "instantiated"
         self._live = False
+        self._was_reset = False
         self._keep: list[object] = []
         self._describe(description)
         prefix = self._functions.values.prefix
@@ -120,8 +121,7 @@ class FmuInstance(ABC):
             library = description.library if self._model.calls is None else None
             self.close()
             missing = missing_libraries(path, library, terms) if library else ()
-            text = "; ".join(missing) or str(error)
-            raise LoadFailed(f"'{path}' cannot be instantiated: {text}{self._message()}", instance=name) from error
+            raise self._refused("; ".join(missing) or str(error)) from error
 
     @property
     def changes_process(self) -> bool:
@@ -206,13 +206,11 @@ class FmuInstance(ABC):
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         if self._state == "closed":
             return
-        was_reset = False
         if self._live and self._state == "stepping":
-            resets = self._kept is not None and (self._kept.resets or self.description.only_once_per_process)
-            was_reset = self._end_run(resets=resets)
-        elif self._live:
+            self._end_simulation()
+        elif self._live and self._state != "ended":
             self._quietly(self._release)
-        self._leave_model(was_reset=was_reset)
+        self._leave_model()
         unregister(self)
         self._live = False
         self._state = "closed"
@@ -293,6 +291,12 @@ class FmuInstance(ABC):
 
     # --- its life
 
+    def _end_simulation(self) -> None:
+        """End the simulation, and reset the instance if the next run gets this one."""
+        resets = self._kept is not None and (self._kept.resets or self.description.only_once_per_process)
+        self._was_reset = self._end_run(resets=resets)
+        self._state = "ended"
+
     def _end_run(self, *, resets: bool) -> bool:
         """End the simulation; with ``resets`` also reset the instance, and return whether that was done."""
         self._quietly(self._terminate)
@@ -309,22 +313,18 @@ class FmuInstance(ABC):
         except OSError:
             return
 
-    def _leave_model(self, *, was_reset: bool) -> None:
-        """Leave the FMU to the next instance of this name; after a failure nothing of it is used again.
+    @property
+    def _is_used_up(self) -> bool:
+        """Whether there can be no other instance: a library that allows one instance is unloaded with it."""
+        return self._model.is_lost or (self.description.only_once_per_process and not self._was_reset)
 
-        A library that allows one instance is unloaded with it.
-        """
+    def _leave_model(self) -> None:
+        """Leave the FMU to the next instance of this name; after a failure nothing of it is used again."""
         model = self._model
-        if (
-            self._kept is None
-            or not self._live
-            or self._state == "failed"
-            or model.is_lost
-            or (self.description.only_once_per_process and not was_reset)
-        ):
+        if self._kept is None or not self._live or self._state == "failed" or self._is_used_up:
             model.close()
             return
-        if not was_reset:
+        if not self._was_reset:
             model.free()
         self._kept.keep(self.name, model)
 
@@ -387,6 +387,9 @@ class FmuInstance(ABC):
 
     def _end_requested(self) -> TerminationRequested:
         return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+
+    def _refused(self, why: str) -> LoadFailed:
+        return LoadFailed(f"'{self._model.path}' cannot be instantiated: {why}{self._message()}", instance=self.name)
 
     def _message(self) -> str:
         recall()

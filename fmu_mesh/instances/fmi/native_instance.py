@@ -7,6 +7,7 @@ version of FMI adds how a step is taken and what its statuses mean.
 from __future__ import annotations
 
 import ctypes
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
@@ -17,6 +18,7 @@ from ...rings.native import MemberTable, Move, NativeStep, Span, Stage, StepKind
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from .buffers import NumberBuffer
+from .callbacks import unregister
 from .calls import Function, Pointer, address_of, cffi_function, pointer
 from .fmu_instance import FmuInstance
 from .fmu_values import PartCall
@@ -34,6 +36,8 @@ class NativeInstance(FmuInstance):
 
     _kind: StepKind
     _do_step: Function  # the function of the FMU, as cffi calls it
+
+    begins_again = False  # see `BeginsAgain`
 
     _by_calls = False  # whether the steps have a part that the library does not know
 
@@ -73,6 +77,37 @@ class NativeInstance(FmuInstance):
         self._member = member = self._table(self._native, outputs)
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
         self._in_step = take, pointer(ctypes.addressof(member))
+
+    def end_run(self) -> bool:
+        """See `BeginsAgain`."""
+        if self._kept is None or not self._live or self._state != "stepping":
+            return False
+        self._end_simulation()
+        if self._is_used_up:
+            return False
+        if not self._was_reset:
+            self._model.free()
+        unregister(self)
+        return True
+
+    def begin_again(self) -> None:
+        """See `BeginsAgain`."""
+        self._last_messages = []
+        self._said.note(step=-1, quiet_until=math.inf)
+        self._state = "instantiated"
+        try:
+            self._instantiate()
+        except Exception as error:
+            self._state = "failed"
+            raise self._refused(str(error)) from error
+
+    def bind_again(self) -> None:
+        """See `BeginsAgain`: only the address of the instance may be another one."""
+        self._said.note(step=0)
+        if self._native is not None and self._member is not None:
+            self._native = self._native._replace(component=self._component)
+            self._member.begin_again(self._component)
+        self._read_outputs(0)
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """See `FmuInstance` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""

@@ -32,7 +32,13 @@ class Fmi2Instance(NativeInstance, Fmi2):
 
     _kind = StepKind.FMI2
     _functions = FmuFunctions(FMU2Slave, Fmi2.VALUES, "fmi2FreeInstance", (*Fmi2.NEEDED, "fmi2DoStep"), Fmi2.NAMES)
+    begins_again = True
     _terminated = False  # whether the FMU has asked to end the simulation with the step that is complete now
+
+    def begin_again(self) -> None:
+        """See `BeginsAgain`."""
+        self._terminated = False
+        super().begin_again()
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
