@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -23,10 +23,10 @@ from ..results.recording import Columns, ResultFile, joined
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
-from ..run.preparing import other_start_values
+from ..run.preparing import OtherStartValues
 from ..run.repeated import RepeatedRuns
 from ..run.run_plan import RunPlan
-from ..variables.value_types import DTYPES, PlainValue
+from ..variables.value_types import DTYPES
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
 from .result import Result, types_of
 from .run_thread import check_memory
@@ -72,7 +72,8 @@ class RepeatedMesh:
         self._thread = threading.get_ident()
         self._before_close = before_close
         self._rows: _CollectedRows | None = None
-        self._key, self._last, self._in_memory = b"", cast("RunPlan | None", None), False
+        self._key: Hashable = None
+        self._planned: _Planned | None = None
         told = self._tell_end if before_close is not None else None
         self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, before_close=told)
         self._loaded: list[tuple[RepeatedRuns, Path]] = []
@@ -101,16 +102,35 @@ class RepeatedMesh:
             CallRefused: this is not the thread that made this object, or it is closed.
             FmuMeshError: the run ended early; its `result` has what was recorded up to then.
         """
+        if options.output is None and options.record is None:
+            options = replace(options, record="memory")
+        values = dict(options.start_values or {})
+        # A copy: what was given may change.
+        key = msgspec.json.encode((list(values), replace(options, start_values=None).given()), enc_hook=repr)
+        return self.run_planned(key, values, options.given)
+
+    def run_planned(
+        self, key: Hashable, start_values: Mapping[str, Any], options: Callable[[], Mapping[str, Any]]
+    ) -> Result:
+        """As `run`, for a program that knows which of its runs have equal options.
+
+        Args:
+            key: equal for runs whose ``options`` differ in the start values only, of the same variables.
+            start_values: those of the options.
+            options: returns the options as `Mesh.plan` takes them; called where the run has to be planned.
+        """
         if not self._release.alive or threading.get_ident() != self._thread:
             why = "it belongs to the thread that made it" if self._release.alive else "it is closed"
             raise CallRefused(f"run is not possible, because {why}.")
-        if options.output is None and options.record is None:
-            options = replace(options, record="memory")
-        plan, start_values = self._planned(options)
-        self._rows = rows = _CollectedRows(plan, in_memory=self._in_memory)
+        others = self._planned.others.taken(start_values) if self._planned is not None and key == self._key else None
+        if others is None or self._planned is None:
+            self._key, self._planned, others = key, None, {}
+            self._planned = _Planned.of(self._plan(**options()))
+        plan = self._planned.run
+        self._rows = rows = _CollectedRows(plan, in_memory=self._planned.in_memory)
         runs = self._runs(plan.mesh)
         try:
-            outcome = runs.run(plan, rows.open, start_values)
+            outcome = runs.run(plan, rows.open, others)
         except FmuMeshError as error:
             point = runs.point
             time, warnings = plan.plan.grid.time(point), runs.warnings
@@ -127,20 +147,6 @@ class RepeatedMesh:
         assert self._before_close is not None
         self._before_close(self._rows.result(end) if isinstance(end, Outcome) else end)
 
-    def _planned(self, options: PlanOptions) -> tuple[RunPlan, Mapping[str, Mapping[str, PlainValue]]]:
-        """The plan of a run, and the start values that are not as in it: that of the run before, if it is the same."""
-        given = options.given()
-        values: Mapping[str, Any] = given.pop("start_values", {})
-        key = msgspec.json.encode((list(values), given), enc_hook=repr)  # a copy: what was given may change
-        last = self._last if key == self._key else None
-        if last is not None and (others := other_start_values(last, values)) is not None:
-            return last, others
-        self._key, self._last = key, None
-        plan = self._plan(**options.given())
-        check_memory(plan, sys.maxsize, to_its_end=True)
-        self._last, self._in_memory = plan, memory_of(plan) is not None
-        return plan, {}
-
     def _runs(self, mesh: str) -> RepeatedRuns:
         """What runs a plan; made for the first one, whose configuration is right."""
         if not self._loaded:
@@ -152,6 +158,19 @@ class RepeatedMesh:
         return self._loaded[0][0]
 
 
+class _Planned(NamedTuple):
+    """What runs share that differ in start values only."""
+
+    run: RunPlan
+    others: OtherStartValues
+    in_memory: bool
+
+    @classmethod
+    def of(cls, run: RunPlan) -> _Planned:
+        check_memory(run, sys.maxsize, to_its_end=True)
+        return cls(run, OtherStartValues(run), memory_of(run) is not None)
+
+
 class _CollectedRows:
     """The rows of a run in memory, and in its result file if it has one; see `ResultFile`."""
 
@@ -161,6 +180,7 @@ class _CollectedRows:
         nothing = {name: np.zeros(0, DTYPES[type_]) for name, type_ in (types_of(plan.plan.system) or {}).items()}
         self._pieces = [Columns(np.zeros(0), nothing)]
         self.rows = 0
+        self._made: tuple[Outcome, Result] | None = None
 
     def open(self) -> list[ResultFile]:
         """This object, whose file is open now."""
@@ -196,6 +216,12 @@ class _CollectedRows:
             self._file.close()
 
     def result(self, outcome: Outcome) -> Result:
+        """The result of a run that has ended in this way; the same one for the same outcome."""
+        if self._made is None or self._made[0] is not outcome:
+            self._made = outcome, self._result(outcome)
+        return self._made[1]
+
+    def _result(self, outcome: Outcome) -> Result:
         system, file = self._plan.plan.system, self._file.path if self._file is not None else None
         files = ((str(file), outcome.rows),) if file is not None else ()
         outcome = replace(outcome, file=str(file) if file is not None else None, files=files)

@@ -107,9 +107,12 @@ class Engine(ABC):
     def follow_inputs(self, runner: Runner) -> None:  # noqa: B027  an engine whose steps ask the runner needs nothing
         """On the main thread, between steps: inputs over time of the runner change in other steps than before."""
 
-    def begin_again(self, looked_after: ProcessState) -> None:
-        """All runners begin another run (`Runner.bind_again`); ``looked_after`` is the state of the process."""
-        self.waited_s, self.is_blocked, self._looked_after = 0.0, False, looked_after
+    def begin_again(self, looked_after: ProcessState | None) -> None:
+        """All runners begin another run (`Runner.bind_again`).
+
+        ``looked_after`` is the state of the process now; None: it is to be as it was before.
+        """
+        self.waited_s, self.is_blocked, self._looked_after = 0.0, False, looked_after or self._looked_after
         for unit, _ in zip(self._units, self.units, strict=False):
             unit.begin_again()
 
@@ -132,11 +135,15 @@ class Engine(ABC):
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
-                self._look_at = perf_counter() + _STATE_CHECK_S
-                if self._looked_after.restore():
-                    for runner in self.runners:
-                        runner.take_care()
+                self.look_after()
         return stepped
+
+    def look_after(self) -> None:
+        """Restore the state of the process, if a model has changed it since the first step."""
+        self._look_at = perf_counter() + _STATE_CHECK_S
+        if self._looked_after is not None and self._looked_after.restore():
+            for runner in self.runners:
+                runner.take_care()
 
     @abstractmethod
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
@@ -237,7 +244,7 @@ class BurstEngine(Engine):
         for runner in self.runners:
             runner.refit()
 
-    def begin_again(self, looked_after: ProcessState) -> None:
+    def begin_again(self, looked_after: ProcessState | None) -> None:
         """See `Engine`."""
         super().begin_again(looked_after)
         self._node.begin_again()

@@ -47,6 +47,7 @@ __all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
 
 _NAME: Final = "fmu_mesh"
 _TOKEN_BYTES: Final = 16
+_ZERO: Final = bytes(8)
 
 ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
 """Whether the process that somebody waits for cannot run meanwhile."""
@@ -199,7 +200,8 @@ class HostMemory:
     def begin_again(self) -> None:
         """Of private memory: all counters are 0, as at the start; the rings have their rows."""
         for counter in (self.map.grant, self.map.sent, self.map.finish, *self.map.progress, *self.map.rings):
-            self.number(counter)[:] = self.number(counter + 16)[:] = 0  # and what is claimed
+            self._view[counter : counter + 8] = _ZERO
+            self._view[counter + 16 : counter + 24] = _ZERO  # what is claimed
 
     def close(self) -> None:
         """Close the descriptor: from now on no other process can open this memory."""

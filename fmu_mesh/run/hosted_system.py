@@ -48,6 +48,8 @@ class HostedSystem:
         watch: watches all calls.
         open_instance: opens the instance with this name in this plan.
         log: called with what inputs over time warn of.
+        alone: whether nothing else in this process changes its state between the runs, so that it is looked after as
+            between steps: several times a second, and not once in each run.
 
     Attributes:
         plan: the plan of the same system with all instances in one node.
@@ -55,13 +57,15 @@ class HostedSystem:
         loads: whether the next `open` opens instances, and does not use those that are there.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a system needs of its surroundings
         self,
         run: RunPlan,
         files: int,
         watch: CallWatch,
         open_instance: Callable[[Plan, str], Instance],
         log: Callable[[LogMessage], None],
+        *,
+        alone: bool,
     ) -> None:
         self.plan = _in_one_node(run.plan, files)
         self.node = self.plan.nodes[_NODE]
@@ -73,6 +77,7 @@ class HostedSystem:
         self._open_instance, self._log = open_instance, log
         self._instances: list[Guarded] = []
         self._engine: Engine | None = None
+        self._alone = alone
         self._state: ProcessState | None = None
         self._begins_again = True
 
@@ -88,7 +93,7 @@ class HostedSystem:
             LoadFailed: one cannot be opened.
         """
         if not self.loads:
-            self._state = ProcessState()
+            self._state = None if self._alone else ProcessState()
             self.memory.begin_again()
             for instance in self._instances:
                 instance.begin_again()
@@ -119,7 +124,7 @@ class HostedSystem:
         if engine is None:
             units = [[self.runners[name] for name in names] for names in node.units]
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
-        elif self._state is not None:
+        else:
             engine.begin_again(self._state)
         for runner in self.runners.values():
             runner.begin()
@@ -129,15 +134,17 @@ class HostedSystem:
         """After the last point: end the run of all instances, and keep what the next one needs; whether that works."""
         if not self._begins_again:
             return False
-        state = self._state or ProcessState()
+        state = self._state or (None if self._alone else ProcessState())
         with self.watch.surviving(", ".join(self.plan.order)):
             ended = [instance.end_run() for instance in reversed(self._instances)]
-        self.loads = state.restore() or not all(ended)
+        self.loads = not all(ended) or (state is not None and state.restore())
         return not self.loads
 
     def close(self) -> None:
         """Close all instances, and free the memory. May be called twice."""
         self.loads = True
+        if self._engine is not None:
+            self._engine.look_after()
         for instance in reversed(self._instances):
             instance.close()
         self._instances.clear()

@@ -214,7 +214,7 @@ class RepeatedRuns:
             opening = opening_of(plan, name, around.scratch, around.log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
-        self._system = HostedSystem(run, files, watch, opened, around.log)
+        self._system = HostedSystem(run, files, watch, opened, around.log, alone=around.before_close is not None)
         return self._system
 
     def _remove_scratch(self) -> None:
@@ -269,6 +269,7 @@ class _Run:
         self._stop: str | None = None
         self._seconds = 0.0
         self._engine: Engine | None = None
+        self._end: Outcome | None = None
         self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
 
     @property
@@ -304,9 +305,12 @@ class _Run:
 
     def _outcome(self) -> Outcome:
         """How a run ended that did not fail."""
+        if self._end is not None:
+            return self._end
         writer, end = self.writer, self._first[1] if self._first is not None else None
         files, warnings = writer.counted, writer.warnings
-        return outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
+        self._end = outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
+        return self._end
 
     def _leave(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         """Keep the system for the next run, if this one has come to its last point."""

@@ -41,7 +41,7 @@ from .sweep_folder import RowFile
 from .sweep_options import SweepOptions
 from .sweep_result import SweepResult
 from .variant_run import Row, run_variants
-from .worker_pool import WorkerLost, WorkerPool, unguarded_call
+from .worker_pool import WorkerLost, WorkerPool, prepare_workers, unguarded_call
 
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 
@@ -397,5 +397,7 @@ def sweep(
     if options.executor is None and (place := unguarded_call()) is not None:
         text = f"each worker of the sweep would come to '{place}', because it imports this program"
         raise CallRefused(text, hint=_GUARD)
+    if options.executor is None:
+        prepare_workers()
     planned = planned_sweep(mesh, vary, **options.given())
     return ExecutorSweep(planned, executor=options.executor, workers=options.workers)

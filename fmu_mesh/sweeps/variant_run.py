@@ -11,6 +11,7 @@ has a thread of its own, because an FMU may not return: then the row says so, an
 from __future__ import annotations
 
 import base64
+import mmap
 import os
 import socket
 import threading
@@ -135,6 +136,9 @@ class _Loaded:
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
         self._jobs: _Jobs = SimpleQueue()
         self.hung = _Hung()
+        self._instances = frozenset(self._mesh.instances)
+        self._memory = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+        weakref.finalize(self, os.close, self._memory)
         self._bytes = 0
         self._started = 0.0
         work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset)
@@ -152,7 +156,7 @@ class _Loaded:
                 end = ended.result()
                 apart = isinstance(end, NotInOneProcess)  # a parameter may be the path of a model
             if apart:
-                end = self._run(self._mesh.run, variants[len(rows)])
+                end = self._run(lambda *variant: self._mesh.run(**self._options(*variant)), variants[len(rows)])
             if end is not None:
                 rows.append(self._row(variants[len(rows)], end, functions))
         return rows
@@ -162,7 +166,7 @@ class _Loaded:
     ) -> _End | None:
         """On the thread of the models: add the rows of variants; returns why one cannot run here."""
         for variant in variants:
-            end = self._run(runs.run, variant)
+            end = self._run(partial(self._run_here, runs), variant)
             if self.hung.stuck or isinstance(end, NotInOneProcess):
                 return end
             rows.append(self._row(variant, end, functions))
@@ -170,11 +174,19 @@ class _Loaded:
                 break
         return None
 
-    def _run(self, run: Callable[..., Result], variant: Variant) -> _End:
+    def _run_here(self, runs: RepeatedMesh, identity: str, parameters: Parameters) -> Result:
+        """A run with the models of this process; without files of their own, runs with equal keys share a plan."""
+        instances = self._instances
+        start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
+        keys = tuple((name, value) for name, value in parameters.items() if name not in start)
+        key = tuple(start), msgspec.json.encode(keys), identity if self._task.folder is not None else None
+        return runs.run_planned(key, start, partial(self._options, identity, parameters))
+
+    def _run(self, run: Callable[[str, Parameters], Result], variant: Variant) -> _End:
         self._started = time.perf_counter()
         self.hung.begin()
         try:
-            return run(**self._options(*variant))
+            return run(*variant)
         except BaseException as error:  # noqa: BLE001  it becomes a row
             return error
 
@@ -219,7 +231,7 @@ class _Loaded:
 
     def _has_grown(self) -> bool:
         """Whether this process has more than twice the memory that it had after its first run."""
-        now = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        now = int(os.pread(self._memory, 100, 0).split()[1]) * mmap.PAGESIZE
         self._bytes = self._bytes or now
         return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
 

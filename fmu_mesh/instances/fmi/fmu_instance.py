@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
@@ -42,6 +42,7 @@ LogSink = Callable[[LogMessage], None]
 T = TypeVar("T")
 
 _DOING: Final[dict[Verb, str]] = {"Set": doing(Stage.SETTING), "Get": doing(Stage.GETTING)}
+_MOST_KNOWN: Final = 64
 _OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
@@ -63,6 +64,15 @@ class FmuState(NamedTuple):
 
     handle: Any
     kept: Bookkeeping
+
+
+class _Transfer(NamedTuple):
+    """Variables of one type that are set or read by name, and memory for their values."""
+
+    type: VariableType
+    variables: Sequence[Variable]
+    names: Sequence[str]
+    buffer: Buffer
 
 
 class FmuInstance(ABC):
@@ -102,6 +112,7 @@ class FmuInstance(ABC):
         self._live = False
         self._was_reset = False
         self._keep: list[object] = []
+        self._known_functions: dict[tuple[Verb, VariableType], Callable[..., int]] = {}
         self._describe(description)
         prefix = self._functions.values.prefix
         # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
@@ -150,22 +161,19 @@ class FmuInstance(ABC):
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set variables by name."""
         self._check_live()
-        for type_, names in self._by_type(values).items():
-            variables = [self._variables[name] for name in names]
-            buffer = self._functions.values.buffer(type_, variables)
-            self._load(buffer, [e for v in variables for e in flattened(values[v.name], len(v.shape))], names)
-            self._transfer("Set", type_, variables, buffer)
+        for part in self._transfers(values):
+            elements = [e for v in part.variables for e in flattened(values[v.name], len(v.shape))]
+            self._load(part.buffer, elements, part.names)
+            self._transfer("Set", part.type, part.variables, part.buffer)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name."""
         self._check_live()
         values: dict[str, Value] = {}
-        for type_, members in self._by_type(names).items():
-            variables = [self._variables[name] for name in members]
-            buffer = self._functions.values.buffer(type_, variables)
-            self._transfer("Get", type_, variables, buffer)
-            elements, first = self._elements(buffer, members), 0
-            for variable in variables:
+        for part in self._transfers(names):
+            self._transfer("Get", part.type, part.variables, part.buffer)
+            elements, first = self._elements(part.buffer, part.names), 0
+            for variable in part.variables:
                 values[variable.name] = nested(elements[first : first + variable.size], variable.shape)
                 first += variable.size
         return [values[name] for name in names]
@@ -340,7 +348,10 @@ class FmuInstance(ABC):
         self._state = "stepping"
 
     def _describe(self, description: ModelDescription) -> None:
+        if description is getattr(self, "description", None):
+            return
         self.description = description
+        self._known_transfers: dict[tuple[str, ...], list[_Transfer]] = {}
         self._variables = {variable.name: variable for variable in description.variables}
 
     def _check_functions(self) -> None:
@@ -483,12 +494,13 @@ class FmuInstance(ABC):
             raise self._transfer_failed(verb, type_, variables, status)
 
     def _call(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> int:
-        count = len(variables)
-        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
+        count, key = len(variables), (verb, type_)
+        references = (ctypes.c_uint * count)(*[variable.value_reference for variable in variables])
         values = [buffer.sizes_address, buffer.address] if isinstance(buffer, BinaryBuffer) else [buffer.address]
         if self._functions.values.sized:
             values.append(sum(variable.size for variable in variables))
-        return self._function(verb, type_)(self._component, ctypes.addressof(references), count, *values)
+        function = self._known_functions.get(key) or self._known_functions.setdefault(key, self._function(verb, type_))
+        return function(self._component, ctypes.addressof(references), count, *values)
 
     def _function_name(self, verb: Verb, type_: VariableType) -> str:
         """The name of a getter or setter, for errors."""
@@ -525,11 +537,22 @@ class FmuInstance(ABC):
             raise self._failed(f"{', '.join(names)} cannot be read: {error}") from error
         return elements.tolist() if hasattr(elements, "tolist") else list(elements)
 
-    def _by_type(self, names: Sequence[str] | Mapping[str, Value]) -> dict[VariableType, list[str]]:
+    def _transfers(self, names: Iterable[str]) -> list[_Transfer]:
+        """Memory for the values of variables, a part for each type; the last ones are known."""
+        key = tuple(names)
+        if (known := self._known_transfers.get(key)) is not None:
+            return known
         groups: dict[VariableType, list[str]] = {}
-        for name in names:
+        for name in key:
             groups.setdefault(self._variables[name].type, []).append(name)
-        return groups
+        found = []
+        for type_, members in groups.items():
+            variables = [self._variables[name] for name in members]
+            found.append(_Transfer(type_, variables, members, self._functions.values.buffer(type_, variables)))
+        if len(self._known_transfers) >= _MOST_KNOWN:
+            self._known_transfers.clear()
+        self._known_transfers[key] = found
+        return found
 
 
 def _is_buffered(part: PartCall) -> bool:
