@@ -16,7 +16,8 @@ from ..errors import ProtocolBroken
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, LogMessage
 from ..instances.process_state import ProcessState
-from ..node.engine import Engine, make_engine
+from ..node.burst_engine import make_engine
+from ..node.engine import Engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
 from ..node.stepping import Runner, connect
