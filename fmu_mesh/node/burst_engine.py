@@ -81,7 +81,7 @@ class BurstEngine(Engine):
     def begin_again(self, looked_after: ProcessState | None) -> None:
         """See `Engine`."""
         super().begin_again(looked_after)
-        self._node.begin_again()
+        self._node.note(allowed=0, stride=1, patience=0)  # nothing of the grant before is known any more
 
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library

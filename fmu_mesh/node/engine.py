@@ -109,7 +109,7 @@ class Engine(ABC):
         """
         self.waited_s, self.is_blocked, self._looked_after = 0.0, False, looked_after or self._looked_after
         for unit, _ in zip(self._units, self.units, strict=False):
-            unit.begin_again()
+            unit.note(tick=0, next=0, spent_ns=0, blocked_by=None)
 
     def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.

@@ -114,7 +114,10 @@ class Runner:
         fill_unconnected(self.inputs, connected, self.instance.get_values)
         cast("BeginsAgain", self.instance).bind_again()
         own = self.instance.native if isinstance(self.instance, AroundNativeSteps) else None
-        self.table.begin_again(own.component if own is not None else None)
+        component = own.component if own is not None else None
+        self.table.note(component=component, step=0, stage=native.Stage.WAITING, outcome=0)
+        for gate in self.table.gates[: self.table.n_gates]:
+            gate.note(known=0)
 
     def begin(self) -> None:
         """The outputs after Initialization Mode are complete: row 0.

@@ -170,6 +170,15 @@ def _declared(name: str) -> Callable[[type[Structure]], type[Structure]]:
     return complete
 
 
+class _Changed(Structure):
+    """A structure whose fields others change while the library does not use it."""
+
+    def note(self, **changed: float | None) -> None:
+        """Change fields."""
+        for name, value in changed.items():
+            setattr(self, name, value)
+
+
 @_declared("Place")
 class Participant(Structure):
     """Which process this is among those of the memory."""
@@ -181,7 +190,7 @@ class Wish(Structure):
 
 
 @_declared("Gate")
-class Gate(Structure):
+class Gate(_Changed):
     """The rows of one source, for one delay."""
 
 
@@ -261,7 +270,7 @@ class Track(Structure):
     """An input with a value for each own step that the burst takes before `MemberTable.python_at`."""
 
 
-class _WithArrays(Structure):
+class _WithArrays(_Changed):
     def give(self, **arrays: Sequence[Structure]) -> None:
         """Give it arrays, by the names of their fields, and their lengths; it keeps them."""
         kinds: dict[str, Any] = {field: kind for field, kind, *_ in self._fields_}
@@ -274,30 +283,15 @@ class _WithArrays(Structure):
 class EquationsTable(_WithArrays):
     """The equations of a model-exchange FMU, and their solver."""
 
-    def note(self, **changed: float | None) -> None:
-        """Change fields; see `ModelPlace`."""
-        for name, value in changed.items():
-            setattr(self, name, value)
-
 
 @_declared("Member")
 class MemberTable(_WithArrays):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
-    def begin_again(self, component: int | None) -> None:
-        """Between two bursts: the next step is the first one, of the instance at this address."""
-        self.component, self.step, self.stage, self.outcome = component, 0, 0, 0
-        for number in range(self.n_gates):
-            self.gates[number].known = 0
-
 
 @_declared("Unit")
-class UnitTable(Structure):
+class UnitTable(_Changed):
     """Members that step together."""
-
-    def begin_again(self) -> None:
-        """Between two bursts: the next tick is the first one; none of the members has stopped."""
-        self.tick, self.next, self.spent_ns, self.blocked_by = 0, 0, 0, None
 
 
 @_declared("Peer")
@@ -398,12 +392,8 @@ class StreamsTable(_WithArrays):
 
 
 @_declared("Node")
-class NodeTable(Structure):
+class NodeTable(_Changed):
     """All units of a process."""
-
-    def begin_again(self) -> None:
-        """Between two bursts: nothing of the grant before is known any more."""
-        self.allowed, self.stride, self.patience = 0, 1, 0
 
 
 @_declared("Copy")

@@ -245,7 +245,12 @@ class _Hung:
         self.warning = ""  # why, if the run was over before
         self._end: _End | None = None
 
+    def watch(self, ended: Future[_End | None]) -> None:
+        """Another job begins."""
+        self.ended = ended
+
     def begin(self) -> None:
+        """Another run begins."""
         self._end = None
 
     def over(self, end: _End) -> None:
@@ -266,10 +271,11 @@ def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool) -> None:
     own = mesh.from_configuration(mesh.configuration, keeps_code=True)
     with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
-            run_all, hung.ended = job
+            run_all, ended = job
+            hung.watch(ended)
             end = run_all(runs)
             if not hung.stuck:
-                hung.ended.set_result(end)
+                ended.set_result(end)
             del job, run_all  # they have the object whose end is the end of this thread
 
 

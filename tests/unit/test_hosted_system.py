@@ -116,7 +116,8 @@ def test_the_plan_of_a_scenario_uses_start_values_itself(tmp_path: Path) -> None
     mesh.add("gain", fmu=str(FMUS / "Gain.fmu"))
     scenario = {"events": [{"at": 0.1, "set": {"gain.u": 1.0}}]}
 
-    plain, prescribed = (mesh.plan(start_values={"pendulum.d": 0.1}, **more) for more in ({}, {"scenario": scenario}))
+    plain = mesh.plan(start_values={"pendulum.d": 0.1})
+    prescribed = mesh.plan(start_values={"pendulum.d": 0.1}, scenario=scenario)
 
     assert OtherStartValues(plain).taken({"pendulum.d": 0.5}) is not None
     assert OtherStartValues(prescribed).taken({"pendulum.d": 0.5}) is None

@@ -109,7 +109,7 @@ class NativeInstance(FmuInstance):
         self._said.note(step=0)
         if self._native is not None and self._member is not None:
             self._native = self._native._replace(component=self._component)
-            self._member.begin_again(self._component)
+            self._member.note(component=self._component, step=0, stage=Stage.WAITING, outcome=0)
         self._read_outputs(0)
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
