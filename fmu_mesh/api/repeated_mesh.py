@@ -55,17 +55,19 @@ class RepeatedMesh:
     Args:
         mesh: the mesh in words; ``plan`` plans a run of it, as `Mesh.plan`.
         reset: as in `Mesh.repeated`, and so is ``on_hang``.
+        alone: whether nothing else in this process changes its working directory, locale or the like between runs.
         before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
             ``on_hang`` is also called if an FMU crashes then; the thread of the runs never goes on.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a caller may want to hear of
         self,
         mesh: str,
         plan: Callable[..., RunPlan],
         *,
         reset: bool,
         on_hang: Callable[[FmuError], None],
+        alone: bool = False,
         before_close: Callable[[Result | BaseException], None] | None = None,
     ) -> None:
         self._mesh, self._plan = mesh, plan
@@ -75,7 +77,7 @@ class RepeatedMesh:
         self._key: Hashable = None
         self._planned: _Planned | None = None
         told = self._tell_end if before_close is not None else None
-        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, before_close=told)
+        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, alone=alone, before_close=told)
         self._loaded: list[tuple[RepeatedRuns, Path]] = []
         self._release = weakref.finalize(self, _release, self._loaded, self._thread)
 

@@ -90,6 +90,7 @@ class RepeatedRuns:
         on_hang: called on another thread if a model does not return in time. All complete rows are in the result files.
             The thread that is inside the model cannot be stopped, so the caller has to end the process.
         reset: whether instances stay between runs and are reset, where their models can be reset.
+        alone: whether nothing else in this process changes its state between runs; see `HostedSystem`.
         before_close: called with how a run has ended, before its instances are closed. With it, ``on_hang`` is also
             called if a model crashes while it is closed; the thread of the runs never goes on then.
         open_instance: opens an instance by name, instead of the model of the plan; it is closed here.
@@ -103,12 +104,13 @@ class RepeatedRuns:
         progress: Callable[[int], None] = lambda _point: None,
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         reset: bool = False,
+        alone: bool = False,
         before_close: Callable[[Outcome | BaseException], None] | None = None,
         open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
         models = KeptModels(folder, resets=reset)
         self._around = _Surroundings(folder / _SCRATCH, models, log, progress, open_instance, before_close)
-        self._on_hang = on_hang
+        self._on_hang, self._alone = on_hang, alone
         self._threads = LimitedThreads()
         self._process = OneProcess()
         self._watch: CallWatch | None = None
@@ -214,7 +216,7 @@ class RepeatedRuns:
             opening = opening_of(plan, name, around.scratch, around.log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
-        self._system = HostedSystem(run, files, watch, opened, around.log, alone=around.before_close is not None)
+        self._system = HostedSystem(run, files, watch, opened, around.log, alone=self._alone)
         return self._system
 
     def _remove_scratch(self) -> None:

@@ -20,6 +20,7 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
+from multiprocessing.process import parent_process
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, cast
@@ -269,7 +270,8 @@ class _Hung:
 def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
     own = mesh.from_configuration(mesh.configuration, keeps_code=True)
-    with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
+    alone = parent_process() is not None  # a thread of a program is not
+    with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, alone=alone, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
             run_all, ended = job
             hung.watch(ended)

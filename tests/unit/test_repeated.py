@@ -548,7 +548,7 @@ def test_an_instance_is_reset_where_the_fmu_can(
     with repeating(tmp_path, reset=True) as runs:
         assert_equal(runs, [fmu_mesh.load(config).plan()] * 2)
 
-    assert found == [resets] * 3
+    assert found == [resets] * 4
 
 
 def test_messages_go_to_the_instance_of_the_run(tmp_path: Path, faulty: Path) -> None:
