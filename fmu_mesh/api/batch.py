@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CallRefused
 from ..run.copies import Copies
+from ..run.local_system import forwarded
 from ..run.preparing import KnownModels, planned_reset
 from ..run.process import interrupts_later
 from ..run.run_plan import RunPlan
@@ -34,7 +35,7 @@ from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
 from ..variables.value_types import DTYPES, is_float, is_text
-from .open_system import SystemState, forwarded
+from .system_state import SystemState
 
 __all__ = ["Batch", "BatchState"]
 
@@ -76,10 +77,10 @@ class Batch:
     """
 
     def __init__(self, run: RunPlan, copies: int) -> None:
-        if isinstance(copies, bool) or not hasattr(copies, "__index__") or operator.index(copies) < 1:
+        if copies < 1:
             raise CallRefused(f"{option_text('copies', copies)}: expected a whole number of 1 or more")
         self._run = run
-        self._count = operator.index(copies)
+        self._count = copies
         self._thread = threading.get_ident()
         self._known = KnownModels()
         self._variables: dict[str, tuple[str, Variable]] = {}
@@ -231,8 +232,8 @@ class Batch:
     def reset(self, mask: ArrayLike | None = None, start_values: Values | None = None) -> None:
         """Bring copies back to point 0: they are as new ones, whether they were done or not.
 
-        Where all FMUs can get and set their state, the second reset of a copy takes about as long as that (FMI 2.0,
-        2.1.8); the first one, and any other, makes new instances of the loaded models.
+        Where all FMUs can get and set their state, and no start values are given, the second reset of a copy takes
+        about as long as that (FMI 2.0, 2.1.8); the first one, and any other, makes new instances of the loaded models.
 
         Example:
             >>> import fmu_mesh, numpy as np
@@ -245,7 +246,7 @@ class Batch:
         Args:
             mask: which copies, truths of shape (copies,); None: all.
             start_values: by `instance.variable`: shape (copies, dimensions of the variable), or one value for all;
-                those of other copies are ignored. They stay for later resets of the same copies.
+                those of other copies are ignored. They replace those of `Mesh.batch`, in this reset only.
 
         Raises:
             ConfigurationError: a start value is wrong; carries all findings.

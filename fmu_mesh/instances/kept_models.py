@@ -9,19 +9,19 @@ from collections.abc import Hashable
 from pathlib import Path
 from typing import Protocol, cast, runtime_checkable
 
-__all__ = ["BeginsAgain", "KeptModel", "KeptModels", "SharedModels"]
+__all__ = ["KeptModel", "KeptModels", "RunsAgain", "SharedModels"]
 
 
 @runtime_checkable
-class BeginsAgain(Protocol):
+class RunsAgain(Protocol):
     """An instance whose run can end without `close`, and which can then begin another run of the same sizes.
 
-    Call sequence: `end_run` after the last step; if it returns True, `begin_again`, the calls of Initialization Mode,
+    Call sequence: `end_run` after the last step; if it returns True, `run_again`, the calls of Initialization Mode,
     `bind_again` in the place of `bind`, and steps from 0 on. Otherwise, and at any time, `close`.
     """
 
     @property
-    def begins_again(self) -> bool:
+    def runs_again(self) -> bool:
         """Whether `end_run` may be called."""
         ...
 
@@ -29,7 +29,7 @@ class BeginsAgain(Protocol):
         """End the simulation as `close` does, but keep what does not depend on the run; whether that was possible."""
         ...
 
-    def begin_again(self) -> None:
+    def run_again(self) -> None:
         """Be as a new instance before Initialization Mode.
 
         Raises:
@@ -66,6 +66,7 @@ class KeptModels:
         self.folder = folder
         self.resets = resets
         self.loads = 0  # how many models were not kept, and so are loaded
+        self.is_closed = False
         self._models: dict[str, KeptModel] = {}
 
     def take(self, name: str, key: Hashable) -> KeptModel | None:
@@ -78,14 +79,15 @@ class KeptModels:
         return found
 
     def keep(self, name: str, model: KeptModel) -> None:
-        """Keep a model for the next instance ``name``."""
+        """Keep a model for the next instance ``name``; not after `close`."""
         self._models[name] = model
 
     def made(self, name: str, model: KeptModel) -> None:
         """A model was made for the instance ``name``, because none was kept."""
 
     def close(self) -> None:
-        """Free all models."""
+        """Free all models; those that are still in use are not kept."""
+        self.is_closed = True
         for model in self._models.values():
             model.close()
         self._models.clear()

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, cast
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
 from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
-from ..instances.kept_models import BeginsAgain
+from ..instances.kept_models import RunsAgain
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -108,11 +108,11 @@ class Runner:
         self.refit()
 
     def bind_again(self) -> None:
-        """As `bind`, for an instance that has begun another run; see `BeginsAgain`."""
+        """As `bind`, for an instance that has begun another run; see `RunsAgain`."""
         self.outputs.stamps[: self.step + 1] = 0  # of the rows of the run before
         connected = [own.target for source in self.sources for own in source.transfer.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
-        cast("BeginsAgain", self.instance).bind_again()
+        cast("RunsAgain", self.instance).bind_again()
         own = self.instance.native if isinstance(self.instance, AroundNativeSteps) else None
         component = own.component if own is not None else None
         self.table.note(component=component, step=0, stage=native.Stage.WAITING, outcome=0)

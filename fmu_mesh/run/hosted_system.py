@@ -97,7 +97,7 @@ class HostedSystem:
             self._state = None if self._alone else ProcessState()
             self.memory.begin_again()
             for instance in self._instances:
-                instance.begin_again()
+                instance.run_again()
             return
         node = self.node
         places = {place.instance: place for place in node.rings}
@@ -107,7 +107,7 @@ class HostedSystem:
             place = places[item.name]
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
-            self._begins_again = self._begins_again and timed is instance and instance.begins_again
+            self._begins_again = self._begins_again and timed is instance and instance.runs_again
             self.runners[item.name] = Runner(item, timed, node.grid, ring, counter)
         connect(node, self.runners, self.memory, self.memory)
 

@@ -303,7 +303,8 @@ class FmuInstance(ABC):
 
     def _end_simulation(self) -> None:
         """End the simulation, and reset the instance if the next run gets this one."""
-        resets = self._kept is not None and (self._kept.resets or self.description.only_once_per_process)
+        kept, only_once = self._kept, self.description.only_once_per_process
+        resets = kept is not None and not kept.is_closed and (kept.resets or only_once)
         self._was_reset = self._end_run(resets=resets)
         self._state = "ended"
 
@@ -331,12 +332,13 @@ class FmuInstance(ABC):
     def _leave_model(self) -> None:
         """Leave the FMU to the next instance of this name; after a failure nothing of it is used again."""
         model = self._model
-        if self._kept is None or not self._live or self._state == "failed" or self._is_used_up:
+        kept = self._kept
+        if kept is None or kept.is_closed or not self._live or self._state == "failed" or self._is_used_up:
             model.close()
             return
         if not self._was_reset:
             model.free()
-        self._kept.keep(self.name, model)
+        kept.keep(self.name, model)
 
     def _tolerance(self) -> float | None:
         """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""

@@ -12,9 +12,10 @@ import itertools
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from copy import copy
 from functools import wraps
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from fmpy import freeLibrary
@@ -135,6 +136,12 @@ class _LoadedBefore:
         self.environment = environment
         super().__init__(**keywords)
         library.close()
+
+    def for_another(self, environment: int) -> Self:
+        """The same library for another instance with an environment of its own: functions are looked up once."""
+        other = copy(self)
+        vars(other).update(environment=environment, component=None)
+        return other
 
     @property
     def dll(self) -> FmuLibrary:

@@ -10,19 +10,23 @@ import ctypes
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal
+
+import numpy as np
 
 from ...errors import NotFinite
 from ...rings import native
 from ...rings.native import CopyCall, MemberTable, Move, NativeStep, Span, Stage, StepKind
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
+from ...variables.model_description import Variable
+from ...variables.value_types import DTYPES, Value
 from ..instance_wrapper import of_kind
 from .buffers import NumberBuffer
 from .callbacks import unregister
-from .calls import Function, Pointer, address_of, cffi_function, pointer
+from .calls import Function, Pointer, address_of, cffi_function, memory, pointer
 from .fmu_instance import FmuInstance, FmuState
-from .fmu_values import PartCall, Verb
+from .fmu_values import WARNING, PartCall, Verb
 
 __all__ = ["NativeInstance"]
 
@@ -38,7 +42,7 @@ class NativeInstance(FmuInstance):
     _kind: StepKind
     _do_step: Function  # the function of the FMU, as cffi calls it
 
-    begins_again = False  # see `BeginsAgain`
+    runs_again = False  # see `RunsAgain`
 
     _by_calls = False  # whether the steps have a part that the library does not know
 
@@ -82,7 +86,7 @@ class NativeInstance(FmuInstance):
         self._in_step = take, pointer(ctypes.addressof(member))
 
     def end_run(self) -> bool:
-        """See `BeginsAgain`."""
+        """See `RunsAgain`."""
         if self._kept is None or not self._live or self._state != "stepping":
             return False
         self._end_simulation()
@@ -93,9 +97,9 @@ class NativeInstance(FmuInstance):
         unregister(self)
         return True
 
-    def begin_again(self) -> None:
-        """See `BeginsAgain`."""
-        self._last_messages = []
+    def run_again(self) -> None:
+        """See `RunsAgain`."""
+        self._last_messages, self._was_reset = [], False
         self._said.note(step=-1, quiet_until=math.inf)
         self._state = "instantiated"
         try:
@@ -105,7 +109,7 @@ class NativeInstance(FmuInstance):
             raise self._refused(str(error)) from error
 
     def bind_again(self) -> None:
-        """See `BeginsAgain`: only the address of the instance may be another one."""
+        """See `RunsAgain`: only the address of the instance may be another one."""
         self._said.note(step=0)
         if self._native is not None and self._member is not None:
             self._native = self._native._replace(component=self._component)
@@ -162,6 +166,43 @@ class NativeInstance(FmuInstance):
         size = sum(variable.size for variable in variables) if functions.sized else -1
         self._accesses = [*self._accesses, references]
         return CopyCall(function, self._component, ctypes.addressof(references), count, size)
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`."""
+        if (number := self._number("Set", name)) is None:
+            return None
+        variable, call, arguments, cell = number
+
+        def put(value: Value) -> None:
+            cell[0] = value
+            if (status := call(*arguments)) > WARNING:
+                raise self._transfer_failed("Set", variable.type, [variable], status)
+
+        return put
+
+    def getter(self, name: str) -> Callable[[], Value] | None:
+        """See `Prepares`."""
+        if (number := self._number("Get", name)) is None:
+            return None
+        variable, call, arguments, cell = number
+
+        def get() -> Value:
+            if (status := call(*arguments)) > WARNING:
+                raise self._transfer_failed("Get", variable.type, [variable], status)
+            value: Value = cell[0]
+            return value
+
+        return get
+
+    def _number(self, verb: Verb, name: str) -> tuple[Variable, Function, tuple[Any, ...], Any] | None:
+        """What sets or gets one number: a function, its arguments, and where the number is; None if it is none."""
+        variable = self._variables[name]
+        access = self.access(verb, [name]) if not variable.shape else None
+        if access is None:
+            return None
+        cell, size = np.zeros(1, DTYPES[variable.type]), (1,) if access.size >= 0 else ()
+        call = cffi_function(self._function(verb, variable.type), self._functions.values.declaration)
+        return variable, call, (self._self, pointer(access.references), 1, memory(cell), *size), cell.data
 
     def state_access(self, state: object) -> CopyCall | None:
         """See `AccessedNatively`."""
