@@ -15,6 +15,7 @@ __all__ = ["JOBS", "OTHER", "OURS", "Entry", "Job", "with_checkout"]
 
 OURS = "fmu_mesh_launch"
 KINDS = "fmu_mesh_kinds"
+SWEEP = "fmu_mesh_sweep"
 STEPPED = "fmu_mesh_environment"
 OTHER = ", other checkout"
 """The end of the label of a row that another checkout runs."""
@@ -22,6 +23,7 @@ OTHER = ", other checkout"
 _MODULES_NEED = {
     "c_program": ("fmpy",),
     "c_model_exchange": ("fmpy",),
+    "c_sweep": ("fmpy",),
     "c_environment": ("fmpy",),
     "fmpy_environment": ("fmpy",),
     "fmpy_loop": ("fmpy",),
@@ -71,7 +73,7 @@ class Entry:
     @property
     def is_ours(self) -> bool:
         """Whether it runs fmu_mesh, of this checkout or of another one."""
-        return self.module in (OURS, KINDS, STEPPED)
+        return self.module in (OURS, KINDS, STEPPED, SWEEP)
 
 
 @dataclass(frozen=True)
@@ -399,6 +401,17 @@ JOBS = (
             Entry("fmu_mesh, cvode", KINDS, 10_000, 5_000, {"kind": "model_exchange_cvode"}),
             Entry(_C_SOLVER, "c_model_exchange", 100_000, 20_000),
             Entry("FMPy simulate_fmu (CVode), one after the other", "fmpy_model_exchange", 10_000, 5_000),
+        ),
+    ),
+    Job(
+        "sweep",
+        "a sweep of 2,000 variants of 2,000 points, two workers, no curves, one reduction; a point is a variant",
+        _NOTHING,
+        (
+            Entry("C, two processes, new instances", "c_sweep", 2_000, 500),
+            Entry("fmu_mesh, from the call to the table", SWEEP, 2_000, 500),
+            Entry("fmu_mesh, while its workers run", SWEEP, 2_000, 500, {"timed": "rows"}),
+            Entry("fmu_mesh, instances reset", SWEEP, 2_000, 500, {"reset": "yes"}),
         ),
     ),
     Job(
