@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.attaching import attach, meshes
+    from .api.batch import Batch, BatchState
     from .api.comparison import Comparison
     from .api.inspection import Inspection, inspect
     from .api.mesh_builder import Mesh, load
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
     from .sweeps.variants import Range
 
 __all__ = [
+    "Batch",
+    "BatchState",
     "CallRefused",
     "Check",
     "Comparison",
@@ -106,6 +109,7 @@ __all__ = [
 _NAMES = {
     "adapter": ("FMIAdapter",),
     "api.attaching": ("attach", "meshes"),
+    "api.batch": ("Batch", "BatchState"),
     "api.comparison": ("Comparison",),
     "api.inspection": ("Inspection", "inspect"),
     "api.mesh_builder": ("Mesh", "load"),

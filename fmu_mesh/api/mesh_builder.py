@@ -49,6 +49,7 @@ from .mesh_editing import (
 if TYPE_CHECKING:
     from ..errors import Finding
     from ..pictures.system_graph import SystemGraph
+    from .batch import Batch
     from .open_system import System
     from .repeated_mesh import RepeatedMesh
     from .result import Result
@@ -633,9 +634,38 @@ class Mesh:
         """
         from .open_system import System  # noqa: PLC0415  only this needs it
 
+        return System(self._opened(options))
+
+    @takes(OpenOptions)
+    def batch(self, copies: int, options: OpenOptions) -> Batch:
+        """Open many copies of all instances in this process, for a program that steps them as arrays (docs/batches.md).
+
+        Nothing is recorded into a file, and no other process is started. Inputs with a Zenoh key are free to be set.
+
+        Example:
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2, {"pendulum.a": 0.5}) as batch:
+            ...     batch.step(100)
+            ...     batch.time.tolist()
+            [0.2, 0.2]
+
+        Args:
+            copies: how many, 1 or more.
+            options: see `OpenOptions`.
+
+        Raises:
+            ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
+                instances need a process of their own each.
+            CallRefused: there is not enough memory.
+            FmuError: an instance cannot be opened or initialized. Nothing is left behind.
+        """
+        from .batch import Batch  # noqa: PLC0415  only this needs it
+
+        return Batch(self._opened(options), copies)
+
+    def _opened(self, options: OpenOptions) -> RunPlan:
         if options.keys_from is not None:
-            raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `system.set`.")
-        return System(without_keys(self.plan(**options.given())))
+            raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `set`.")
+        return without_keys(self.plan(**options.given()))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

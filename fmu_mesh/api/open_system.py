@@ -29,13 +29,11 @@ from ..run.local_system import LocalSystem, SavedSystem, opening_of
 from ..run.one_process import OneProcess
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
-from ..system.start_values import why_not_settable
-from ..text import did_you_mean, listed, meant, nearest, option_text, shown
-from ..variables.model_description import Variable
+from ..text import listed, option_text, shown
 from ..variables.value_conversion import ValueRefused, checked_value
 from ..variables.value_types import DTYPES
 
-__all__ = ["System", "SystemState"]
+__all__ = ["System", "SystemState", "forwarded"]
 
 log = logging.getLogger(__name__)
 
@@ -221,7 +219,7 @@ class System:
             FmuError: the FMU refuses the value. Only `close` is allowed now.
         """
         self._demand("set")
-        instance, variable = self._found(name)
+        instance, variable = self._run.variable(name)
         own = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance)
         try:
             own.check_settable(variable)
@@ -336,32 +334,12 @@ class System:
         self._mode = "ready"
 
     def _getter(self, name: str) -> Callable[[int], Any]:
-        instance, variable = self._found(name, elements=True)
+        instance, variable = self._run.variable(name, elements=True)
         plain = self._local.getter(instance, name.removeprefix(f"{instance}."))
         is_array, dtype = variable.shape and name == f"{instance}.{variable.name}", DTYPES[variable.type]
         read = (lambda point: np.array(plain(point), dtype)) if is_array else plain
         self._getters[name] = read
         return read
-
-    def _found(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
-        """The instance and the variable with this name; with ``elements``, it may be an element of the variable."""
-        instances = self._run.plan.system.instances
-        instance, _, rest = str(name).partition(".")
-        if instance not in instances:
-            hint = did_you_mean(instance, instances, f"There are {listed(list(instances))}.")
-            raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
-        description = instances[instance].description
-        variable = description.variable_of(rest) if elements else description.variable(rest)
-        if variable is None or (rest != variable.name and rest not in variable.elements):
-            sources = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance).sources
-            free = [one.name for one in description.variables if not why_not_settable(one, sources.get(one.name))]
-            names = [one.name for one in description.variables] if elements else free
-            if (clock := description.clock(rest)) is not None:
-                raise UnknownName(f"{clock}.", instance=instance)
-            near = nearest(rest, names)
-            hint = meant(near and f"{instance}.{near}", f"There are {listed(names)}.")
-            raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
-        return instance, variable
 
     def _free_lost(self) -> None:
         """Free the states whose objects are gone, which may have happened on any thread."""
@@ -409,11 +387,12 @@ class SystemState:
 
 
 def _opened(run: RunPlan, folder: Path, name: str) -> Guarded:
-    opening = opening_of(run.plan, name, folder, _forward, run.showing)
+    opening = opening_of(run.plan, name, folder, forwarded, run.showing)
     return Guarded(name, lambda: open_instance(opening), Unwatched(), run.plan.system.config.timeouts)
 
 
-def _forward(message: LogMessage) -> None:
+def forwarded(message: LogMessage) -> None:
+    """Give the log a message of a model."""
     level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status.lower(), logging.ERROR)
     said = map(paragraph, (message.category, message.message))
     log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
@@ -22,7 +22,7 @@ from ..variables.model_description import ModelDescription, Value
 from .kept_models import KeptModels
 
 if TYPE_CHECKING:
-    from ..rings.native import NativeStep, Span
+    from ..rings.native import CopyCall, NativeStep, Span
     from ..rings.ring import Ring
 
 __all__ = [
@@ -308,6 +308,22 @@ class StepsNatively(Protocol):
             FmuError: the step has failed.
             TerminationRequested: see `Instance.do_step`.
         """
+        ...
+
+
+@runtime_checkable
+class AccessedNatively(Protocol):
+    """An instance whose values and states the library may get and set for many copies at once."""
+
+    def access(self, verb: Literal["Get", "Set"], names: Sequence[str]) -> CopyCall | None:
+        """The call for these variables of one type, their elements one after another in the dtype of that type.
+
+        None if only `get_values` and `set_values` can.
+        """
+        ...
+
+    def state_access(self, state: object) -> CopyCall | None:
+        """The call of `KeepsState.set_state`; None if there is more to do than to call it and to restore `Said`."""
         ...
 
 

@@ -6,16 +6,16 @@ Also owns the form in which a wrapper stores its own part of a state next to tha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, Literal, TypeVar, cast
 
 import msgspec
 
 from ..errors import FmuError, FmuMeshError
-from ..rings.native import NativeStep, Span, Stage
+from ..rings.native import CopyCall, NativeStep, Span, Stage
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..variables.model_description import ModelDescription, Value
-from .contract import ChangesProcess, Instance, KeepsState, StepsNatively
+from .contract import AccessedNatively, ChangesProcess, Instance, KeepsState, StepsNatively
 
 __all__ = ["AroundInstance", "AroundNativeSteps", "of_kind", "packed", "unpacked"]
 
@@ -136,6 +136,14 @@ class AroundNativeSteps(AroundInstance[Instance]):
     def check_rows(self, spans: Sequence[Span]) -> bool:
         """See `StepsNatively`; False if the inner instance has no such steps."""
         return self._instance.check_rows(spans) if isinstance(self._instance, StepsNatively) else False
+
+    def access(self, verb: Literal["Get", "Set"], names: Sequence[str]) -> CopyCall | None:
+        """See `AccessedNatively`; None if the inner instance is none."""
+        return self._instance.access(verb, names) if isinstance(self._instance, AccessedNatively) else None
+
+    def state_access(self, state: object) -> CopyCall | None:
+        """See `AccessedNatively`; None if the inner instance is none."""
+        return self._instance.state_access(state) if isinstance(self._instance, AccessedNatively) else None
 
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`; only called if there is `native`."""

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
-__all__ = ["KeptModel", "KeptModels"]
+__all__ = ["KeptModel", "KeptModels", "SharedModels"]
 
 
 class KeptModel(Protocol):
@@ -51,8 +51,58 @@ class KeptModels:
         """Keep a model for the next instance ``name``."""
         self._models[name] = model
 
+    def made(self, name: str, model: KeptModel) -> None:
+        """A model was made for the instance ``name``, because none was kept."""
+
     def close(self) -> None:
         """Free all models."""
         for model in self._models.values():
             model.close()
         self._models.clear()
+
+
+class SharedModel(KeptModel, Protocol):
+    """A model that others like it can share the files with."""
+
+    @property
+    def has_files(self) -> bool:
+        """Whether its files are still there."""
+        ...
+
+    def sharing(self) -> KeptModel:
+        """Another one with the same files; of one library, a process has one copy."""
+        ...
+
+
+class SharedModels(KeptModels):
+    """Any number of models for each instance name, which share files and library (FMI 2.0, 2.1.1; FMI 3.0, 2.2.1)."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._made: dict[str, SharedModel] = {}
+        self._free: dict[str, list[KeptModel]] = {}
+
+    def take(self, name: str, key: Hashable) -> KeptModel | None:
+        """A free model of the instance ``name``, or one more; the caller owns it from now on."""
+        if free := self._free.get(name):
+            return free.pop()
+        made = self._made.get(name)
+        if made is not None and made.key == key and made.has_files:
+            return made.sharing()
+        self.loads += 1
+        return None
+
+    def keep(self, name: str, model: KeptModel) -> None:
+        """Keep a model for the next instance ``name``."""
+        self._free.setdefault(name, []).append(model)
+
+    def made(self, name: str, model: KeptModel) -> None:
+        """A model was made for the instance ``name``: the next ones share its files."""
+        self._made[name] = cast("SharedModel", model)
+
+    def close(self) -> None:
+        """Free all models that are free."""
+        for models in self._free.values():
+            for model in models:
+                model.close()
+        self._free.clear()

@@ -1,8 +1,7 @@
 """The engine of a node: steps its runners as far as inputs, windows and the grant allow.
 
-`BurstEngine` hands tables to the burst in C, which also waits (`fmu_mesh/rings/burst.c`). `PlainEngine` is the same in
-plain Python, for one process: where the library is missing, all other processes are reached by frames, so it waits for
-nothing but its inbox.
+`PlainEngine` does it in plain Python, for one process: where the library is missing, all other processes are reached by
+frames, so it waits for nothing but its inbox. `fmu_mesh.node.burst_engine` does it in C.
 """
 
 from __future__ import annotations
@@ -10,23 +9,19 @@ from __future__ import annotations
 import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from itertools import chain
 from threading import Lock
 from time import perf_counter
-from typing import Final, cast
+from typing import Final
 
-from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
-from ..instances.contract import StepsNatively
+from ..errors import FmuMeshError, ProtocolBroken
 from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
 from ..rings.host_memory import Counter, HostMemory
-from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
-from ..rings.row_streams import RowStreams
+from ..rings.native import Stage, table
 from ..system.plan import NodePlan
-from .inputs import TimedInputs
 from .stepping import Runner
 
-__all__ = ["BurstEngine", "Engine", "PlainEngine", "Windows", "make_engine"]
+__all__ = ["SLICE_S", "STATE_CHECK_S", "Engine", "PlainEngine", "Windows"]
 
 # Threads: `run` belongs to the main thread, because an FMU is called from one thread only (ADR 12). From other
 # threads come: `ring_bell` (threads of Zenoh with a message, the server with a query), `current` and `spent_s` (the
@@ -40,7 +35,7 @@ __all__ = ["BurstEngine", "Engine", "PlainEngine", "Windows", "make_engine"]
 #   copied it, and ends with FORGED. The outputs of that step are not counted.
 # * A wake-up is lost, because its sender was killed: each sleep has a limit, then everything is looked at anew.
 # * An FMU changes the floating-point mode or a signal handler of the process: the mode is looked at after each step,
-#   as that is two additions; all else every 50 ms (`_STATE_CHECK_S`), as that is 10 us.
+#   as that is two additions; all else every 50 ms (`STATE_CHECK_S`), as that is 10 us.
 # * Python writes a table while the burst uses it: it cannot, because `refit` and `follow_inputs` run on the main
 #   thread, between two calls of `node_run`, or for a member whose step the burst has just given to Python.
 #
@@ -48,10 +43,10 @@ __all__ = ["BurstEngine", "Engine", "PlainEngine", "Windows", "make_engine"]
 # compiled (170 MB, up to 20 ms for each node, and no faster; ADR 57), a grant that is asked for at each window (ADR
 # 58).
 
-_SLICE_S: Final = 0.001
+SLICE_S: Final = 0.001
 """A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""
 
-_STATE_CHECK_S: Final = 0.05
+STATE_CHECK_S: Final = 0.05
 """How often in s, at the end of a burst, a changed state of the process is looked for, which takes 10 us. Models that
 are known to change it are looked after in each step."""
 
@@ -126,7 +121,7 @@ class Engine(ABC):
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
-                self._look_at = perf_counter() + _STATE_CHECK_S
+                self._look_at = perf_counter() + STATE_CHECK_S
                 if self._looked_after.restore():
                     for runner in self.runners:
                         runner.take_care()
@@ -171,208 +166,33 @@ class Engine(ABC):
         sources = (source for runner in self.runners for source in runner.lacking)
         return next((source.instance for source in sources if source.instance not in own), None)
 
+    @property
+    def places(self) -> list[tuple[int, int]]:
+        """Where in memory it is told how far the units and their members are, and how many bytes."""
+        ticks = native.UnitTable.tick.offset, native.UnitTable.spent_ns.offset
+        steps = native.MemberTable.step.offset, ctypes.sizeof(native.MemberTable)
+        tables = [(unit, ticks) for unit in self._units[: len(self.units)]] + [
+            (own.table, steps) for own in self.runners
+        ]
+        return [(ctypes.addressof(own) + first, end - first) for own, (first, end) in tables]
+
     def tick_points(self, unit: Sequence[Runner]) -> int:
         """Base points of one tick: a unit of one instance ticks at its own points, a cycle at every point."""
         return unit[0].plan.step_points if len(unit) == 1 else 1
 
 
-def make_engine(  # noqa: PLR0913  one node and how it is connected
-    plan: NodePlan,
-    units: Sequence[Sequence[Runner]],
-    memory: HostMemory,
-    windows: Windows = (),
-    *,
-    spins: bool,
-    streams: RowStreams | None = None,
-) -> Engine:
-    """The engine for this machine."""
-    if native.library is None:
-        return PlainEngine(plan, units, memory, windows)
-    return BurstEngine(plan, units, memory, windows, spins=spins, streams=streams)
-
-
-class BurstEngine(Engine):
-    """Steps with the burst in C."""
-
-    def __init__(  # noqa: PLR0913  one node and how it is connected
-        self,
-        plan: NodePlan,
-        units: Sequence[Sequence[Runner]],
-        memory: HostMemory,
-        windows: Windows = (),
-        *,
-        spins: bool,
-        streams: RowStreams | None = None,
-    ) -> None:
-        super().__init__(plan, units, memory, windows)
-        self._streams = streams
-        assert native.library is not None
-        self._library = native.library
-        self._kept: dict[str, list[object]] = {}
-        self._tracks: dict[str, list[object]] = {}
-        self._peers = table(native.Peer, [native.Peer(counter.address, window) for _, counter, window in self._windows])
-        self._node = native.NodeTable(
-            place=memory.place,
-            streams=streams.address if streams is not None else None,
-            units=self._units,
-            n_units=len(units),
-            peers=self._peers,
-            n_peers=len(self._windows),
-            ceiling=memory.grant.address,
-            finish=memory.finish.address if streams is not None else None,
-            progress=self._progress.address,
-            last_point=self._last_point,
-            slice_ns=int(_SLICE_S * 1e9),
-            spins=spins,
-            batch=plan.batch,
-            stride=1,
-        )
-        self._address = ctypes.addressof(self._node)
-        for runner in self.runners:
-            runner.refit()
-
-    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
-        node, library = self._node, self._library
-        most_s = _STATE_CHECK_S if quiet else _SLICE_S
-        node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
-        started, before, waited_ns = perf_counter(), self._ticks, node.waited_ns
-        while True:
-            result = library.run(self._address)
-            if result < BurstEnd.PYTHON:
-                break
-            runner = self.units[node.unit][node.member]
-            if result == BurstEnd.FORGED:
-                raise self._forged(runner)
-            began = perf_counter()
-            self._complete(node.unit, runner, result)
-            self._units[node.unit].spent_ns += int((perf_counter() - began) * 1e9)
-            if perf_counter() - started > most_s:
-                library.attend(self._address)  # so it returns after this tick
-        library.attended(self._address)
-        self.is_blocked = result in {BurstEnd.BLOCKED, BurstEnd.DONE}
-        self.note_wait((node.waited_ns - waited_ns) / 1e9)
-        return self._ticks != before
-
-    def send(self) -> None:
-        """See `Engine`."""
-        super().send()
-        if self._streams is not None:
-            self._streams.beat()
-
-    def ring_bell(self) -> None:
-        """See `Engine`."""
-        self._library.attend(self._address)
-
-    @property
-    def awaited(self) -> str | None:
-        """See `Engine`."""
-        names = {source.counter.address: source.instance for runner in self.runners for source in runner.sources}
-        names |= {counter.address: name for name, counter, _ in self._windows}
-        unfinished = (unit for unit in self._units if unit.tick < unit.last_tick and not unit.stopped)
-        return next((names.get(unit.blocked_by) for unit in unfinished if unit.blocked_by is not None), None)
-
-    @property
-    def late(self) -> int:
-        """How often a sleep ended by its time limit although the value was there: 0 where no wake-up is lost."""
-        return int(self._node.late)
-
-    @property
-    def _ticks(self) -> int:
-        return sum(runner.step for runner in self.runners)
-
-    def refit(self, runner: Runner) -> None:
-        """Fill the table of a runner: at the start, and again whenever it steps in another way."""
-        before, unit = runner.table, next(unit for unit in self.units if runner in unit)
-        own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
-        if own is not None and any(source.transfer.has_text for source in runner.sources):
-            own = None
-        moves = [source.transfer.moves(RowBase.FIRST_GATE + number) for number, source in enumerate(runner.sources)]
-        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(runner.sources)))()
-        grid, points = runner.grid, runner.plan.step_points
-        watched = runner.watched if runner.watched is not None else runner.outputs
-        rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
-        names = ("kind", "component", "do_step", "said") if own is not None else ()  # without them, BY_PYTHON is 0
-        calls = {name: getattr(own, name) for name in names}
-        made = native.MemberTable(
-            **calls,
-            start_time=grid.start_time,
-            base_step_size=grid.step_size,
-            step_size=points * grid.step_size,
-            points=points,
-            every=points // self.tick_points(unit),
-            last_step=runner.last_step,
-            python_at=NEVER,
-            outputs=(native.OutputTable * 2)(*rings),
-            counter=runner.counter.address,
-            bases=ctypes.cast(bases, ctypes.POINTER(ctypes.c_void_p)),
-            step=before.step,
-            stage=before.stage,
-            outcome=before.outcome,
-        )
-        loads = list(chain(*moves))
-        if own is not None:
-            made.give(setters=own.setters, getters=own.getters, stores=own.stores)
-            loads += own.loads
-        made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
-        self._kept[runner.name] = [made, bases, own]  # what the table points to
-        ctypes.pointer(before)[0] = made
-        self.follow_inputs(runner)
-
-    def follow_inputs(self, runner: Runner) -> None:
-        """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""
-        timed, member = runner.instance, runner.table
-        if isinstance(timed, TimedInputs):
-            if timed.tracks or member.n_tracks:
-                self._tracks[runner.name] = [timed.tracks]  # what the table points to
-                member.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
-            member.python_at, member.tracks_from = timed.python_at, timed.tracks_from
-
-    def _complete(self, unit: int, runner: Runner, result: int) -> None:
-        """Let Python take a step, or complete one that returned something unusual."""
-        member = runner.table
-        step = member.step
-        try:
-            if result == BurstEnd.NOT_FINITE:
-                raise runner.is_finite.error(step + 1, runner.grid)
-            if result == BurstEnd.PYTHON:
-                for source in runner.sources:
-                    source.transfer.step_text(step)
-                runner.instance.do_step(step)
-                self.follow_inputs(runner)
-            else:
-                if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
-                    for source in runner.sources:
-                        source.transfer.check_range(step)
-                if member.kind == StepKind.BY_PYTHON:
-                    raise self._forged(runner)  # it was out of range when the burst has read it
-                cast("StepsNatively", runner.instance).finish(step, member.outcome)
-        except FmuMeshError as error:
-            self._units[unit].stopped = 1
-            runner.is_finite.explain(error)
-            if isinstance(error, TerminationRequested):
-                member.stage = Stage.WAITING
-            raise
-        if floating_point_changed():
-            restore_floating_point()
-        member.stage = Stage.STEPPED
-
-    def _forged(self, runner: Runner) -> ProtocolBroken:
-        step, sources = runner.step, runner.sources
-        lost = [own for own in sources if not own.transfer.source.has_row(own.transfer.rule.row_for(step))]
-        source = (lost or sources)[0]
-        return ProtocolBroken(
-            f"a row of '{source.instance}' for '{runner.name}' is not the one that was written",
-            instance=runner.name,
-            point=runner.point,
-            time=runner.grid.time(runner.point),
-            hint="Does another process write to the memory of this run?",
-        )
-
-
 class PlainEngine(Engine):
     """Steps in plain Python."""
 
-    slice_s = _SLICE_S  # every unit has a turn before it is looked at
+    def step_to(self, point: int) -> None:
+        """Take all steps that end at this point or before, in a process that waits for nobody."""
+        for unit, place in zip(self.units, self._units, strict=False):
+            place.last_tick = point // place.tick_points
+            while place.tick < place.last_tick and not place.stopped:
+                if not self._advance(unit, place, perf_counter()):
+                    raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
+
+    slice_s = SLICE_S  # every unit has a turn before it is looked at
     _attention = False
 
     def refit(self, runner: Runner) -> None:

@@ -67,7 +67,8 @@ from ..wire.streamed_rows import why_not
 from ..wire.views import LogLine
 from ..wire.ways import Ways
 from .activity import Activity
-from .engine import Engine, Windows, make_engine
+from .burst_engine import make_engine
+from .engine import Engine, Windows
 from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink

@@ -12,6 +12,7 @@
  *   counter_raise                       the one thread that raises this counter
  *   counter_value, bell_seen, sleep_for each participant for itself: one thread that sleeps
  *   grant_withdraw                      the master
+ *   copies_*                            the one thread of the copies that they are given
  *
  * What may go wrong: a peer writes garbage into the memory (a value never comes of it, see Rows), a peer is killed
  * between a value and its bell (a sleeper loses its time limit once), a model changes the floating-point mode (it is
@@ -215,17 +216,20 @@ static inline int move_all(const Move *moves, int64_t n, char *const *bases) {
   return 0;
 }
 
+/* Call a getter or setter; a `size` below 0 is that of a function that takes none. */
+static inline int call_values(void *function, void *component, const void *references, int64_t count, void *values,
+                              int64_t size) {
+  if (size < 0)
+    return ((int (*)(void *, const void *, size_t, void *))function)(component, references, (size_t)count, values);
+  return ((int (*)(void *, const void *, size_t, void *, size_t))function)(component, references, (size_t)count, values,
+                                                                           (size_t)size);
+}
+
 static inline int call_all(const Member *member, const Call *calls, int64_t n) {
-  void *component = member->component;
   for (int64_t i = 0; i < n; i++) {
     const Call *call = &calls[i];
     void *values = member->bases[call->base] + call->values;
-    int status =
-        call->size < 0
-            ? ((int (*)(void *, const void *, size_t, void *))call->function)(component, call->references,
-                                                                              (size_t)call->count, values)
-            : ((int (*)(void *, const void *, size_t, void *, size_t))call->function)(
-                  component, call->references, (size_t)call->count, values, (size_t)call->size);
+    int status = call_values(call->function, member->component, call->references, call->count, values, call->size);
     if (status > WARNING || status < 0) {
       member->said->call = (int32_t)i;
       return status;
@@ -679,3 +683,62 @@ PUBLIC void node_attend(Node *node) {
 }
 
 PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
+
+/* ---- copies: many systems in this process, each with tables of its own. Nobody else reads their memory, so nothing
+ * waits: a unit that lacks a row is a fault of its plan. */
+
+/* Step a copy to its goal, point by point: so it ends at an event as if each instance had been called in its turn. */
+static int step_copy(Copy *copy) {
+  Node *node = copy->node;
+  for (; copy->point < copy->goal; copy->point++) {
+    for (int64_t i = 0; i < node->n_units; i++) {
+      Unit *unit = &node->units[i];
+      unit->last_tick = unit->tick_points == 1 ? copy->point + 1 : (copy->point + 1) / unit->tick_points;
+      if (unit->stopped || unit->tick >= unit->last_tick) continue;
+      int64_t ticks;
+      int result = advance(node, unit, &ticks);
+      if (result != SLICE) return result;
+      if (unit->tick < unit->last_tick) return BLOCKED;
+    }
+  }
+  return DONE;
+}
+
+/* Step copies to their goals; returns how many have ended before. `end` says why, and the node who it is about. */
+PUBLIC int64_t copies_step(Copy *copies, int64_t n) {
+  int64_t left = 0;
+  for (int64_t i = 0; i < n; i++) {
+    copies[i].end = step_copy(&copies[i]);
+    left += copies[i].end != DONE;
+  }
+  return left;
+}
+
+/* Get or set variables of the copies that `wanted` names (NULL: all), from or to values that are `stride` bytes apart; or
+ * set their states. Returns the number of the first copy whose status is above warning; `n` if there is none. */
+PUBLIC int64_t copies_call(const CopyCall *calls, int64_t n, const uint8_t *wanted, char *values,
+                           int64_t stride) {
+  for (int64_t i = 0; i < n; i++) {
+    const CopyCall *own = &calls[i];
+    if (wanted != NULL && !wanted[i]) continue;
+    int status = own->count < 0 ? ((int (*)(void *, const void *))own->function)(own->component, own->references)
+                                : call_values(own->function, own->component, own->references, own->count,
+                                              values + i * stride, own->size);
+    if (status > WARNING || status < 0) return i;
+  }
+  return n;
+}
+
+/* Copy outputs of `size` bytes from the rows at the points of the copies. */
+PUBLIC void copies_read(const Copy *copies, const CopyOutput *outputs, int64_t n, int64_t size, char *to, int64_t stride) {
+  for (int64_t i = 0; i < n; i++) {
+    const Member *member = outputs[i].member;
+    const Output *own = &member->outputs[0];
+    const int64_t row = member->points == 1 ? copies[i].point : copies[i].point / member->points;
+    const char *from = own->rows + (row & own->mask) * own->stride + outputs[i].place;
+    if (size == 8)
+      memcpy(to + i * stride, from, 8);
+    else
+      memcpy(to + i * stride, from, (size_t)size);
+  }
+}

@@ -275,6 +275,23 @@ typedef struct { /* all units of a process */
   _Atomic int64_t attention; /* Python has something to do */
 } Node;
 
+typedef struct { /* one of many copies of a system in this process */
+  Node *node;
+  int64_t point, goal; /* the last point that all its units have reached, and where it shall go */
+  int64_t end;         /* a BurstEnd */
+} Copy;
+
+typedef struct { /* a getter or setter of one copy, for some variables */
+  void *function, *component;
+  const void *references;
+  int64_t count, size; /* as those of Call; with the count -1, the function sets the state `references` */
+} CopyCall;
+
+typedef struct { /* an output in the rows of one copy: `place` in bytes */
+  const Member *member;
+  int64_t place;
+} CopyOutput;
+
 enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* why node_run returns */
 
 #endif

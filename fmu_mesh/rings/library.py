@@ -11,12 +11,13 @@ import hashlib
 import os
 import platform
 import sys
+from ctypes import CFUNCTYPE, PYFUNCTYPE, c_double, c_int64, c_uint32, c_void_p
 from pathlib import Path
 from typing import Final
 
 from ..errors import ConfigurationError
 
-__all__ = ["LIBRARY_VARIABLE", "library_missed", "load_library", "why_no_library"]
+__all__ = ["LIBRARY_VARIABLE", "LibraryFunctions", "library_missed", "load_library", "why_no_library"]
 
 LIBRARY_VARIABLE: Final = "FMU_MESH_LIBRARY"
 """An environment variable: `none` runs without the library; a path is that of another library."""
@@ -28,6 +29,38 @@ _COULD_BE: Final = ("linux-x86_64", "linux-aarch64")
 """The platforms that it can be built for, with glibc."""
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
+
+
+class LibraryFunctions:
+    """The functions of the library at ``path``. Those that may take long release the interpreter's lock."""
+
+    def __init__(self, path: str) -> None:
+        quick, slow = ctypes.PyDLL(path), ctypes.CDLL(path)
+        address = c_void_p
+        self.run = CFUNCTYPE(c_int64, address)(("node_run", slow))
+        self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
+        self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
+        self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
+        self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
+        self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
+        self.copies_step = CFUNCTYPE(c_int64, address, c_int64)(("copies_step", slow))
+        called = (address, c_int64, address, address, c_int64)
+        self.copies_call = CFUNCTYPE(c_int64, *called)(("copies_call", slow))
+        read = (address, address, c_int64, c_int64, address, c_int64)
+        self.copies_read = CFUNCTYPE(None, *read)(("copies_read", slow))
+        self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
+        self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
+        self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))
+        self.bell_seen = PYFUNCTYPE(c_uint32, address)(("bell_seen", quick))
+        self.counter_raise = PYFUNCTYPE(None, address, address, c_int64)(("counter_raise", quick))
+        self.counter_value = PYFUNCTYPE(c_int64, address)(("counter_value", quick))
+        self.stream_open = PYFUNCTYPE(None, address, c_int64)(("stream_open", quick))
+        self.stream_hold = CFUNCTYPE(None, address)(("stream_hold", slow))
+        self.stream_beat = PYFUNCTYPE(None, address)(("stream_beat", quick))
+        self.streams_write = PYFUNCTYPE(None, address, c_int64)(("streams_write", quick))
+        self.streams_serve = CFUNCTYPE(None, address, c_int64)(("streams_serve", slow))
+        self.streams_listen = PYFUNCTYPE(None, address, c_int64, c_int64)(("streams_listen", quick))
+        self.grant_withdraw = PYFUNCTYPE(c_int64, address, address, c_int64)(("grant_withdraw", quick))
 
 
 def load_library() -> str | None:

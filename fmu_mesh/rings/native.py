@@ -13,14 +13,14 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from ctypes import CFUNCTYPE, POINTER, PYFUNCTYPE, Structure, c_bool, c_double, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_void_p
 from enum import IntEnum
 from keyword import iskeyword
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ..variables.value_types import VariableType
-from .library import load_library
+from .library import LibraryFunctions, load_library
 
 __all__ = [
     "NEVER",
@@ -31,6 +31,9 @@ __all__ = [
     "BurstEnd",
     "Call",
     "Change",
+    "CopyCall",
+    "CopyOutput",
+    "CopyTable",
     "Entry",
     "EquationsTable",
     "Gate",
@@ -389,6 +392,21 @@ class NodeTable(Structure):
     """All units of a process."""
 
 
+@_declared("Copy")
+class CopyTable(Structure):
+    """One of many copies of a system in this process."""
+
+
+@_declared("CopyCall")
+class CopyCall(Structure):
+    """A getter or setter of one copy, for one variable."""
+
+
+@_declared("CopyOutput")
+class CopyOutput(Structure):
+    """An output in the rows of one copy."""
+
+
 class NativeStep(NamedTuple):
     """How an FMU takes a step without Python: the tables of `call_step`.
 
@@ -416,32 +434,5 @@ def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no
     return (kind * max(len(items), 1))(*items)
 
 
-class _Library:
-    """The functions of `burst.c`. Those that may take long release the interpreter's lock."""
-
-    def __init__(self, path: str) -> None:
-        quick, slow = ctypes.PyDLL(path), ctypes.CDLL(path)
-        address = c_void_p
-        self.run = CFUNCTYPE(c_int64, address)(("node_run", slow))
-        self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
-        self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
-        self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
-        self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
-        self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
-        self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
-        self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
-        self.ring_bell = PYFUNCTYPE(None, address)(("ring_bell", quick))
-        self.bell_seen = PYFUNCTYPE(c_uint32, address)(("bell_seen", quick))
-        self.counter_raise = PYFUNCTYPE(None, address, address, c_int64)(("counter_raise", quick))
-        self.counter_value = PYFUNCTYPE(c_int64, address)(("counter_value", quick))
-        self.stream_open = PYFUNCTYPE(None, address, c_int64)(("stream_open", quick))
-        self.stream_hold = CFUNCTYPE(None, address)(("stream_hold", slow))
-        self.stream_beat = PYFUNCTYPE(None, address)(("stream_beat", quick))
-        self.streams_write = PYFUNCTYPE(None, address, c_int64)(("streams_write", quick))
-        self.streams_serve = CFUNCTYPE(None, address, c_int64)(("streams_serve", slow))
-        self.streams_listen = PYFUNCTYPE(None, address, c_int64, c_int64)(("streams_listen", quick))
-        self.grant_withdraw = PYFUNCTYPE(c_int64, address, address, c_int64)(("grant_withdraw", quick))
-
-
 _path = load_library()
-library: Final = _Library(_path) if _path is not None else None
+library: Final = LibraryFunctions(_path) if _path is not None else None

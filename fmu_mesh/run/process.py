@@ -32,7 +32,16 @@ from ..wire.runtime import (
 )
 from .run_plan import MANUAL
 
-__all__ = ["GRACE_S", "Interruption", "RunProcess", "die_with_parent", "ended_by_signals", "forked_by", "only_wake"]
+__all__ = [
+    "GRACE_S",
+    "Interruption",
+    "RunProcess",
+    "die_with_parent",
+    "ended_by_signals",
+    "forked_by",
+    "interrupts_later",
+    "only_wake",
+]
 
 GRACE_S = 1.0
 """How long the main thread may take to end the process before another thread does."""
@@ -234,3 +243,24 @@ def forked_by(server: int) -> None:
 
 def only_wake(_number: int, _frame: FrameType | None) -> None:
     """The handler of a signal whose number whoever reads the wakeup descriptor gets."""
+
+
+@contextmanager
+def interrupts_later() -> Iterator[Callable[[], bool]]:
+    """In the block, Ctrl-C only answers the function with True, and is raised at the end.
+
+    Where it was no `KeyboardInterrupt` before, or this is not the main thread, nothing changes.
+    """
+    asked: list[int] = []
+    if threading.current_thread() is not threading.main_thread() or (
+        signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    ):
+        yield lambda: False
+        return
+    signal.signal(signal.SIGINT, lambda number, _frame: asked.append(number))
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if asked:
+        raise KeyboardInterrupt

@@ -39,7 +39,8 @@ from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..node.engine import Engine, make_engine
+from ..node.burst_engine import make_engine
+from ..node.engine import Engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
 from ..node.stepping import Runner, connect

@@ -15,14 +15,15 @@ from msgspec.structs import replace
 
 from ..config.loading import LoadedConfig
 from ..config.mesh import ZenohConfig
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, UnknownName
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
 from ..simtime import ENDLESS
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
-from ..text import counted, did_you_mean, listed
-from ..variables.model_description import ModelDescription
+from ..system.start_values import why_not_settable
+from ..text import counted, did_you_mean, listed, meant, nearest, shown
+from ..variables.model_description import ModelDescription, Variable
 from .limits import ring_problem
 
 __all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "numbered", "opening_in", "read_node", "read_run"]
@@ -155,6 +156,32 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 for item in plan.nodes[name].instances
             },
         )
+
+    def variable(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
+        """The instance and the variable ``instance.variable``; with ``elements``, it may be an element of the variable.
+
+        Raises:
+            UnknownName: there is none; suggests the nearest one.
+        """
+        if not isinstance(name, str):
+            raise UnknownName(f"{shown(name)} is no name of a variable.")
+        instances = self.plan.system.instances
+        instance, _, rest = name.partition(".")
+        if instance not in instances:
+            hint = did_you_mean(instance, instances, f"There are {listed(list(instances))}.")
+            raise UnknownName(f"there is no instance '{instance}', which '{name}' names.", hint=hint)
+        description = instances[instance].description
+        variable = description.variable_of(rest) if elements else description.variable(rest)
+        if variable is None or (rest != variable.name and rest not in variable.elements):
+            sources = self.plan.nodes[self.plan.node_of(instance)].instance(instance).sources
+            free = [one.name for one in description.variables if not why_not_settable(one, sources.get(one.name))]
+            names = [one.name for one in description.variables] if elements else free
+            if (clock := description.clock(rest)) is not None:
+                raise UnknownName(f"{clock}.", instance=instance)
+            near = nearest(rest, names)
+            hint = meant(near and f"{instance}.{near}", f"There are {listed(names)}.")
+            raise UnknownName(f"there is no variable '{rest}'.", instance=instance, hint=hint)
+        return instance, variable
 
     def after_resets(self, resets: int) -> RunPlan:
         """The plan of the run after so many resets: `rows.csv` is followed by `rows-2.csv`."""

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_mesh.instances.contract import Instance
-from fmu_mesh.node.engine import BurstEngine, Engine, Windows
+from fmu_mesh.node.burst_engine import BurstEngine
+from fmu_mesh.node.engine import Engine, Windows
 from fmu_mesh.node.stepping import Runner, sources_of
 from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.rings.ring import Ring

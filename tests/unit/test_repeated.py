@@ -656,7 +656,7 @@ def test_of_two_that_fail_in_one_step_the_first_is_named(tmp_path: Path, monkeyp
     mesh.add("third", python="ender.py:Ender")
     mesh.connect("third.y", "first.u")
     mesh.connect("second.y", "third.u")
-    monkeypatch.setattr("fmu_mesh.node.engine._SLICE_S", 1e-7)
+    monkeypatch.setattr("fmu_mesh.node.burst_engine.SLICE_S", 1e-7)
 
     with pytest.raises(fmu_mesh.StepFailed, match="it ends") as failure:
         mesh.run(processes=False)

@@ -109,6 +109,8 @@ class FmuInstance(ABC):
         fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding)
         left = cast("LoadedFmu | None", kept.take(name, fmu.key)) if kept is not None else None
         self._model = left or LoadedFmu(fmu, folder if kept is None else kept.folder)
+        if left is None and kept is not None:
+            kept.made(name, self._model)
         try:
             self._model.load()
             self._fmu = self._model.calls

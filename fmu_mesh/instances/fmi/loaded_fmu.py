@@ -65,17 +65,41 @@ class FmuToLoad(NamedTuple):
         return self.path, self.terms, own.guid, own.model_identifier, self.functions.library, self.deep_binding
 
 
-class LoadedFmu:
-    """One FMU with a library and a folder of its own, below ``folder``; `LoadFailed` if it cannot be extracted."""
+class _Files:
+    """An extracted FMU, and the models that use it."""
 
-    def __init__(self, fmu: FmuToLoad, folder: Path) -> None:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.used_by: list[LoadedFmu] = []
+
+
+class LoadedFmu:
+    """One FMU with a library and a folder of its own, below ``folder``; `LoadFailed` if it cannot be extracted.
+
+    With the files of another one it has the same library.
+    """
+
+    def __init__(self, fmu: FmuToLoad, folder: Path | _Files) -> None:
         self.key = fmu.key
         self.calls: Any = None  # FMPy's object, once it is loaded
         self.has_instance = False
         self.is_lost = False  # whether it has returned fatal
         self._fmu = fmu
-        self._folder = extract(fmu.path, folder, fmu.terms, model=fmu.description)
+        self._files = files = (
+            _Files(extract(fmu.path, folder, fmu.terms, model=fmu.description)) if isinstance(folder, Path) else folder
+        )
+        self._folder = files.folder
+        files.used_by.append(self)
         self._changes_process: bool | None = None
+
+    @property
+    def has_files(self) -> bool:
+        """See `SharedModel`."""
+        return bool(self._files.used_by)
+
+    def sharing(self) -> LoadedFmu:
+        """See `SharedModel`."""
+        return LoadedFmu(self._fmu, self._files)
 
     def load(self) -> None:
         """Load the library, if it is not loaded."""
@@ -143,7 +167,10 @@ class LoadedFmu:
             with suppress(FMICallException, OSError):
                 self.calls.freeLibrary()
         self.calls = None
-        self.remove_files()
+        if self in self._files.used_by:
+            self._files.used_by.remove(self)
+        if not self._files.used_by:
+            self.remove_files()
 
     def remove_files(self) -> None:
         """From any thread, when the process is about to be ended: remove the extracted files."""

@@ -9,17 +9,18 @@ from __future__ import annotations
 import ctypes
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Final, Literal
 
 from ...errors import NotFinite
 from ...rings import native
-from ...rings.native import MemberTable, Move, NativeStep, Span, Stage, StepKind
+from ...rings.native import CopyCall, MemberTable, Move, NativeStep, Span, Stage, StepKind
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
+from ..instance_wrapper import of_kind
 from .buffers import NumberBuffer
 from .calls import Function, Pointer, address_of, cffi_function, pointer
-from .fmu_instance import FmuInstance
-from .fmu_values import PartCall
+from .fmu_instance import FmuInstance, FmuState
+from .fmu_values import PartCall, Verb
 
 __all__ = ["NativeInstance"]
 
@@ -38,6 +39,8 @@ class NativeInstance(FmuInstance):
     _by_calls = False  # whether the steps have a part that the library does not know
 
     _derivatives: Mapping[str, float] = {}  # of the linear inputs, in 1/s, for the next step
+
+    _accesses: Sequence[object] = ()  # what the addresses of `access` point to
 
     _native: NativeStep | None = None
     _member: MemberTable | None = None  # the member that takes the steps of `do_step`
@@ -109,6 +112,33 @@ class NativeInstance(FmuInstance):
                 self._fail_to_set(step, status)
             case _:
                 self._fail_to_get(status)
+
+    def access(self, verb: Verb, names: Sequence[str]) -> CopyCall | None:
+        """See `AccessedNatively`."""
+        if not self._is_plain(verb):
+            return None
+        variables = [self._variables[name] for name in names]
+        type_, functions = variables[0].type, self._functions.values
+        if any(variable.type != type_ for variable in variables) or not functions.is_direct(type_, variables):
+            return None
+        count = len(variables)
+        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
+        function = address_of(cffi_function(self._function(verb, type_), functions.declaration))
+        size = sum(variable.size for variable in variables) if functions.sized else -1
+        self._accesses = [*self._accesses, references]
+        return CopyCall(function, self._component, ctypes.addressof(references), count, size)
+
+    def state_access(self, state: object) -> CopyCall | None:
+        """See `AccessedNatively`."""
+        if not self._is_plain("State"):
+            return None
+        name = self._functions.names.get("setFMUState", f"{self._symbols}SetFMUState")
+        function = address_of(cffi_function(getattr(self._fmu.dll, name), "int (*)(void *, void *)"))
+        return CopyCall(function, self._component, of_kind(FmuState, state).handle.value, -1, -1)
+
+    def _is_plain(self, verb: Verb | Literal["State"]) -> bool:
+        """Whether nothing but a function of the FMU gets or sets values, or sets a state."""
+        return not self._by_calls
 
     @abstractmethod
     def _complete(self, step: int, status: int | None) -> None:

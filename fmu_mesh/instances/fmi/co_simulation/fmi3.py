@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
@@ -106,6 +106,9 @@ class Fmi3Instance(NativeInstance, Fmi3):
         """Whether the variables of a part change in event mode only."""
         continuous = all(variable.variability == "continuous" for variable in part.variables)
         return self.description.has_event_mode and not continuous
+
+    def _is_plain(self, verb: Verb | Literal["State"]) -> bool:
+        return super()._is_plain(verb) and (verb == "Get" or not self.description.has_event_mode)
 
     def _complete(self, step: int, status: int | None) -> None:
         steps, start, size, end = self._steps, self._time_of(step), self._step_size, self._time_of(step + 1)

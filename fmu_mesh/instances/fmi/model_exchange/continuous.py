@@ -11,7 +11,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from fmpy.fmi1 import FMU1Model
@@ -28,6 +28,7 @@ from ..calls import cffi_function
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping
+from ..fmu_values import Verb
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
 from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
@@ -114,6 +115,9 @@ class ContinuousInstance(NativeInstance):
         if self._loop is not None:
             self._loop.close()
             self._loop = None
+
+    def _is_plain(self, verb: Verb | Literal["State"]) -> bool:
+        return verb == "Get"
 
     def _complete(self, step: int, status: int | None) -> None:
         loop, solver, end = self._event_loop(), self._solver_in_c, self._time_of(step + 1)

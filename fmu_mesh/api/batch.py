@@ -1,0 +1,430 @@
+"""`Batch`: many copies of a mesh as arrays, in this process; `BatchState`: where they can go back to.
+
+Owns names, values and the private folder. What a step does is `fmu_mesh.run.copies`.
+"""
+
+# Threads: the one that made a batch calls it, and so all FMUs (ADR 12). The object of a state may be freed on any
+# thread: then it is only noted in `_lost`. Where the last reference to a batch is dropped on another thread, only its
+# files are removed, because its FMUs may not be called there.
+
+from __future__ import annotations
+
+import operator
+import os
+import shutil
+import tempfile
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import CallRefused
+from ..run.copies import Copies
+from ..run.preparing import KnownModels, planned_reset
+from ..run.process import interrupts_later
+from ..run.run_plan import RunPlan
+from ..run.system_copy import Overrides, SavedCopy
+from ..text import option_text, shown
+from ..variables.model_description import Variable
+from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
+from ..variables.value_types import DTYPES, is_float, is_text
+from .open_system import SystemState, forwarded
+
+__all__ = ["Batch", "BatchState"]
+
+_LOOKED_AT: Final = 16
+"""After so many copies it is known how much memory one takes."""
+
+_MOST_OF_MEMORY: Final = 0.9
+
+Values = Mapping[str, ArrayLike]
+
+
+class Batch:
+    """Many copies of a mesh that your program steps as arrays, in this process; `Mesh.batch` makes it.
+
+    Copy ``i`` is element ``i`` of each array, and gives the floats of a `System` with its values. Copies are
+    independent: each has a point of its own, and one that fails does not end the others. All calls come from the thread
+    that made the batch; Ctrl-C ends `step` with all copies at one point.
+
+    A call that hangs in an FMU cannot be ended, and an FMU that crashes takes the program with it. Copies of an FMU
+    share its library, as the standard allows (FMI 2.0, 2.1.1).
+
+    Example:
+        >>> import fmu_mesh, numpy as np
+        >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+        >>> with mesh.batch(3) as batch:
+        ...     batch.reset(start_values={"pendulum.a": [0.1, 0.2, 0.3]})
+        ...     batch.step(500)
+        ...     batch.get("pendulum.a").shape, batch.get(["pendulum.a", "delay.y"]).shape
+        ((3,), (3, 2))
+
+    Args:
+        run: the plan of each copy.
+        copies: how many.
+
+    Raises:
+        NotInOneProcess: copies of an FMU need a process each.
+        CallRefused: there is not enough memory; or ``copies`` is no number above 0.
+        FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
+    """
+
+    def __init__(self, run: RunPlan, copies: int) -> None:
+        if isinstance(copies, bool) or not hasattr(copies, "__index__") or operator.index(copies) < 1:
+            raise CallRefused(f"{option_text('copies', copies)}: expected a whole number of 1 or more")
+        self._run = run
+        self._count = operator.index(copies)
+        self._thread = threading.get_ident()
+        self._known = KnownModels()
+        self._variables: dict[str, tuple[str, Variable]] = {}
+        self._settable: set[str] = set()
+        self._saved: weakref.WeakKeyDictionary[BatchState, list[SavedCopy]] = weakref.WeakKeyDictionary()
+        self._lost: deque[list[SavedCopy]] = deque()
+        folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+        self._copies = own = Copies(run, self._count, folder, forwarded)
+        self._release = weakref.finalize(self, _release, own, folder, self._thread)
+        self._before = _resident_bytes()
+        try:
+            own.start(self._look_at_memory)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __repr__(self) -> str:
+        state = f"{int(self.done.sum())} done" if self._release.alive else "closed"
+        return f"<Batch of {self._count} x {self._run.mesh}: {state}>"
+
+    @property
+    def copies(self) -> int:
+        """How many copies there are."""
+        return self._count
+
+    @property
+    def point(self) -> NDArray[np.int64]:
+        """The communication point that all instances of each copy have reached, shape (copies,)."""
+        return self._copies.points.copy()
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        """The simulation time of each copy in s, shape (copies,)."""
+        grid = self._run.plan.grid
+        return grid.start_time + self._copies.points.astype(np.float64) * grid.step_size
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """Which copies take no more steps, shape (copies,): an FMU failed or asked to end, or it is the stop time."""
+        return self._copies.ended
+
+    @property
+    def reasons(self) -> dict[int, str]:
+        """Why copies are done that have not reached the stop time, by their numbers."""
+        return {number: str(error) for number, error in sorted(self._copies.errors.items())}
+
+    def step(self, points: int = 1) -> None:
+        """Step all copies that are not done over ``points``, 1 or more; those near the stop time to that.
+
+        A copy whose FMU fails, or asks to end, stays at the last point that all its instances have reached; it is
+        `done`, and the others go on.
+
+        Raises:
+            CallRefused: see `close`.
+        """
+        self._demand("step")
+        if not hasattr(points, "__index__") or operator.index(points) < 1:
+            raise CallRefused(f"{option_text('points', points)}: expected a whole number of 1 or more")
+        with interrupts_later() as is_asked:
+            self._copies.step(operator.index(points), is_asked)
+
+    def get(self, name: str | Sequence[str], out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """The current values of a variable, or of several ones of one type.
+
+        Example:
+            >>> import fmu_mesh
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2) as batch:
+            ...     batch.get("pendulum.a").tolist()
+            [1.3, 1.3]
+
+        Args:
+            name: `instance.variable`; or several such names, of variables that are no arrays.
+            out: an array for the result, of its shape and dtype, whose last dimensions are contiguous.
+
+        Returns:
+            Shape (copies, dimensions of the variable), or (copies, names), in the unit of the variable. A copy whose
+            FMU has failed keeps the outputs of its last point; what cannot be read is NaN, 0 or None.
+
+        Raises:
+            UnknownName: there is no such variable; suggests the nearest one.
+            CallRefused: the variables have several types; or see `close`.
+        """
+        self._demand("get")
+        names = [name] if isinstance(name, str) else list(name)
+        found = [self._variable(one) for one in names]
+        if len({variable.type for _, variable in found}) != 1:
+            raise CallRefused(f"get needs variables of one type, and got {shown(names)}.", hint="Ask for each type.")
+        first = found[0][1]
+        if not isinstance(name, str) and any(variable.shape for _, variable in found):
+            raise CallRefused(f"{shown(names)} has an array", hint="Ask for each array by its name alone.")
+        shape = (self._count, *first.shape) if isinstance(name, str) else (self._count, len(names))
+        dtype = np.dtype(DTYPES[first.type])
+        if out is None:
+            out = np.full(shape, np.nan if is_float(first.type) else None if is_text(first.type) else 0, dtype)
+        elif out.shape != shape or out.dtype != dtype:
+            raise CallRefused(f"`out` has shape {out.shape} and dtype {out.dtype}; expected {shape} and {dtype}")
+        rows = out.reshape(self._count, -1)
+        if not np.shares_memory(rows, out) or rows.strides[1] != dtype.itemsize:
+            raise CallRefused("the last dimensions of `out` are not contiguous")
+        start = 0
+        while start < len(names):  # neighbours of one instance are read with one call
+            end = start + 1
+            while end < len(names) and found[end][0] == found[start][0]:
+                end += 1
+            width = sum(variable.size for _, variable in found[start:end])
+            columns = rows[:, start : start + width]
+            self._copies.get(found[start][0], [variable.name for _, variable in found[start:end]], columns)
+            start = end
+        return out
+
+    def set(self, name: str | Values, values: ArrayLike | None = None) -> None:
+        """Set an unconnected input or a tunable parameter of all copies that are not done, or several of them.
+
+        A value holds from the next step on, as with `System.set`.
+
+        Example:
+            >>> mesh = fmu_mesh.Mesh("m", step_size=0.1, stop_time=1.0)
+            >>> mesh.add("gain", fmu="fmus/Gain.fmu")
+            >>> with mesh.batch(2) as batch:
+            ...     batch.set("gain.u", [3.0, 4.0])
+            ...     batch.step()
+            ...     batch.get("gain.y").tolist()
+            [3.0, 4.0]
+
+        Args:
+            name: `instance.variable`, or values by such names; none is set if one of them is refused.
+            values: shape (copies, dimensions of the variable), or one value for all, in the unit of the variable.
+
+        Raises:
+            UnknownName: there is no such variable; suggests the nearest one.
+            CallRefused: a variable cannot be set, or not to these values; or see `close`.
+        """
+        self._demand("set")
+        given: Values = {name: values} if isinstance(name, str) else name  # type: ignore[dict-item]  # None is refused
+        ready = [(one, *self._ready(one, own)) for one, own in given.items()]
+        for one, variable, rows in ready:
+            instance = self._variables[one][0]
+            self._copies.set(instance, variable.name, rows, np.ones(self._count, np.bool_))
+
+    def reset(self, mask: ArrayLike | None = None, start_values: Values | None = None) -> None:
+        """Bring copies back to point 0: they are as new ones, whether they were done or not.
+
+        Where all FMUs can get and set their state, the second reset of a copy takes about as long as that (FMI 2.0,
+        2.1.8); the first one, and any other, makes new instances of the loaded models.
+
+        Example:
+            >>> import fmu_mesh, numpy as np
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2) as batch:
+            ...     batch.step(100)
+            ...     batch.reset(np.array([True, False]), {"pendulum.a": [0.5, 0.0]})
+            ...     batch.point.tolist(), float(batch.get("pendulum.a")[0])
+            ([0, 100], 0.5)
+
+        Args:
+            mask: which copies, truths of shape (copies,); None: all.
+            start_values: by `instance.variable`: shape (copies, dimensions of the variable), or one value for all;
+                those of other copies are ignored. They stay for later resets of the same copies.
+
+        Raises:
+            ConfigurationError: a start value is wrong; carries all findings.
+            CallRefused: see `close`.
+            FmuError: an FMU cannot be initialized; its copy, and those after it, are as they were, or done.
+        """
+        self._demand("reset")
+        wanted = self._wanted("mask", mask)
+        overrides = self._overrides(wanted, start_values) if start_values else None
+        self._copies.reset(wanted, overrides)
+
+    def save(self) -> BatchState:
+        """Save the state of all copies: every instance, and the values between them (FMI 2.0, 2.1.8).
+
+        Returns:
+            The state. It is freed with the object, with its `close`, or with the batch.
+
+        Raises:
+            CallRefused: an FMU cannot get and set its state, or inputs follow a scenario; or see `close`.
+            FmuError: an FMU failed.
+        """
+        self._demand("save")
+        self._free_lost()
+        if (why := self._copies.why_not_saved) is not None:
+            raise CallRefused(f"the state cannot be saved: {why}.", hint="Use `reset` to go back to the first point.")
+        saved = self._copies.save()
+        state = BatchState(0, partial(self._lost.append, saved))
+        self._saved[state] = saved
+        return state
+
+    def restore(self, state: BatchState, copies: ArrayLike | None = None) -> None:
+        """Bring copies back, or ahead, to what `save` has saved of them; as often as you like.
+
+        Args:
+            state: of this batch.
+            copies: which copies, truths of shape (copies,); None: all.
+
+        Raises:
+            CallRefused: it is no state of this batch, or is closed; or see `close`.
+            FmuError: an FMU failed.
+        """
+        self._demand("restore")
+        saved = None if getattr(state, "closed", True) else self._saved.get(state)
+        if saved is None:
+            raise CallRefused("restore needs a state that this batch has saved, and that is not closed.")
+        self._free_lost()
+        self._copies.restore(saved, self._wanted("copies", copies))
+
+    def close(self) -> None:
+        """Free all FMUs and states, and remove the files. May be called twice.
+
+        Raises:
+            CallRefused: this is not the thread that made the batch. Every other method raises this, too, and also where
+                the batch is closed.
+        """
+        if self._release.alive:
+            self._demand("close")
+            self._release()
+
+    def _demand(self, call: str) -> None:
+        if threading.get_ident() != self._thread:
+            text = f"{call} is not possible here, because a batch belongs to the thread that made it."
+            raise CallRefused(text, hint="Make a batch on each thread that steps one.")
+        if not self._release.alive:
+            raise CallRefused(f"{call} is not possible, because the batch is closed.")
+
+    def _variable(self, name: str) -> tuple[str, Variable]:
+        found = self._variables.get(name)
+        if found is None:
+            found = self._variables[name] = self._run.variable(name)
+        return found
+
+    def _ready(self, name: str, values: ArrayLike) -> tuple[Variable, NDArray[Any]]:
+        """The variable, and its values as rows, if it may be set to them."""
+        instance, variable = self._variable(name)
+        item = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance)
+        try:
+            if name not in self._settable:
+                item.check_settable(variable)
+                self._settable.add(name)
+            rows = self._rows(values, variable, finite=item.not_finite == "stop")
+        except ValueRefused as refused:
+            raise CallRefused(f"it {refused}.", instance=instance, variable=variable.name) from refused
+        return variable, rows
+
+    def _rows(self, values: ArrayLike, variable: Variable, *, finite: bool) -> NDArray[Any]:
+        """Values as an array of shape (copies, elements)."""
+        shape, dtype = (self._count, *variable.shape), np.dtype(DTYPES[variable.type])
+        given = np.asarray(values)
+        if given.shape != shape and given.shape not in {(), variable.shape}:
+            expected = f"{shape}, or {variable.shape} for all copies"
+            raise ValueRefused(f"cannot be set to values of shape {given.shape}; expected {expected}")
+        if given.dtype.kind in "iuf" and dtype.kind == "f":
+            rows = np.broadcast_to(np.asarray(given, dtype), shape)
+            if finite and not np.isfinite(rows).all():
+                raise ValueRefused("cannot be set to values that are not finite")
+            low, high = variable.minimum, variable.maximum
+            if (low is not None and (rows < low).any()) or (high is not None and (rows > high).any()):
+                raise ValueRefused(f"cannot be set to a value out of its range: expected {range_of(variable)}")
+        else:
+            each = np.empty(shape, dtype)
+            for number, own in enumerate(np.broadcast_to(given, shape)):
+                plain = own.tolist() if isinstance(own, np.ndarray | np.generic) else own
+                each[number] = checked_value(plain, variable, f"cannot be set: {shown(plain)}", finite=finite)
+            rows = each
+        return np.ascontiguousarray(rows).reshape(self._count, -1)
+
+    def _wanted(self, option: str, mask: ArrayLike | None) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self._count, np.bool_)
+        wanted = np.asarray(mask)
+        if wanted.dtype != np.bool_ or wanted.shape != (self._count,):
+            raise CallRefused(
+                f"`{option}` has shape {wanted.shape} and dtype {wanted.dtype}; expected truths of shape "
+                f"({self._count},)"
+            )
+        return wanted
+
+    def _overrides(self, wanted: NDArray[np.bool_], start_values: Values) -> Callable[[int], Overrides]:
+        """The start values of a copy, by its number."""
+        rows: dict[str, NDArray[Any]] = {}
+        for name, values in start_values.items():
+            _, variable = self._variable(name)
+            try:
+                rows[name] = self._rows(values, variable, finite=False)
+            except ValueRefused as refused:
+                raise CallRefused(f"'{name}' {refused}.") from refused
+
+        def of_copy(number: int) -> dict[str, dict[str, Any]]:
+            found: dict[str, dict[str, Any]] = {}
+            for name, own in rows.items():
+                instance, variable = self._variables[name]
+                row = own[number].reshape(variable.shape).tolist()
+                found.setdefault(instance, {})[variable.name] = to_plain(row)
+            return found
+
+        for number in np.flatnonzero(wanted)[:1].tolist():  # the names and roles are the same in all copies
+            plain = {f"{name}.{one}": value for name, own in of_copy(number).items() for one, value in own.items()}
+            planned_reset(self._run, plain, 0, self._known)
+        return of_copy
+
+    def _look_at_memory(self, ready: int) -> None:
+        """Once some copies are there: whether all of them fit into memory."""
+        if ready != _LOOKED_AT or self._count <= ready:
+            return
+        each = max(0, _resident_bytes() - self._before) // ready
+        needed, free = each * (self._count - ready), os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        if needed > _MOST_OF_MEMORY * free:
+            text = f"{self._count} copies take about {each * self._count / 2**30:.1f} GiB of memory, {each / 1024:.0f} "
+            raise CallRefused(f"{text}KiB each; {free / 2**30:.1f} GiB are free", hint="Make fewer copies.")
+
+    def _free_lost(self) -> None:
+        """Free the states whose objects are gone, which may have happened on any thread."""
+        while self._lost:
+            self._copies.free(self._lost.popleft())
+
+
+class BatchState(SystemState):
+    """The state of all copies of a `Batch`, for `Batch.restore`; it belongs to this batch.
+
+    Example:
+        >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2) as batch:
+        ...     batch.step(10)
+        ...     with batch.save() as state:
+        ...         batch.step(10)
+        ...         batch.restore(state)
+        ...         batch.point.tolist()
+        [10, 10]
+    """
+
+
+def _resident_bytes() -> int:
+    """The memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def _release(copies: Copies, folder: Path, thread: int) -> None:
+    """Free everything. On another thread only the files: an FMU is only called on its own."""
+    if threading.get_ident() == thread:
+        copies.close()
+    shutil.rmtree(folder, ignore_errors=True)

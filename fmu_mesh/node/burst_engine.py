@@ -1,0 +1,225 @@
+"""Steps the runners of a node with the burst in C, which also waits (`fmu_mesh/rings/burst.c`)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from itertools import chain
+from time import perf_counter
+from typing import cast
+
+from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
+from ..instances.contract import StepsNatively
+from ..instances.process_state import floating_point_changed, restore_floating_point
+from ..rings import native
+from ..rings.host_memory import HostMemory
+from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
+from ..rings.row_streams import RowStreams
+from ..system.plan import NodePlan
+from .engine import SLICE_S, STATE_CHECK_S, Engine, PlainEngine, Windows
+from .inputs import TimedInputs
+from .stepping import Runner
+
+__all__ = ["BurstEngine", "make_engine"]
+
+
+def make_engine(  # noqa: PLR0913  one node and how it is connected
+    plan: NodePlan,
+    units: Sequence[Sequence[Runner]],
+    memory: HostMemory,
+    windows: Windows = (),
+    *,
+    spins: bool,
+    streams: RowStreams | None = None,
+) -> Engine:
+    """The engine for this machine."""
+    if native.library is None:
+        return PlainEngine(plan, units, memory, windows)
+    return BurstEngine(plan, units, memory, windows, spins=spins, streams=streams)
+
+
+class BurstEngine(Engine):
+    """Steps with the burst in C."""
+
+    def __init__(  # noqa: PLR0913  one node and how it is connected
+        self,
+        plan: NodePlan,
+        units: Sequence[Sequence[Runner]],
+        memory: HostMemory,
+        windows: Windows = (),
+        *,
+        spins: bool,
+        streams: RowStreams | None = None,
+    ) -> None:
+        super().__init__(plan, units, memory, windows)
+        self._streams = streams
+        assert native.library is not None
+        self._library = native.library
+        self._kept: dict[str, list[object]] = {}
+        self._tracks: dict[str, list[object]] = {}
+        self._peers = table(native.Peer, [native.Peer(counter.address, window) for _, counter, window in self._windows])
+        self._node = native.NodeTable(
+            place=memory.place,
+            streams=streams.address if streams is not None else None,
+            units=self._units,
+            n_units=len(units),
+            peers=self._peers,
+            n_peers=len(self._windows),
+            ceiling=memory.grant.address,
+            finish=memory.finish.address if streams is not None else None,
+            progress=self._progress.address,
+            last_point=self._last_point,
+            slice_ns=int(SLICE_S * 1e9),
+            spins=spins,
+            batch=plan.batch,
+            stride=1,
+        )
+        self._address = ctypes.addressof(self._node)
+        for runner in self.runners:
+            runner.refit()
+
+    def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
+        node, library = self._node, self._library
+        most_s = STATE_CHECK_S if quiet else SLICE_S
+        node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
+        started, before, waited_ns = perf_counter(), self._ticks, node.waited_ns
+        while True:
+            result = library.run(self._address)
+            if result < BurstEnd.PYTHON:
+                break
+            self.complete(result)
+            if perf_counter() - started > most_s:
+                library.attend(self._address)  # so it returns after this tick
+        library.attended(self._address)
+        self.is_blocked = result in {BurstEnd.BLOCKED, BurstEnd.DONE}
+        self.note_wait((node.waited_ns - waited_ns) / 1e9)
+        return self._ticks != before
+
+    def complete(self, result: int) -> None:
+        """Let Python take or complete the step with which a burst has ended, or raise what it has ended with."""
+        unit, runner = self._node.unit, self.units[self._node.unit][self._node.member]
+        if result == BurstEnd.FORGED:
+            raise self._forged(runner)
+        began = perf_counter()
+        self._complete(unit, runner, result)
+        self._units[unit].spent_ns += int((perf_counter() - began) * 1e9)
+
+    def as_copy(self) -> native.CopyTable:
+        """For a system in this process that waits for nobody: all of it is granted."""
+        self._node.allowed = self._last_point
+        return native.CopyTable(node=self._address)
+
+    def send(self) -> None:
+        """See `Engine`."""
+        super().send()
+        if self._streams is not None:
+            self._streams.beat()
+
+    def ring_bell(self) -> None:
+        """See `Engine`."""
+        self._library.attend(self._address)
+
+    @property
+    def awaited(self) -> str | None:
+        """See `Engine`."""
+        names = {source.counter.address: source.instance for runner in self.runners for source in runner.sources}
+        names |= {counter.address: name for name, counter, _ in self._windows}
+        unfinished = (unit for unit in self._units if unit.tick < unit.last_tick and not unit.stopped)
+        return next((names.get(unit.blocked_by) for unit in unfinished if unit.blocked_by is not None), None)
+
+    @property
+    def late(self) -> int:
+        """How often a sleep ended by its time limit although the value was there: 0 where no wake-up is lost."""
+        return int(self._node.late)
+
+    @property
+    def _ticks(self) -> int:
+        return sum(runner.step for runner in self.runners)
+
+    def refit(self, runner: Runner) -> None:
+        """Fill the table of a runner: at the start, and again whenever it steps in another way."""
+        before, unit = runner.table, next(unit for unit in self.units if runner in unit)
+        own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
+        if own is not None and any(source.transfer.has_text for source in runner.sources):
+            own = None
+        moves = [source.transfer.moves(RowBase.FIRST_GATE + number) for number, source in enumerate(runner.sources)]
+        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(runner.sources)))()
+        grid, points = runner.grid, runner.plan.step_points
+        watched = runner.watched if runner.watched is not None else runner.outputs
+        rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
+        names = ("kind", "component", "do_step", "said") if own is not None else ()  # without them, BY_PYTHON is 0
+        calls = {name: getattr(own, name) for name in names}
+        made = native.MemberTable(
+            **calls,
+            start_time=grid.start_time,
+            base_step_size=grid.step_size,
+            step_size=points * grid.step_size,
+            points=points,
+            every=points // self.tick_points(unit),
+            last_step=runner.last_step,
+            python_at=NEVER,
+            outputs=(native.OutputTable * 2)(*rings),
+            counter=runner.counter.address,
+            bases=ctypes.cast(bases, ctypes.POINTER(ctypes.c_void_p)),
+            step=before.step,
+            stage=before.stage,
+            outcome=before.outcome,
+        )
+        loads = list(chain(*moves))
+        if own is not None:
+            made.give(setters=own.setters, getters=own.getters, stores=own.stores)
+            loads += own.loads
+        made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
+        self._kept[runner.name] = [made, bases, own]  # what the table points to
+        ctypes.pointer(before)[0] = made
+        self.follow_inputs(runner)
+
+    def follow_inputs(self, runner: Runner) -> None:
+        """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""
+        timed, member = runner.instance, runner.table
+        if isinstance(timed, TimedInputs):
+            if timed.tracks or member.n_tracks:
+                self._tracks[runner.name] = [timed.tracks]  # what the table points to
+                member.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
+            member.python_at, member.tracks_from = timed.python_at, timed.tracks_from
+
+    def _complete(self, unit: int, runner: Runner, result: int) -> None:
+        """Let Python take a step, or complete one that returned something unusual."""
+        member = runner.table
+        step = member.step
+        try:
+            if result == BurstEnd.NOT_FINITE:
+                raise runner.is_finite.error(step + 1, runner.grid)
+            if result == BurstEnd.PYTHON:
+                for source in runner.sources:
+                    source.transfer.step_text(step)
+                runner.instance.do_step(step)
+                self.follow_inputs(runner)
+            else:
+                if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
+                    for source in runner.sources:
+                        source.transfer.check_range(step)
+                if member.kind == StepKind.BY_PYTHON:
+                    raise self._forged(runner)  # it was out of range when the burst has read it
+                cast("StepsNatively", runner.instance).finish(step, member.outcome)
+        except FmuMeshError as error:
+            self._units[unit].stopped = 1
+            runner.is_finite.explain(error)
+            if isinstance(error, TerminationRequested):
+                member.stage = Stage.WAITING
+            raise
+        if floating_point_changed():
+            restore_floating_point()
+        member.stage = Stage.STEPPED
+
+    def _forged(self, runner: Runner) -> ProtocolBroken:
+        step, sources = runner.step, runner.sources
+        lost = [own for own in sources if not own.transfer.source.has_row(own.transfer.rule.row_for(step))]
+        source = (lost or sources)[0]
+        return ProtocolBroken(
+            f"a row of '{source.instance}' for '{runner.name}' is not the one that was written",
+            instance=runner.name,
+            point=runner.point,
+            time=runner.grid.time(runner.point),
+            hint="Does another process write to the memory of this run?",
+        )

@@ -1,0 +1,401 @@
+"""Many copies of one system in this process, stepped together: `Mesh.batch`.
+
+Each copy has its own instances, rings and tables, and takes its steps as the burst does; one call of the library steps
+all of them. Owns how far each copy is, how each has ended, and where their values are. Knows no names that a user has
+mistyped: `fmu_mesh.api.batch` checks them.
+"""
+
+# Threads: the one that made the copies calls all FMUs (ADR 12). The library releases the lock of the interpreter while
+# it steps, so other threads of the program go on; they may look at nothing here.
+#
+# A step of an FMU that does not return cannot be ended: the process is the user's. Ctrl-C ends a call between two
+# pieces of it, so all copies are at one point then.
+
+from __future__ import annotations
+
+import ctypes
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from ..errors import FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
+from ..instances.contract import Instance, LogMessage
+from ..instances.kept_models import SharedModels
+from ..instances.process_state import ProcessState
+from ..instances.registry import open_instance
+from ..node.burst_engine import BurstEngine
+from ..node.engine import STATE_CHECK_S
+from ..node.inputs import TimedInputs, set_input
+from ..rings import native
+from ..rings.native import BurstEnd
+from ..system.memory_map import MemoryMap, RingPlace, map_memory
+from ..system.plan import Plan, make_plan
+from ..system.process_sharing import SharedProcess
+from ..text import listed
+from ..variables.value_types import DTYPES, is_text
+from .local_system import opening_of
+from .one_process import claims_in
+from .run_plan import RunPlan
+from .system_copy import IN_ONE_NODE, Overrides, SavedCopy, SystemCopy, Verb
+from .threads import one_thread_meanwhile
+
+__all__ = ["Copies"]
+
+_PIECE_S: Final = 0.05
+"""About how long in s a piece of a call takes: then somebody may interrupt it."""
+
+_MANY_POINTS: Final = 4096
+
+Truths = NDArray[np.bool_]
+
+
+class Copies:
+    """Copies of one plan, all at a point of their own.
+
+    Call sequence: `start`; then `step`, `set`, `get`, `reset`, `save` and `restore`; at the end `close`.
+
+    Args:
+        run: the plan; its nodes and its window are not used.
+        count: how many copies.
+        folder: an existing private folder; FMUs are extracted below it.
+        log: called with every log message of a model.
+
+    Attributes:
+        points: the last point that all instances of a copy have reached, shape (count,).
+        errors: how copies have ended before the stop time, by their numbers.
+    """
+
+    def __init__(self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None]) -> None:
+        self.errors: dict[int, FmuMeshError] = {}
+        self._run = run
+        self._plan = plan = _in_one_node(run.plan)
+        self._node = plan.nodes[IN_ONE_NODE]
+        self._last = plan.grid.last_point
+        self._places = _rings_of(plan)
+        self._folder, self._log = folder, log
+        self._models = SharedModels(folder)
+        self._copies: list[SystemCopy] = []
+        self._table = (native.CopyTable * count)()
+        numbers: NDArray[np.int64] = np.frombuffer(memoryview(self._table), np.int64).reshape(count, -1)
+        self.points, self._goals, self._ends = numbers[:, 1], numbers[:, 2], numbers[:, 3]
+        self._ended = np.zeros(count, np.bool_)
+        self._set_at = {name: np.full(count, -1) for name in plan.order}
+        self._is_set: set[str] = set()
+        self._accesses: dict[tuple[str, Verb, tuple[str, ...]], Any] = {}
+        self._columns: dict[tuple[str, str], Any] = {}
+        self._first: dict[int, SavedCopy] = {}
+        self._threads = ExitStack()
+        self._looked_after: ProcessState | None = None
+        self._look_at = 0.0
+        self._piece = 1
+
+    def start(self, ready: Callable[[int], None] = lambda _count: None) -> None:
+        """Open and initialize all copies: then they are at point 0.
+
+        Args:
+            ready: called after each one with how many there are.
+
+        Raises:
+            NotInOneProcess: copies of an instance cannot share a process.
+            FmuError: an instance cannot be opened or initialized.
+        """
+        self._check_sharing()
+        self._threads.enter_context(one_thread_meanwhile())
+        for number in range(len(self._table)):
+            self._copies.append(SystemCopy(self._node, self._places, self._opened))
+            self._begin(number)
+            ready(number + 1)
+        self._threads.enter_context(one_thread_meanwhile())  # with the libraries that components have imported
+
+    @property
+    def ended(self) -> Truths:
+        """Which copies take no more steps, shape (count,)."""
+        ended: Truths = self._ended | (self.points >= self._last)
+        return ended
+
+    def step(self, points: int, is_asked: Callable[[], bool] = lambda: False) -> None:
+        """Step all copies that have not ended, those near the stop time to that; until somebody asks to end the call.
+
+        What an FMU raises is in `errors`, and ends its copy at the last point that all its instances have reached.
+        """
+        self._looked_after = self._looked_after or ProcessState()
+        try:
+            while points > 0 and not is_asked():
+                piece = min(points, self._piece)
+                began = time.perf_counter()
+                self._step(piece)
+                points -= piece
+                took_s = time.perf_counter() - began
+                if took_s < _PIECE_S / 2 and piece == self._piece:
+                    self._piece = min(2 * piece, _MANY_POINTS)
+                elif took_s > _PIECE_S:
+                    self._piece = max(1, self._piece // 2)
+        finally:
+            if (now := time.perf_counter()) >= self._look_at:
+                self._look_at = now + STATE_CHECK_S
+                if self._looked_after.restore():
+                    for copy in self._copies:
+                        copy.take_care()
+
+    def _step(self, points: int) -> None:
+        np.minimum(self.points + points, self._last, out=self._goals)
+        if self.errors:
+            np.copyto(self._goals, self.points, where=self._ended)
+        if native.library is None:
+            for number, copy in enumerate(self._copies):
+                self._end_of(number, partial(copy.step_to, int(self._goals[number])))
+                self.points[number] = copy.point
+            return
+        while native.library.copies_step(ctypes.addressof(self._table), len(self._table)):
+            for number in np.flatnonzero(self._ends != BurstEnd.DONE).tolist():
+                copy, end = self._copies[number], int(self._ends[number])
+                self._end_of(number, partial(copy.complete, end))
+
+    def _end_of(self, number: int, call: Callable[[], object]) -> None:
+        """Make a call for a copy; what it raises ends the copy."""
+        try:
+            call()
+        except (FmuError, TerminationRequested) as error:
+            point = int(self.points[number])
+            if error.point is None:
+                begun = self._copies[number].begun_at(error) if isinstance(error, FmuError) else point
+                error.at(begun, self._plan.grid.time(begun))
+            self.errors[number] = error
+            self._ended[number] = True
+            self._goals[number] = point
+
+    # --- values
+
+    def dtype(self, instance: str, name: str) -> np.dtype[Any]:
+        """That of the values of a variable."""
+        variable = self._copies[0].runners[instance].instance.description.variable(name)
+        assert variable is not None
+        return np.dtype(DTYPES[variable.type])
+
+    def set(self, instance: str, name: str, values: NDArray[Any], wanted: Truths) -> None:
+        """Set a variable of the ``wanted`` copies to ``values``, of shape (count, elements) and its dtype.
+
+        What an FMU raises is in `errors`, and ends its copy.
+        """
+        wanted = wanted & ~self._ended
+        points = self._copies[0].runners[instance].plan.step_points
+        np.copyto(self._set_at[instance], self.points // points, where=wanted)
+        self._is_set.add(instance)
+
+        def by_python(number: int) -> None:
+            runner = self._copies[number].runners[instance]
+            shape = runner.instance.description.variable(name).shape  # type: ignore[union-attr]  # it is there
+            row = values[number].reshape(shape).tolist() if shape else values[number, 0]
+            value = row.item() if isinstance(row, np.generic) else row
+            self._end_of(number, partial(set_input, runner, name, value, None))
+
+        timed = self._copies[0].runners[instance].instance
+        access = None
+        if not isinstance(timed, TimedInputs) or not timed.follows(name):
+            access = self._access(instance, "Set", (name,))
+        self._call(access, values, wanted, by_python)
+
+    def get(self, instance: str, names: Sequence[str], out: NDArray[Any]) -> None:
+        """Read variables of one type into ``out``, of shape (count, elements) and their dtype.
+
+        Where a failed copy has no value any more, it stays as it is.
+        """
+        members = self._copies[0].runners[instance].plan
+        wanted = np.ones(len(self._copies), np.bool_)
+        if self.errors:
+            wanted[[number for number, error in self.errors.items() if isinstance(error, FmuError)]] = False
+        in_rows = all(name in members.outputs.names for name in names) and native.library is not None
+        if in_rows and not is_text(members.outputs.column(names[0]).type):
+            first = 0
+            for name in names:
+                place = members.outputs.place(name)
+                size = place.size * out.itemsize
+                self._read(instance, name, size, out[:, first:])
+                first += place.size
+            if instance not in self._is_set:
+                return
+            wanted &= self._set_at[instance] == self.points // members.step_points
+            if not wanted.any():
+                return
+
+        def by_python(number: int) -> None:
+            copy = self._copies[number]
+            values = copy.values(instance, names, int(self.points[number]), since=self._set_at[instance][number])
+            out[number] = np.concatenate([np.ravel(np.array(value, out.dtype)) for value in values])
+
+        self._call(
+            self._access(instance, "Get", tuple(names)), out, wanted, lambda n: self._end_of(n, partial(by_python, n))
+        )
+
+    def _call(self, accesses: Any, values: NDArray[Any], wanted: Truths, otherwise: Callable[[int], None]) -> None:  # noqa: ANN401  an array of ctypes
+        """Get or set through the library; copies for which it cannot, or fails, one by one."""
+        count, number = len(self._copies), 0
+        if accesses is None or native.library is None:
+            for number in np.flatnonzero(wanted).tolist():
+                otherwise(number)
+            return
+        every = np.ascontiguousarray(wanted).view(np.uint8)
+        stride, size = values.strides[0], ctypes.sizeof(native.CopyCall)
+        while True:
+            left = count - number
+            number += native.library.copies_call(
+                ctypes.addressof(accesses) + number * size,
+                left,
+                every[number:].ctypes.data,
+                values.ctypes.data + number * stride,
+                stride,
+            )
+            if number >= count:
+                return
+            otherwise(number)
+            number += 1
+
+    def _access(self, instance: str, verb: Verb, names: tuple[str, ...]) -> Any:  # noqa: ANN401  an array of ctypes
+        """How the library gets or sets variables of all copies; None if it cannot."""
+        key = instance, verb, names
+        if key not in self._accesses:
+            found = [copy.access(*key) for copy in self._copies]
+            self._accesses[key] = native.table(native.CopyCall, found) if all(found) else None
+        return self._accesses[key]
+
+    def _read(self, instance: str, name: str, size: int, out: NDArray[Any]) -> None:
+        key = instance, name
+        if key not in self._columns:
+            columns = [copy.column(*key) for copy in self._copies]
+            self._columns[key] = native.table(native.CopyOutput, columns)
+        assert native.library is not None
+        table, columns = ctypes.addressof(self._table), self._columns[key]
+        native.library.copies_read(table, columns, len(self._copies), size, out.ctypes.data, out.strides[0])
+
+    # --- states
+
+    @property
+    def why_not_saved(self) -> str | None:
+        """Why `save` is not possible, in words; None if it is."""
+        runners = self._copies[0].runners
+        without = [name for name, own in runners.items() if not own.instance.description.can_get_and_set_state]
+        if without:
+            return f"the model description of {listed(without)} says that it cannot (canGetAndSetFMUstate)"
+        timed = [name for name, own in runners.items() if isinstance(own.instance, TimedInputs)]
+        return f"inputs of {listed(timed)} follow a scenario, or have a timeout" if timed else None
+
+    def save(self) -> list[SavedCopy]:
+        """Save all copies; `free` frees them.
+
+        Raises:
+            FmuError: an FMU cannot, or has failed.
+        """
+        saved: list[SavedCopy] = []
+        try:
+            for number, copy in enumerate(self._copies):
+                saved.append(copy.save(int(self.points[number])))
+        except BaseException:
+            self.free(saved)
+            raise
+        return saved
+
+    def restore(self, saved: Sequence[SavedCopy], wanted: Truths) -> None:
+        """Bring the ``wanted`` copies back to what was saved of them."""
+        numbers = np.flatnonzero(wanted).tolist()
+        for number in numbers:
+            self._end_of(number, partial(self._copies[number].restore, saved[number]))
+            self._back_at(number, saved[number].point)
+
+    def free(self, saved: Sequence[SavedCopy]) -> None:
+        """Free saved copies, in the order of the copies."""
+        for copy, own in zip(self._copies, saved, strict=False):
+            copy.free(own)
+
+    def reset(self, wanted: Truths, overrides: Callable[[int], Overrides] | None = None) -> None:
+        """Bring the ``wanted`` copies back to point 0: they are as new ones.
+
+        Args:
+            wanted: which, shape (count,).
+            overrides: other start values of a copy, by instance and variable; None: those that it was reset with.
+
+        Raises:
+            FmuError: one cannot be initialized; it has ended then, and so have those after it that were not reset.
+        """
+        for number in np.flatnonzero(wanted).tolist():
+            copy = self._copies[number]
+            first = self._first.get(number)
+            if overrides is None and first is not None and number not in self.errors:
+                copy.restore(first)
+                self._back_at(number, 0)
+                continue
+            if first is not None:
+                copy.free(self._first.pop(number))
+            self._ended[number] = True
+            copy.close()
+            self._begin(number, overrides(number) if overrides is not None else None)
+            if self.why_not_saved is None:
+                self._first[number] = copy.save(0)
+
+    def _begin(self, number: int, overrides: Overrides | None = None) -> None:
+        copy = self._copies[number]
+        copy.begin(overrides)
+        if isinstance(copy.engine, BurstEngine):
+            self._table[number] = copy.engine.as_copy()
+        for key, accesses in self._accesses.items():
+            if accesses is not None and (access := copy.access(*key)) is not None:
+                accesses[number] = access
+        for own, columns in self._columns.items():
+            columns[number] = copy.column(*own)
+        self._back_at(number, 0)
+
+    def _back_at(self, number: int, point: int) -> None:
+        self.errors.pop(number, None)
+        self._ended[number] = False
+        self.points[number] = self._goals[number] = point
+        for steps in self._set_at.values():
+            steps[number] = -1
+
+    def close(self) -> None:
+        """Close all instances and free all models. Never raises; may be called twice."""
+        for number, own in self._first.items():
+            self._copies[number].free(own)
+        self._first.clear()
+        for copy in self._copies:
+            copy.close()
+        self._models.close()
+        self._threads.close()
+
+    def _check_sharing(self) -> None:
+        process, claims_of = SharedProcess(), claims_in(self._plan)
+        for copy in ("", " of another copy")[: len(self._table)]:
+            for name in self._plan.order:
+                if (why := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:
+                    raise NotInOneProcess(
+                        why, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
+                    )
+
+    def _opened(self, name: str) -> Instance:
+        opening = opening_of(self._plan, name, self._folder, self._log, self._run.showing)
+        return open_instance(replace(opening, content=self._run.contents.get(name), kept=self._models))
+
+
+def _in_one_node(plan: Plan) -> Plan:
+    """The plan of the same system with all instances in one node."""
+    system = plan.system
+    config = replace(system.config, simulation=replace(system.config.simulation, window=1))
+    instances = {name: replace(own, node=IN_ONE_NODE) for name, own in system.instances.items()}
+    return make_plan(replace(system, config=config, instances=instances))
+
+
+def _rings_of(plan: Plan) -> tuple[MemoryMap, Mapping[str, RingPlace]]:
+    """The memory of one copy: as many rows as its own instances read."""
+    instances = plan.system.instances
+    rings = {}
+    for item in plan.nodes[IN_ONE_NODE].instances:
+        readers = {c.target_instance for c in plan.connections if c.source_instance == item.name} | {item.name}
+        oldest = max(instances[reader].step_points for reader in readers)
+        rows = 1 << (2 * -(-oldest // item.step_points)).bit_length()
+        rings[item.name] = (IN_ONE_NODE, item.step_points, item.outputs, rows)
+    return map_memory([IN_ONE_NODE], rings)
