@@ -76,10 +76,10 @@ class Batch:
     """
 
     def __init__(self, run: RunPlan, copies: int) -> None:
-        if isinstance(copies, bool) or not hasattr(copies, "__index__") or operator.index(copies) < 1:
+        if copies < 1:
             raise CallRefused(f"{option_text('copies', copies)}: expected a whole number of 1 or more")
         self._run = run
-        self._count = operator.index(copies)
+        self._count = copies
         self._thread = threading.get_ident()
         self._known = KnownModels()
         self._variables: dict[str, tuple[str, Variable]] = {}
@@ -231,8 +231,8 @@ class Batch:
     def reset(self, mask: ArrayLike | None = None, start_values: Values | None = None) -> None:
         """Bring copies back to point 0: they are as new ones, whether they were done or not.
 
-        Where all FMUs can get and set their state, the second reset of a copy takes about as long as that (FMI 2.0,
-        2.1.8); the first one, and any other, makes new instances of the loaded models.
+        Where all FMUs can get and set their state, and no start values are given, the second reset of a copy takes
+        about as long as that (FMI 2.0, 2.1.8); the first one, and any other, makes new instances of the loaded models.
 
         Example:
             >>> import fmu_mesh, numpy as np
@@ -245,7 +245,7 @@ class Batch:
         Args:
             mask: which copies, truths of shape (copies,); None: all.
             start_values: by `instance.variable`: shape (copies, dimensions of the variable), or one value for all;
-                those of other copies are ignored. They stay for later resets of the same copies.
+                those of other copies are ignored. They replace those of `Mesh.batch`, in this reset only.
 
         Raises:
             ConfigurationError: a start value is wrong; carries all findings.

@@ -32,7 +32,7 @@ from ..instances.process_state import ProcessState
 from ..instances.registry import open_instance
 from ..node.burst_engine import BurstEngine
 from ..node.engine import STATE_CHECK_S
-from ..node.inputs import TimedInputs, set_input
+from ..node.inputs import TimedInputs
 from ..rings import native
 from ..rings.native import BurstEnd
 from ..system.memory_map import MemoryMap, RingPlace, map_memory
@@ -110,7 +110,7 @@ class Copies:
         self._threads.enter_context(one_thread_meanwhile())
         for number in range(len(self._table)):
             self._copies.append(SystemCopy(self._node, self._places, self._opened))
-            self._begin(number)
+            self._begin(number, {})
             ready(number + 1)
         self._threads.enter_context(one_thread_meanwhile())  # with the libraries that components have imported
 
@@ -190,11 +190,11 @@ class Copies:
         self._is_set.add(instance)
 
         def by_python(number: int) -> None:
-            runner = self._copies[number].runners[instance]
-            shape = runner.instance.description.variable(name).shape  # type: ignore[union-attr]  # it is there
+            variable = self._copies[number].runners[instance].instance.description.variable(name)
+            shape = variable.shape if variable is not None else ()
             row = values[number].reshape(shape).tolist() if shape else values[number, 0]
             value = row.item() if isinstance(row, np.generic) else row
-            self._end_of(number, partial(set_input, runner, name, value, None))
+            self._end_of(number, partial(self._copies[number].set, instance, name, value))
 
         timed = self._copies[0].runners[instance].instance
         access = None
@@ -318,7 +318,7 @@ class Copies:
 
         Args:
             wanted: which, shape (count,).
-            overrides: other start values of a copy, by instance and variable; None: those that it was reset with.
+            overrides: other start values of a copy, by instance and variable; None: those of the plan.
 
         Raises:
             FmuError: one cannot be initialized; it has ended then, and so have those after it that were not reset.
@@ -334,11 +334,11 @@ class Copies:
                 copy.free(self._first.pop(number))
             self._ended[number] = True
             copy.close()
-            self._begin(number, overrides(number) if overrides is not None else None)
-            if self.why_not_saved is None:
+            self._begin(number, overrides(number) if overrides is not None else {})
+            if overrides is None and self.why_not_saved is None:
                 self._first[number] = copy.save(0)
 
-    def _begin(self, number: int, overrides: Overrides | None = None) -> None:
+    def _begin(self, number: int, overrides: Overrides) -> None:
         copy = self._copies[number]
         copy.begin(overrides)
         if isinstance(copy.engine, BurstEngine):

@@ -9,7 +9,6 @@ import ctypes
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, cast
 
 from msgspec.structs import replace
@@ -21,7 +20,7 @@ from ..instances.contract import AccessedNatively, Instance, KeepsState, StepsNa
 from ..node.burst_engine import BurstEngine, make_engine
 from ..node.engine import Engine, PlainEngine
 from ..node.initialization import Initialization
-from ..node.inputs import with_times
+from ..node.inputs import TimedInputs, set_input, with_times
 from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -53,23 +52,21 @@ class SystemCopy:
     def __init__(
         self, node: NodePlan, places: tuple[MemoryMap, Mapping[str, RingPlace]], opened: Callable[[str], Instance]
     ) -> None:
-        self._overrides: Overrides = MappingProxyType({})
         self._node, self._opened = node, opened
         self._map, self._places = places
         self.runners: dict[str, Runner] = {}
         self.engine: Engine
 
-    def begin(self, overrides: Overrides | None = None) -> None:
+    def begin(self, overrides: Overrides) -> None:
         """Open new instances and initialize them; then they are at point 0.
 
-        With ``overrides``, these start values stand in the place of those of the plan, from now on.
+        These start values, by instance and variable, stand in the place of those of the plan.
         """
-        self._overrides = self._overrides if overrides is None else overrides
         node, memory = self._node, HostMemory.private(self._map, IN_ONE_NODE)
         guards: list[Instance] = []
         try:
             for item in node.instances:
-                own = self._overrides.get(item.name)
+                own = overrides.get(item.name)
                 plan = replace(item, start_values=item.start_values | dict(own)) if own else item
                 guards.append(Guarded(item.name, partial(self._opened, item.name), Unwatched(), node.timeouts))
                 timed = with_times(guards[-1], plan, node.grid, lambda _message: None)
@@ -115,6 +112,13 @@ class SystemCopy:
         """Steps have changed the state of the process."""
         for runner in self.runners.values():
             runner.take_care()
+
+    def set(self, instance: str, name: str, value: Value) -> None:
+        """Set a variable: it has the value at once, also where the inputs of the instance follow times."""
+        own = self.runners[instance]
+        set_input(own, name, value, None)
+        if isinstance(own.instance, TimedInputs):
+            own.instance.set_values({name: value})
 
     def access(self, instance: str, verb: Verb, names: tuple[str, ...]) -> native.CopyCall | None:
         """See `AccessedNatively`."""

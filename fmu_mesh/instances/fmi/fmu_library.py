@@ -12,9 +12,10 @@ import itertools
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from copy import copy
 from functools import wraps
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from fmpy import freeLibrary
@@ -130,11 +131,20 @@ class FmuLibrary(_Library):
 class _LoadedBefore:
     """Goes before FMPy's class of an FMU, which loads the library again: that gives the same one."""
 
+    component: int | None
+
     def __init__(self, library: FmuLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
         self._library = library
         self.environment = environment
         super().__init__(**keywords)
         library.close()
+
+    def for_another(self, environment: int) -> Self:
+        """The same library for another instance with an environment of its own: functions are looked up once."""
+        other = copy(self)
+        other.environment = environment
+        other.component = None
+        return other
 
     @property
     def dll(self) -> FmuLibrary:

@@ -71,6 +71,9 @@ class _Files:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.used_by: list[LoadedFmu] = []
+        self.loaded: Any = None  # FMPy's object of the first of them
+        self.changes_process: bool | None = None
+        self.stays = False  # whether the library is never unloaded, because one of them has returned fatal
 
 
 class LoadedFmu:
@@ -90,7 +93,6 @@ class LoadedFmu:
         )
         self._folder = files.folder
         files.used_by.append(self)
-        self._changes_process: bool | None = None
 
     @property
     def has_files(self) -> bool:
@@ -106,6 +108,10 @@ class LoadedFmu:
         if self.calls is not None:
             return
         functions, description = self._fmu.functions, self._fmu.description
+        if self._files.loaded is not None:
+            loaded = self._files.loaded.for_another(id(self))
+            self.calls = FmpyCalls(loaded, functions.values.prefix, functions.names)
+            return
         path = self._folder / library_name(description.model_identifier, description.fmi_version)
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
             library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
@@ -117,14 +123,16 @@ class LoadedFmu:
                 unzipDirectory=str(self._folder),
                 instanceName=self._fmu.name,
             )
+        self._files.loaded = loaded
         self.calls = FmpyCalls(loaded, functions.values.prefix, functions.names)
 
     @property
     def changes_process(self) -> bool:
         """See `ChangesProcess`; known once there is an instance, which may have loaded more libraries."""
-        if self._changes_process is None:
-            self._changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
-        return self._changes_process
+        files = self._files
+        if files.changes_process is None:
+            files.changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
+        return files.changes_process
 
     def instantiate(self, **arguments: object) -> None:
         """Make an instance with these arguments for FMPy, if none is there that was reset."""
@@ -163,14 +171,17 @@ class LoadedFmu:
         A process that ends anyway unloads nothing: the FMU may have left a thread or a timer, which needs the library.
         """
         self.free()
-        if self.calls is not None and not self.is_lost and not process_ends():
+        files, self.calls = self._files, None
+        files.stays |= self.is_lost
+        if self in files.used_by:
+            files.used_by.remove(self)
+        if files.used_by:
+            return
+        if files.loaded is not None and not files.stays and not process_ends():
             with suppress(FMICallException, OSError):
-                self.calls.freeLibrary()
-        self.calls = None
-        if self in self._files.used_by:
-            self._files.used_by.remove(self)
-        if not self._files.used_by:
-            self.remove_files()
+                files.loaded.freeLibrary()
+        files.loaded = None
+        self.remove_files()
 
     def remove_files(self) -> None:
         """From any thread, when the process is about to be ended: remove the extracted files."""
