@@ -30,10 +30,10 @@ GUESS, SPREAD = np.array([1.0, 0.0, 0.3]), np.array([0.3, 0.5, 0.1])
 NOISE = 0.05
 """Standard deviation of the sensor in rad."""
 
-POINTS = 10
-"""Communication points between two measurements: 0.1 s."""
+POINTS = 20
+"""Communication points between two measurements: 0.2 s."""
 
-MEMBERS = 100
+MEMBERS = 60
 
 Array = NDArray[np.float64]
 
@@ -98,14 +98,15 @@ def filtered(
 ) -> tuple[Array, Array]:
     """Mean and standard deviation of the ensemble after each measurement; NaN: there is none."""
     means, spreads = [], []
+    batch.reset(start_values=dict(zip(STATE, ensemble.T, strict=True)))
     for angle in measured:
-        # A state cannot be set in the middle of a run. So the copies begin anew from it: their time starts at 0 again,
-        # which is right for a model that does not depend on time.
-        batch.reset(start_values=dict(zip(STATE, ensemble.T, strict=True)))
         batch.step(POINTS)
         ensemble = np.column_stack([batch.get(list(STATE[:2])), ensemble[:, 2]])
         if np.isfinite(angle):
             ensemble = corrected(ensemble, angle, random)
+            # A state cannot be set in the middle of a run. So the copies begin anew from it: their time starts at 0
+            # again, which is right for a model that does not depend on time.
+            batch.reset(start_values=dict(zip(STATE, ensemble.T, strict=True)))
         means.append(ensemble.mean(axis=0))
         spreads.append(ensemble.std(axis=0, ddof=1))
     return np.array(means), np.array(spreads)

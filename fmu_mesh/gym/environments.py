@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import CallRefused
 from ..text import option_text
-from .episodes import SpaceColumn, Episodes
+from .episodes import Episodes, SpaceColumn
 from .task import Task
 
 __all__ = ["MeshEnv", "MeshVectorEnv"]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..api.mesh_builder import Mesh, load
 from ..errors import CallRefused
-from ..system.plan import Plan
+from ..run.run_plan import RunPlan
 from ..text import counted, listed, option_text
 from ..variables.model_description import Variable
 from .task import Names, Step, Task
@@ -35,21 +35,19 @@ class SpaceColumn(NamedTuple):
     Attributes:
         name: `instance.variable`.
         variable: what the model description says about it.
-        shape: of its value; empty for a scalar.
         low: its lower bound; -inf without one.
         high: its upper bound; inf without one.
     """
 
     name: str
     variable: Variable
-    shape: tuple[int, ...]
     low: float
     high: float
 
     @property
     def size(self) -> int:
         """How many elements of an observation or action it has."""
-        return math.prod(self.shape)
+        return self.variable.size
 
     @property
     def is_whole(self) -> bool:
@@ -96,18 +94,18 @@ class Episodes:
         if not hasattr(task.points, "__index__") or (points := operator.index(task.points)) < 1:
             raise CallRefused(f"{option_text('points', task.points)}: expected a whole number, 1 or more")
         self._task, self._points = task, points
-        plan = mesh.plan(**options).plan
-        self._last_point = _last_point(plan, task)
+        run = mesh.plan(**options)
+        self._last_point = _last_point(run, task)
+        self.observed = _columns("observations", run, task.observations)
+        self.acted = _columns("actions", run, task.actions)
         self._batch = mesh.batch(copies, **options)
         try:
-            self.observed = self._columns("observations", plan, task.observations)
-            self.acted = self._columns("actions", plan, task.actions)
             self._check_actions()
         except BaseException:
             self.close()
             raise
         self._scalars = [column.name for column in self.observed]
-        if any(column.shape or column.variable.type != "Float64" for column in self.observed):
+        if any(column.variable.shape or column.variable.type != "Float64" for column in self.observed):
             self._scalars = []
         self._values = np.zeros((copies, sum(column.size for column in self.observed)))
 
@@ -165,24 +163,6 @@ class Episodes:
         """Free all copies."""
         self._batch.close()
 
-    def _columns(self, option: str, plan: Plan, names: Names) -> tuple[SpaceColumn, ...]:
-        bounds = names if isinstance(names, Mapping) else dict.fromkeys(names)
-        if not bounds:
-            raise CallRefused(f"{option} of the task: expected one variable or more")
-        return tuple(self._column(plan, name, given) for name, given in bounds.items())
-
-    def _column(self, plan: Plan, name: str, given: tuple[float, float] | None) -> SpaceColumn:
-        shape = self._batch.get(name).shape[1:]  # this knows each name, and suggests the nearest one
-        instance, _, rest = name.partition(".")
-        variable = plan.system.instances[instance].description.variable_of(rest)
-        assert variable is not None
-        if variable.type in _NO_NUMBERS:
-            raise CallRefused(f"'{name}' is a {variable.type}, and observations and actions are numbers.")
-        low, high = given if given is not None else _bounds_of(variable)
-        if not low < high:
-            raise CallRefused(f"the bounds of '{name}' are {low:g} and {high:g}; expected a lower and an upper one.")
-        return SpaceColumn(name, variable, shape, float(low), float(high))
-
     def _check_actions(self) -> None:
         for column in self.acted:
             self._batch.set(column.name, self._batch.get(column.name))  # this knows what may be set
@@ -215,7 +195,7 @@ class Episodes:
                 raise CallRefused(f"an action has {told}; expected {column.low:g} to {column.high:g}.")
             elif column.variable.type == "Boolean":
                 part = part.astype(bool)
-            done[column.name] = part.reshape(len(part), *column.shape)
+            done[column.name] = part.reshape(len(part), *column.variable.shape)
         self._batch.set(done)
         return done
 
@@ -232,7 +212,7 @@ class Episodes:
     def _named(self, values: Floats) -> dict[str, NDArray[Any]]:
         named, begin = {}, 0
         for column in self.observed:
-            named[column.name] = values[:, begin : begin + column.size].reshape(len(values), *column.shape)
+            named[column.name] = values[:, begin : begin + column.size].reshape(len(values), *column.variable.shape)
             begin += column.size
         return named
 
@@ -247,14 +227,31 @@ def _never(_: Step) -> ArrayLike:
     return False
 
 
-def _last_point(plan: Plan, task: Task) -> int:
+def _last_point(run: RunPlan, task: Task) -> int:
     """The last point of an episode."""
-    grid = plan.grid
+    grid = run.plan.grid
     if task.episode_time is None:
         return grid.last_point
     if not task.episode_time > 0.0:
         raise CallRefused(f"{option_text('episode_time', task.episode_time)}: expected more than 0 s")
     return min(grid.last_point, replace(grid, start_time=0.0).step_at(task.episode_time))
+
+
+def _columns(option: str, run: RunPlan, names: Names) -> tuple[SpaceColumn, ...]:
+    """The columns of observations or actions."""
+    bounds = names if isinstance(names, Mapping) else dict.fromkeys(names)
+    if not bounds:
+        raise CallRefused(f"{option} of the task: expected one variable or more")
+    columns = []
+    for name, given in bounds.items():
+        _, variable = run.variable(name)
+        if variable.type in _NO_NUMBERS:
+            raise CallRefused(f"'{name}' is a {variable.type}, and observations and actions are numbers.")
+        low, high = given if given is not None else _bounds_of(variable)
+        if not low < high:
+            raise CallRefused(f"the bounds of '{name}' are {low:g} and {high:g}; expected a lower and an upper one.")
+        columns.append(SpaceColumn(name, variable, float(low), float(high)))
+    return tuple(columns)
 
 
 def _bounds_of(variable: Variable) -> tuple[float, float]:
@@ -276,6 +273,7 @@ def _spread(name: str, value: ArrayLike, mask: Truths, count: int) -> NDArray[An
             f"the start value of '{name}' has {counted(len(values), 'element')}; expected {count}, one for each copy."
         )
         raise CallRefused(text)
-    spread = np.zeros((len(mask), *values.shape[1:]), values.dtype)
+    spread = np.empty((len(mask), *values.shape[1:]), values.dtype)
+    spread[:] = values[0] if values.ndim else values  # also in the copies that go on: any value in its range
     spread[mask] = values
     return spread
