@@ -42,9 +42,9 @@ class Effort(NamedTuple):
     """
 
     generations: int = 60
-    candidates: int = 32
-    best: int = 6
-    episodes: int = 8
+    candidates: int = 24
+    best: int = 5
+    episodes: int = 4
     steps: int = 300
 
 

@@ -108,13 +108,16 @@ def test_the_training_writes_a_network_of_the_same_form(tmp_path: Path) -> None:
 
 
 def test_a_few_generations_balance_longer_than_random_pushes(training: ModuleType) -> None:
-    effort = training.Effort(generations=6, candidates=16, best=4, episodes=3, steps=150)
+    network = training.trained(training.Effort(generations=6, candidates=16, best=4, episodes=3, steps=150), 1)
 
-    network = training.trained(effort, 1)
+    assert training.worth(None, 30) < 60.0
+    assert training.worth(network, 30) > 120.0  # of 500
 
-    assert network.tolist() == training.trained(effort, 1).tolist()  # a seed gives the same network
-    assert training.worth(None) < 60.0
-    assert training.worth(network) > 120.0  # of 500
+
+def test_a_seed_trains_the_same_network_again(training: ModuleType) -> None:
+    effort = training.Effort(generations=2, candidates=6, best=2, episodes=2, steps=50)
+
+    assert training.trained(effort, 1).tolist() == training.trained(effort, 1).tolist()
 
 
 @pytest.mark.skipif("FMU_MESH_TRAINING" not in os.environ, reason="it trains for a minute; .ci/long learning does that")
