@@ -15,12 +15,15 @@ __all__ = ["JOBS", "OTHER", "OURS", "Entry", "Job", "with_checkout"]
 
 OURS = "fmu_mesh_launch"
 KINDS = "fmu_mesh_kinds"
+STEPPED = "fmu_mesh_environment"
 OTHER = ", other checkout"
 """The end of the label of a row that another checkout runs."""
 
 _MODULES_NEED = {
     "c_program": ("fmpy",),
     "c_model_exchange": ("fmpy",),
+    "c_environment": ("fmpy",),
+    "fmpy_environment": ("fmpy",),
     "fmpy_loop": ("fmpy",),
     "fmpy_model_exchange": ("fmpy",),
     "fmpy_arrays": ("fmpy",),
@@ -68,7 +71,7 @@ class Entry:
     @property
     def is_ours(self) -> bool:
         """Whether it runs fmu_mesh, of this checkout or of another one."""
-        return self.module in (OURS, KINDS)
+        return self.module in (OURS, KINDS, STEPPED)
 
 
 @dataclass(frozen=True)
@@ -92,13 +95,13 @@ class Job:
 
 
 def with_checkout(jobs: Sequence[Job], folder: Path) -> list[Job]:
-    """The jobs with each of our rows a second time, run by the fmu_mesh of another checkout."""
+    """The jobs with each of our rows a second time, run by the fmu_mesh of another checkout, if it is a command."""
     found = []
     for job in jobs:
         others = [
             replace(entry, label=entry.label + OTHER, options={**entry.options, "checkout": str(folder.resolve())})
             for entry in job.entries
-            if entry.is_ours
+            if entry.is_ours and entry.module != STEPPED
         ]
         found.append(replace(job, entries=(*job.entries, *others)))
     return found
@@ -118,6 +121,7 @@ def _starting(count: int) -> System:
 
 
 _NOTHING = System("chain", "jacobi", 1.0, ())
+_CART = System("chain", "jacobi", 0.02, ())
 _PENDULUM = System(
     "chain",
     "gauss_seidel",
@@ -143,6 +147,7 @@ _CHATTY = System("chain", "gauss_seidel", 0.001, (Member("chatty", CHATTY, "u", 
 _SIZES = (2, 16, 64)
 _US = "fmu_mesh"
 _DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
+_OPEN, _RESET_TO_STATE, _RESET_WITH_VALUES = "fmu_mesh, open()", "reset() to a state", "reset() with start values"
 _NO_FILE = "fmu_mesh, nothing recorded"
 _LOCAL = "fmu_mesh, launch --local"
 _FMPY = "FMPy loop, one process"
@@ -392,6 +397,29 @@ JOBS = (
             Entry("fmu_mesh, cvode", KINDS, 10_000, 5_000, {"kind": "model_exchange"}),
             Entry(_C_SOLVER, "c_model_exchange", 100_000, 20_000),
             Entry("FMPy simulate_fmu (CVode), one after the other", "fmpy_model_exchange", 10_000, 5_000),
+        ),
+    ),
+    Job(
+        "environment",
+        "one cart pole (fmus/CartPole.fmu) that a program steps: set, step and get at each point",
+        _CART,
+        (
+            Entry(_OPEN, STEPPED, 200_000, 50_000, {"what": "steps"}),
+            Entry(_C_ONE, "c_environment", 1_000_000, 200_000, {"what": "steps"}),
+            Entry(_FMPY, "fmpy_environment", 50_000, 20_000, {"what": "steps"}),
+        ),
+    ),
+    Job(
+        "resets",
+        "the same cart pole: one way back to its first point, and get",
+        _CART,
+        (
+            Entry(_RESET_TO_STATE, STEPPED, 100_000, 20_000, {"what": "state"}),
+            Entry("C: fmi2SetFMUstate", "c_environment", 10_000_000, 1_000_000, {"what": "state"}),
+            Entry(_RESET_WITH_VALUES, STEPPED, 2_000, 500, {"what": "values"}),
+            Entry("C: fmi2Reset and initialization", "c_environment", 10_000_000, 1_000_000, {"what": "values"}),
+            Entry("FMPy: reset and initialization", "fmpy_environment", 10_000, 5_000, {"what": "values"}),
+            Entry("a new open()", STEPPED, 50, 20, {"what": "open"}),
         ),
     ),
     Job(

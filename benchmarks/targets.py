@@ -58,6 +58,7 @@ _STREAMS, _BY_ZENOH, _MEMORY = "fmu_mesh, row streams", "fmu_mesh, Zenoh", "fmu_
 _TCP, _ZENOH = "TCP, C, spinning: one round trip", "Zenoh in Python: one round trip"
 _DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
 _WINDOW1 = "fmu_mesh, gauss_seidel"
+_OPEN, _TO_STATE, _VALUES = "fmu_mesh, open()", "reset() to a state", "reset() with start values"
 
 TARGETS = (
     Target("main job with its CSV, against the FMPy loop", "pendulum", "fmu_mesh", "times as fast", 25, 40, _FMPY),
@@ -78,6 +79,9 @@ TARGETS = (
     Target("FMI 1.0, against the other checkout", "kinds", _FMI1, "times as fast", 2, 4, _FMI1 + OTHER),
     Target("Boolean, Enumeration, against the other checkout", "kinds", _FMI2, "times as fast", 2, 4, _FMI2 + OTHER),
     Target("model exchange with dopri5, against C", "model_exchange", _DOPRI5, "times as long", 2.5, 1.2, _C_SOLVER),
+    Target("open(): set, step and get, against C", "environment", _OPEN, "times as long", 15, 8, "C, one process"),
+    Target("reset() to a state, against C", "resets", _TO_STATE, "times as long", 5, 2, "C: fmi2SetFMUstate"),
+    Target("reset() with start values, against open()", "resets", _VALUES, "times as long", 0.05, 0.01, "a new open()"),
     Target("main job, launch --local", "pendulum", "fmu_mesh, launch --local", "points/s", 437_000, 800_000),
     Target("main job, whole command, against --local", "command", _COMMAND, "times as long", 1.5, 1.2, _LOCAL),
     Target(

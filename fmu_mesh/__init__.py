@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from .api.inspection import Inspection, inspect
     from .api.mesh_builder import Mesh, load
     from .api.mesh_check import Check
-    from .api.open_system import System, SystemState
+    from .api.open_system import System
     from .api.package_inspection import PackageInspection, inspect_package
     from .api.rerunning import rerun
     from .api.result import Result
     from .api.run_handle import Run
     from .api.samples import Sample
     from .api.simulating import simulate
+    from .api.system_state import SystemState
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -114,7 +115,7 @@ _NAMES = {
     "api.inspection": ("Inspection", "inspect"),
     "api.mesh_builder": ("Mesh", "load"),
     "api.mesh_check": ("Check",),
-    "api.open_system": ("System", "SystemState"),
+    "api.open_system": ("System",),
     "api.package_inspection": ("PackageInspection", "inspect_package"),
     "results.formats": ("recover",),
     "api.rerunning": ("rerun",),
@@ -122,6 +123,7 @@ _NAMES = {
     "api.run_handle": ("Run",),
     "api.samples": ("Sample",),
     "api.simulating": ("simulate",),
+    "api.system_state": ("SystemState",),
     "instances.python.component": ("Component", "component"),
     "instances.python.declarations": ("Input", "Output", "Parameter"),
     "pictures.system_graph": ("SystemGraph",),

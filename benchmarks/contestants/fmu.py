@@ -38,7 +38,7 @@ class Fmu:
         messages: what it has logged.
     """
 
-    def __init__(self, member: Member, stop_time: float) -> None:
+    def __init__(self, member: Member, stop_time: float | None) -> None:
         path = str(FMUS / f"{member.fmu}.fmu")
         description = read_model_description(path, validate=False)
         references = {variable.name: variable.valueReference for variable in description.modelVariables}

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CallRefused
 from ..run.copies import Copies
+from ..run.local_system import forwarded
 from ..run.preparing import KnownModels, planned_reset
 from ..run.process import interrupts_later
 from ..run.run_plan import RunPlan
@@ -34,7 +35,7 @@ from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
 from ..variables.value_types import DTYPES, is_float, is_text
-from .open_system import SystemState, forwarded
+from .system_state import SystemState
 
 __all__ = ["Batch", "BatchState"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -634,7 +635,14 @@ class Mesh:
         """
         from .open_system import System  # noqa: PLC0415  only this needs it
 
-        return System(self._opened(options))
+        run, given = self._opened(options), options.given()
+        values, known = deepcopy(self._plain._replace(file=self._shown_file)), KnownModels.of(run)
+
+        def plan_again(start_values: Mapping[str, Any]) -> RunPlan:
+            own = PlanOptions(**given | {"start_values": given.get("start_values", {}) | start_values})
+            return without_keys(planned(values, own, own.on_notice or log.info, known))
+
+        return System(run, plan_again)
 
     @takes(OpenOptions)
     def batch(self, copies: int, options: OpenOptions) -> Batch:

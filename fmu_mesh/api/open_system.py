@@ -1,4 +1,4 @@
-"""`System`: a mesh that a program steps in its own process, and `SystemState`: where to go back to.
+"""`System`: a mesh that a program steps in its own process.
 
 Owns names, modes and the private folder. What a step does is `fmu_mesh.run.local_system`, which `--local` shares.
 """
@@ -9,37 +9,40 @@ import logging
 import operator
 import shutil
 import tempfile
-import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from threading import get_ident
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
+from msgspec.structs import replace
 
 from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
-from ..instances.contract import LogMessage
+from ..instances.kept_models import KeptModels
 from ..instances.registry import open_instance
-from ..printing import paragraph
-from ..run.local_system import LocalSystem, SavedSystem, opening_of
+from ..run.local_system import LocalSystem, SavedSystem, forwarded, opening_of
 from ..run.one_process import OneProcess
+from ..run.options import ResetOptions
+from ..run.reset_plans import ResetPlans
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..text import listed, option_text, shown
-from ..variables.value_conversion import ValueRefused, checked_value
+from ..variables.value_conversion import ValueRefused, checker
 from ..variables.value_types import DTYPES
+from .system_state import SystemState
 
-__all__ = ["System", "SystemState", "forwarded"]
+__all__ = ["System"]
 
 log = logging.getLogger(__name__)
 
 Mode = Literal["ready", "ended", "failed", "interrupted", "closed"]
 
-_BACK = "Restore a state that was saved before, or close the system."
+_BACK = "Restore a state that was saved before, reset the system, or close it."
 
 
 class System:
@@ -66,28 +69,35 @@ class System:
 
     Args:
         run: the plan of the run.
+        plan_again: plans it again for a reset, with these start values besides; None: from its configuration.
 
     Raises:
         NotInOneProcess: two instances cannot share a process.
         FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
     """
 
-    def __init__(self, run: RunPlan) -> None:
-        plan = run.plan
+    def __init__(self, run: RunPlan, plan_again: Callable[[Mapping[str, Any]], RunPlan] | None = None) -> None:
+        self._plans = plans = ResetPlans(run, plan_again)
+        self._plan = plan = plans.first
         OneProcess().check(plan, run.contents)
         self._run = run
         self._grid = plan.grid
-        self._thread = threading.get_ident()
+        self._last = plan.grid.last_point
+        self._thread = get_ident()
         self._mode: Mode = "ready"
         self._ended_by: ErrorReport | None = None
         self._getters: dict[str, Callable[[int], Any]] = {}
-        self._saved: weakref.WeakKeyDictionary[SystemState, SavedSystem] = weakref.WeakKeyDictionary()
+        self._setters: dict[str, _Setter] = {}
+        self._saved: weakref.WeakKeyDictionary[SystemState, SavedSystem | None] = weakref.WeakKeyDictionary()
         self._lost: deque[SavedSystem] = deque()
-        self._local = local = LocalSystem(plan)
+        self._first: SavedSystem | None = None
+        self._guards: dict[str, Guarded] = {}
         folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+        self._models = KeptModels(folder, resets=True)
+        self._local = local = LocalSystem(plan, self._models)
         self._release = weakref.finalize(self, _release, local, folder, self._thread)
         try:
-            local.start(partial(_opened, run, folder))
+            local.start(self._opened)
         except BaseException:
             self.close()
             raise
@@ -125,8 +135,8 @@ class System:
         """Step all instances to the next communication point, or over several.
 
         If an FMU asks to end the simulation, this returns at the last point that all have reached, and `ended_by` says
-        so. Ctrl-C ends this call with `KeyboardInterrupt` in the middle of a step: then only `restore` and `close` are
-        allowed.
+        so. Ctrl-C ends this call with `KeyboardInterrupt` in the middle of a step: then only `restore`, `reset` and
+        `close` are allowed.
 
         Example:
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open() as system:
@@ -140,17 +150,12 @@ class System:
 
         Raises:
             CallRefused: there are not so many points left, or an FMU has asked to end; or see `close`.
-            FmuError: an FMU failed; has the instance, the point and the time. Only `close` is allowed now.
+            FmuError: an FMU failed; has the instance, the point and the time. Only `reset` and `close` are allowed now.
         """
-        self._demand("step")
-        if not hasattr(points, "__index__"):
-            raise CallRefused(f"{option_text('points', points)}: expected a whole number")
-        count, local = operator.index(points), self._local
-        if count < 1:
-            raise CallRefused(f"step was given {count} points; expected 1 or more.")
-        if count > (left := self._grid.last_point - local.point):
-            text = f"step was given {count} points, and {left} are left until the stop time {self._grid.stop_time:g} s."
-            raise CallRefused(text, hint="Raise `stop_time`; null has no end.")
+        if self._mode != "ready" or get_ident() != self._thread:
+            self._demand("step")
+        local = self._local
+        count = points if points.__class__ is int and 0 < points <= self._last - local.point else self._count(points)
         self._mode = "interrupted"
         try:
             for _ in range(count):
@@ -181,12 +186,14 @@ class System:
         Raises:
             UnknownName: there is no such variable; suggests the nearest one.
             CallRefused: see `close`.
-            FmuError: the FMU failed. Only `close` is allowed now.
+            FmuError: the FMU failed. Only `reset` and `close` are allowed now.
         """
-        self._demand("get", "ended")
-        if not isinstance(name, str):
-            raise UnknownName(f"{shown(name)} is no name of a variable.")
-        read = self._getters.get(name) or self._getter(name)
+        if self._mode != "ready" or get_ident() != self._thread:
+            self._demand("get", "ended")
+        try:
+            read = self._getters[name]
+        except (KeyError, TypeError):
+            read = self._getter(name)
         try:
             return read(self._local.point)
         except FmuError as error:
@@ -216,21 +223,62 @@ class System:
         Raises:
             UnknownName: there is no such variable; suggests the nearest one.
             CallRefused: the variable cannot be set, or not to this value; or see `close`.
-            FmuError: the FMU refuses the value. Only `close` is allowed now.
+            FmuError: the FMU refuses the value. Only `reset` and `close` are allowed now.
         """
-        self._demand("set")
-        instance, variable = self._run.variable(name)
-        own = self._run.plan.nodes[self._run.plan.node_of(instance)].instance(instance)
+        if self._mode != "ready" or get_ident() != self._thread:
+            self._demand("set")
         try:
-            own.check_settable(variable)
-        except ValueRefused as refused:
-            raise CallRefused(f"it {refused}.", instance=instance, variable=variable.name) from refused
+            setter = self._setters[name]
+        except (KeyError, TypeError):
+            setter = self._setter(name)
         try:
-            checked = checked_value(value, variable, shown(value), finite=own.not_finite == "stop")
+            checked = setter.check(value)
         except ValueRefused as refused:
-            raise CallRefused(f"{refused}.", instance=instance, variable=variable.name) from refused
+            raise CallRefused(f"{refused}.", instance=setter.instance, variable=setter.variable) from refused
+        self._mode = "interrupted"
+        try:
+            setter.put(checked)
+        except FmuError as error:
+            self._mode = "failed"
+            error.at(self.point, self.time)
+            raise
+        self._mode = "ready"
+
+    def set_many(self, values: Mapping[str, object]) -> None:
+        """Set several variables at once, as `set` does: all of them, or none if one is refused.
+
+        All values of an instance are set in one call, so that values that belong together make one event of its FMU.
+
+        Example:
+            >>> mesh = fmu_mesh.Mesh("m", step_size=0.1, stop_time=1.0)
+            >>> mesh.add("gain", fmu="fmus/Gain.fmu")
+            >>> with mesh.open() as system:
+            ...     system.set_many({"gain.u": 3.0, "gain.k": 2.0})
+            ...     system.step()
+            ...     system.get("gain.y")
+            6.0
+
+        Args:
+            values: the values by `instance.variable`, each as `set` takes it.
+
+        Raises:
+            UnknownName: there is no such variable; suggests the nearest one. Nothing was set.
+            CallRefused: a variable cannot be set, or not to this value; or see `close`. Nothing was set.
+            FmuError: an FMU refuses a value. Only `reset` and `close` are allowed now.
+        """
+        self._demand("set_many")
+        if not isinstance(values, Mapping):
+            raise CallRefused(f"{option_text('values', values)}: expected a mapping of values by name")
+        checked: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            setter = self._setters.get(name) or self._setter(name)
+            try:
+                checked.setdefault(setter.instance, {})[setter.variable] = setter.check(value)
+            except ValueRefused as refused:
+                raise CallRefused(f"{refused}.", instance=setter.instance, variable=setter.variable) from refused
         with self._changing():
-            self._local.set(instance, variable.name, checked)
+            for instance, own in checked.items():
+                self._local.set(instance, own)
 
     def save(self) -> SystemState:
         """Save the state of the whole system: every instance, and the values between them (FMI 2.0, 2.1.8).
@@ -255,10 +303,10 @@ class System:
 
         Raises:
             CallRefused: an FMU cannot get and set its state; or see `close`.
-            FmuError: an FMU failed. Only `close` is allowed now.
+            FmuError: an FMU failed. Only `reset` and `close` are allowed now.
         """
         self._demand("save")
-        instances = self._run.plan.system.instances
+        instances = self._plan.system.instances
         without = [name for name, own in instances.items() if not own.description.can_get_and_set_state]
         if without:
             why = "as the model description says (canGetAndSetFMUstate)"
@@ -276,16 +324,58 @@ class System:
 
         Raises:
             CallRefused: it is not a state of this system, or it is closed; or see `close`.
-            FmuError: an FMU failed. Only `close` is allowed now.
+            FmuError: an FMU failed. Only `reset` and `close` are allowed now.
         """
         self._demand("restore", "ended", "interrupted")
-        saved = None if getattr(state, "closed", True) else self._saved.get(state)
-        if saved is None:
+        if getattr(state, "closed", True) or state not in self._saved:
             raise CallRefused("restore needs a state that this system has saved, and that is not closed.")
+        saved = self._saved[state]
+        if saved is None:
+            raise CallRefused("the state is gone, because a reset has initialized the instances again since then.")
         self._free_lost()
         with self._changing():
             self._local.restore(saved)
         self._ended_by = None
+
+    def reset(self, start_values: Mapping[str, Any] | None = None) -> None:
+        """Go back to point 0: every float is that of a newly opened system. Nothing is loaded again.
+
+        What was `set` is gone, and so is the progress of scenarios. From the second reset on, the instances go back to
+        their states of point 0, if all FMUs can get and set them and no start values are given. Otherwise each FMU is
+        reset (fmi2Reset; FMI 2.0, 2.1.6), or gets a new instance, and is initialized again: then states that were saved
+        before are gone. An FMU that has failed is loaded again.
+
+        Example:
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open() as system:
+            ...     system.step(100)
+            ...     system.reset()
+            ...     first = system.point, system.get("pendulum.a")
+            ...     system.reset({"pendulum.a": 0.5})
+            ...     first, system.get("pendulum.a")
+            ((0, 1.3), 0.5)
+
+        Args:
+            start_values: by `instance.variable`: these replace those of `open`, in this reset only.
+
+        Raises:
+            ConfigurationError: a start value is wrong, or changes the size of an array. Nothing has changed.
+            CallRefused: this is not the thread that made the system, or it is closed.
+            FmuError: an instance cannot be initialized. Only `reset` and `close` are allowed now.
+        """
+        self._demand("reset", "ended", "interrupted", "failed")
+        self._free_lost()
+        first = self._first
+        if start_values or first is None or self._mode == "failed":
+            self._begin_again(start_values)
+            return
+        self._mode = "interrupted"
+        try:
+            self._local.restore(first)
+        except FmuError as error:
+            self._mode = "failed"
+            error.at(self.point, self.time)
+            raise
+        self._mode, self._ended_by = "ready", None
 
     def close(self) -> None:
         """Free all FMUs and states, and remove the files. May be called twice.
@@ -301,6 +391,42 @@ class System:
             self._mode = "closed"
             self._release()
 
+    def _begin_again(self, start_values: Mapping[str, Any] | None) -> None:
+        """Initialize all instances again."""
+        values = dict(ResetOptions(start_values=start_values).start_values or {})
+        self._plan = plan = self._plans.plan(values)
+        self._getters.clear()
+        self._setters.clear()
+        self._first = None
+        for state in self._saved:
+            self._saved[state] = None
+        with self._changing():
+            self._local.start(self._opened, plan)
+            instances = plan.system.instances.values()
+            if not values and all(own.description.can_get_and_set_state for own in instances):
+                self._first = self._local.save()
+        self._ended_by = None
+
+    def _opened(self, name: str) -> Guarded:
+        opening = opening_of(self._plan, name, self._models.folder, forwarded, self._run.showing)
+        opening, before = replace(opening, kept=self._models), self._guards.get(name)
+        timeouts, is_harmless = self._plan.system.config.timeouts, before is not None and before.is_harmless
+        guard = Guarded(name, lambda: open_instance(opening), Unwatched(), timeouts, is_harmless=is_harmless)
+        self._guards[name] = guard
+        return guard
+
+    def _count(self, points: object) -> int:
+        """The number of points of a step, if it is one, and so many are left."""
+        if not hasattr(points, "__index__"):
+            raise CallRefused(f"{option_text('points', points)}: expected a whole number")
+        count = operator.index(points)
+        if count < 1:
+            raise CallRefused(f"step was given {count} points; expected 1 or more.")
+        if count > (left := self._last - self._local.point):
+            text = f"step was given {count} points, and {left} are left until the stop time {self._grid.stop_time:g} s."
+            raise CallRefused(text, hint="Raise `stop_time`; null has no end.")
+        return count
+
     def _demand(self, call: str, *also: Mode) -> None:
         """Check that a call is allowed now; ``also`` has the modes besides `ready` in which it is."""
         self._demand_thread(call)
@@ -310,14 +436,14 @@ class System:
         who = ended.instance if ended is not None else None
         reason, hint = {
             "ended": (f"'{who}' has asked to end the simulation", _BACK),
-            "failed": ("an instance has failed before", "Only close() is allowed now."),
+            "failed": ("an instance has failed before", "Only reset() and close() are allowed now."),
             "interrupted": ("the last call was interrupted in the middle", _BACK),
             "closed": ("the system is closed", None),
         }[self._mode]
         raise CallRefused(f"{call} is not possible, because {reason}.", hint=hint)
 
     def _demand_thread(self, call: str) -> None:
-        if threading.get_ident() != self._thread:
+        if get_ident() != self._thread:
             text = f"{call} is not possible here, because a system belongs to the thread that made it."
             raise CallRefused(text, hint="Open a system on each thread that steps one.")
 
@@ -333,7 +459,21 @@ class System:
             raise
         self._mode = "ready"
 
+    def _setter(self, name: str) -> _Setter:
+        instance, variable = self._run.variable(name)
+        own = self._plan.nodes[self._plan.node_of(instance)].instance(instance)
+        try:
+            own.check_settable(variable)
+        except ValueRefused as refused:
+            raise CallRefused(f"it {refused}.", instance=instance, variable=variable.name) from refused
+        check = checker(variable, finite=own.not_finite == "stop")
+        made = _Setter(instance, variable.name, check, self._local.setter(instance, variable.name))
+        self._setters[name] = made
+        return made
+
     def _getter(self, name: str) -> Callable[[int], Any]:
+        if not isinstance(name, str):
+            raise UnknownName(f"{shown(name)} is no name of a variable.")
         instance, variable = self._run.variable(name, elements=True)
         plain = self._local.getter(instance, name.removeprefix(f"{instance}."))
         is_array, dtype = variable.shape and name == f"{instance}.{variable.name}", DTYPES[variable.type]
@@ -347,59 +487,17 @@ class System:
             self._local.free(self._lost.popleft())
 
 
-class SystemState:
-    """The state of a `System` at a point, for `System.restore`; it belongs to this system.
+class _Setter(NamedTuple):
+    """What sets a variable: ``check`` makes its value of what was given, or raises `ValueRefused`; ``put`` sets it."""
 
-    Example:
-        >>> with fmu_mesh.load("configs/pendulum_delay.yaml").open() as system:
-        ...     system.step(10)
-        ...     with system.save() as state:
-        ...         system.step(10)
-        ...         system.restore(state)
-        ...     system.point, state.point, state.closed
-        (10, 10, True)
-
-    Attributes:
-        point: the communication point.
-    """
-
-    def __init__(self, point: int, release: Callable[[], None]) -> None:
-        self.point = point
-        self._release = weakref.finalize(self, release)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __repr__(self) -> str:
-        return f"<SystemState: point {self.point}{', closed' if self.closed else ''}>"
-
-    @property
-    def closed(self) -> bool:
-        """Whether `close` was called."""
-        return not self._release.alive
-
-    def close(self) -> None:
-        """Give the memory of the state back; the FMUs free it at the next `save`, `restore` or `System.close`."""
-        self._release()
-
-
-def _opened(run: RunPlan, folder: Path, name: str) -> Guarded:
-    opening = opening_of(run.plan, name, folder, forwarded, run.showing)
-    return Guarded(name, lambda: open_instance(opening), Unwatched(), run.plan.system.config.timeouts)
-
-
-def forwarded(message: LogMessage) -> None:
-    """Give the log a message of a model."""
-    level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status.lower(), logging.ERROR)
-    said = map(paragraph, (message.category, message.message))
-    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)
+    instance: str
+    variable: str
+    check: Callable[[object], Any]
+    put: Callable[[Any], None]
 
 
 def _release(local: LocalSystem, folder: Path, thread: int) -> None:
     """Free everything. On another thread only the files: an FMU is only called on its own."""
-    if threading.get_ident() == thread:
+    if get_ident() == thread:
         local.close()
     shutil.rmtree(folder, ignore_errors=True)

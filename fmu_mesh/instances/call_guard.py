@@ -26,10 +26,10 @@ from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..text import short_path
 from ..variables.model_description import Value
-from .contract import ChangesProcess, Instance
+from .contract import BeginsAgain, ChangesProcess, Instance, Prepares
 from .instance_wrapper import AroundNativeSteps
 from .process_end import surviving
-from .process_state import kept_mode, kept_state
+from .process_state import floating_point_changed, kept_mode, kept_state, restore_floating_point
 
 __all__ = [
     "ENDED",
@@ -267,17 +267,25 @@ class Guarded(AroundNativeSteps):
     ``open_`` makes the instance, which is a call with a deadline like the others.
 
     That a step leaves it is looked after only where a step may change it: it takes longer than many a step. Such an
-    instance has no `native` steps.
+    instance has no `native` steps. With ``is_harmless``, an instance before of the same model has changed nothing, and
+    only the floating-point mode is looked after: who calls looks after the rest, once for many calls.
     """
 
     def __init__(
-        self, name: str, open_: Callable[[], Instance], watch: CallWatch | Unwatched, timeouts: TimeoutsConfig
+        self,
+        name: str,
+        open_: Callable[[], Instance],
+        watch: CallWatch | Unwatched,
+        timeouts: TimeoutsConfig,
+        *,
+        is_harmless: bool = False,
     ) -> None:
         self._name = name
         self._watch = watch
         self._timeouts = timeouts
         self._running = False
         self._careful = False
+        self._trusted = is_harmless
         with watch.calling(name, LoadFailed, "call", timeouts.call), self._kept():
             super().__init__(open_())
         if isinstance(self._instance, ChangesProcess) and self._instance.changes_process:
@@ -293,6 +301,21 @@ class Guarded(AroundNativeSteps):
         """That of the inner instance: `CallWatch.stepping` watches the steps."""
         return self._step if self._careful else self._instance.do_step
 
+    def begin_again(self) -> bool:
+        """See `BeginsAgain`; False if the inner instance is none. What was harmless until now is taken for it."""
+        own = self._instance
+        if not isinstance(own, BeginsAgain):
+            return False
+        self._trusted = self.is_harmless
+        is_as_new = self._forward(own.begin_again)
+        self._running = False
+        return is_as_new
+
+    @property
+    def is_harmless(self) -> bool:
+        """Whether no call has changed the state of the process so far, and none is known to do so."""
+        return not self._careful
+
     def take_care(self) -> None:
         """See `AroundInstance`."""
         self._careful = True
@@ -307,16 +330,48 @@ class Guarded(AroundNativeSteps):
         with self._kept():
             self._instance.set_values(values)
 
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`; nothing is prepared where calls are watched."""
+        own = self._preparing
+        put = own.setter(name) if own is not None else None
+        return self._with_kept_mode(put) if put is not None else None
+
+    def getter(self, name: str) -> Callable[[], Value] | None:
+        """See `setter`."""
+        own = self._preparing
+        get = own.getter(name) if own is not None else None
+        return self._with_kept_mode(get) if get is not None else None
+
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
         watch, name = self._watch, self._name
         ending = watch.calling(name, FmuError, "terminate", self._timeouts.terminate)
-        with ending, watch.surviving(name), kept_state():
+        with ending, watch.surviving(name), self._kept() if self._trusted else kept_state():
             self._instance.close()
 
     def _step(self, step: int) -> None:
         with self._kept():
             self._instance.do_step(step)
+
+    @property
+    def _preparing(self) -> Prepares | None:
+        own = self._instance
+        return own if isinstance(own, Prepares) and isinstance(self._watch, Unwatched) else None
+
+    def _with_kept_mode(self, call: Callable[..., Result]) -> Callable[..., Result]:
+        """As `_forward` between two steps, in less time."""
+
+        def kept(*arguments: Any) -> Result:  # noqa: ANN401 those of the call
+            if self._careful:
+                return self._forward(call, *arguments)
+            was_changed = floating_point_changed()
+            try:
+                return call(*arguments)
+            finally:
+                if not was_changed and floating_point_changed():
+                    restore_floating_point()
+
+        return kept
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
         if self._running:
@@ -329,7 +384,7 @@ class Guarded(AroundNativeSteps):
     @contextmanager
     def _kept(self) -> Iterator[None]:
         """Around one call: restore the state of the process, between steps only where they may change it."""
-        if self._running and not self._careful:
+        if (self._running or self._trusted) and not self._careful:
             with kept_mode():
                 yield
             return

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..rings.ring import Ring
 
 __all__ = [
+    "BeginsAgain",
     "ChangesProcess",
     "Instance",
     "KeepsFiles",
@@ -34,6 +35,7 @@ __all__ = [
     "Kind",
     "LogMessage",
     "Opening",
+    "Prepares",
     "Showing",
     "StepsNatively",
 ]
@@ -308,6 +310,28 @@ class StepsNatively(Protocol):
             FmuError: the step has failed.
             TerminationRequested: see `Instance.do_step`.
         """
+        ...
+
+
+@runtime_checkable
+class Prepares(Protocol):
+    """An instance that looks up once what it needs to set or get a variable many times, between calls of `do_step`."""
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """What `set_values` does with a variable; None where that is quicker, or other values belong to it."""
+        ...
+
+    def getter(self, name: str) -> Callable[[], Value] | None:
+        """What `get_values` does with a variable; None where that is as quick."""
+        ...
+
+
+@runtime_checkable
+class BeginsAgain(Protocol):
+    """An instance that can be as a new one, without being opened again."""
+
+    def begin_again(self) -> bool:
+        """End the simulation; whether `enter_initialization` may follow. Otherwise only `close` may."""
         ...
 
 

@@ -36,6 +36,7 @@ class KeptModels:
         self.folder = folder
         self.resets = resets
         self.loads = 0  # how many models were not kept, and so are loaded
+        self.is_closed = False
         self._models: dict[str, KeptModel] = {}
 
     def take(self, name: str, key: Hashable) -> KeptModel | None:
@@ -48,14 +49,15 @@ class KeptModels:
         return found
 
     def keep(self, name: str, model: KeptModel) -> None:
-        """Keep a model for the next instance ``name``."""
+        """Keep a model for the next instance ``name``; not after `close`."""
         self._models[name] = model
 
     def made(self, name: str, model: KeptModel) -> None:
         """A model was made for the instance ``name``, because none was kept."""
 
     def close(self) -> None:
-        """Free all models."""
+        """Free all models; those that are still in use are not kept."""
+        self.is_closed = True
         for model in self._models.values():
             model.close()
         self._models.clear()

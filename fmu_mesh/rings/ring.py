@@ -74,6 +74,12 @@ class Ring:
         shape, strides = (self.rows, width), (self.stride, dtype.itemsize)
         return np.ndarray(shape, dtype, self._flat.data, offset, strides)
 
+    def clear(self) -> None:
+        """Make all rows as they were at first."""
+        self.stamps[:] = 0
+        for part, array in zip(self.layout.parts, self.parts, strict=True):
+            array[...] = zero(part.type)
+
     def place_in_row(self, part: int, element: int) -> int:
         """Where an element of a part lies in a row, in bytes."""
         return self.offsets[part] + element * self.parts[part].itemsize

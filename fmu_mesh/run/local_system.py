@@ -7,11 +7,11 @@ order of calls at a point and the state of the whole system. Knows no files, no 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
@@ -19,67 +19,76 @@ from msgspec.structs import replace
 from ..errors import FmuError, InitializationFailed, NotFinite, TerminationRequested
 from ..instances.call_guard import Guarded, doing
 from ..instances.contract import LogMessage, Opening, Showing
-from ..instances.process_state import LOOK_STEPS, floating_point_changed, kept_state, restore_floating_point
-from ..rings.array_elements import element_of, scaled
-from ..rings.finite import FiniteRows
-from ..rings.ring import Ring, Rows
+from ..instances.kept_models import KeptModels
+from ..instances.process_state import LOOK_STEPS, kept_state
+from ..printing import paragraph
 from ..rings.value_change import ValueChange
-from ..simtime import TimeGrid
 from ..system.algebraic_loop import FixedPoint
-from ..system.coupling_rule import CouplingRule
 from ..system.initialization_plan import Loop
-from ..system.input_timeouts import LastValues
-from ..system.layout import Layout
 from ..system.plan import Plan
-from ..system.schedule import Course
-from ..system.series_files import courses_of
 from ..variables.value_types import Value
+from .local_member import LocalMember, SavedMember, element_at
 from .run_plan import opening_in
-from .threads import one_thread_meanwhile
+from .threads import LimitedThreads
 
-__all__ = ["LocalSystem", "SavedSystem", "opening_of"]
+__all__ = ["LocalSystem", "SavedSystem", "forwarded", "opening_of"]
+
+log = logging.getLogger("fmu_mesh.api.open_system")  # as docs/stepping.md has it
 
 
 class LocalSystem:
     """The instances of a plan and what moves values between them.
 
     Call sequence: `start`, then `step` as often as there are points, with all other methods in between; at the end, and
-    after any exception, `close`. After an exception of `step` only `restore` brings the system back to a point.
+    after any exception, `close`. After an exception of `step` only `restore` and `start` bring the system to a point.
 
     Args:
         plan: the plan; its nodes and its window are not used.
+        models: what the instances leave for those of the next `start`; None: each one loads its model.
 
     Attributes:
         point: the last point that all instances reached.
         stepping: name of the instance whose step is under way, or has failed; empty between two points.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, models: KeptModels | None = None) -> None:
         self.point = 0
         self.stepping = ""
         self._plan = plan
         self._grid = plan.grid
-        self._members: dict[str, _Member] = {}
+        self._models = models
+        self._members: dict[str, LocalMember] = {}
         self._steps: tuple[tuple[str, Callable[[int], None]], ...] = ()
         self._looked_after: tuple[tuple[str, Callable[[int], None]], ...] = ()
         self._look_at = 0
         self._kept: dict[int, SavedSystem] = {}
-        self._threads = ExitStack()
+        self._threads = LimitedThreads()
 
-    def start(self, open_instance: Callable[[str], Guarded]) -> None:
-        """Open all instances and initialize them; then they are at point 0.
+    def start(self, open_instance: Callable[[str], Guarded], plan: Plan | None = None) -> None:
+        """Open all instances and initialize them; then they are at point 0. Those of before are closed first.
 
         Args:
             open_instance: opens an instance by name; it is closed here.
+            plan: replaces that of before; it has the same instances, with other start values.
 
         Raises:
             FmuError: an instance cannot be opened or initialized.
         """
-        self._threads.enter_context(one_thread_meanwhile())
-        for name in self._plan.order:
-            self._members[name] = _Member(self._plan, name, open_instance(name))
-        self._threads.enter_context(one_thread_meanwhile())  # with the libraries that a component has imported
-        self._initialize()
+        self.point, self.stepping, self._look_at = 0, "", 0
+        self._plan = plan = plan or self._plan
+        with kept_state():
+            self._free_all()
+            before = {name: member for name, member in self._members.items() if member.begin_again(plan, name)}
+            self._close(name for name in self._members if name not in before)
+            self._members = before
+            self._limit_threads()
+            members: dict[str, LocalMember] = {}
+            for name in plan.order:
+                members[name] = before.get(name) or LocalMember(plan, name, open_instance(name))
+                self._members = before | members
+            self._members = members
+            self._limit_threads()  # with the libraries that a component has imported
+            self._initialize()
         self._steps = tuple((name, member.step_from) for name, member in self._members.items())
         self._looked_after = tuple((name, partial(self._look_after, step)) for name, step in self._steps)
 
@@ -144,13 +153,17 @@ class LocalSystem:
         """A function that returns the value of a variable, or of an element of an array, at the current point."""
         return self._members[instance].getter(variable)
 
-    def set(self, instance: str, variable: str, value: Value) -> None:
-        """Set an unconnected input or a tunable parameter; the next step of the instance uses it."""
-        self._members[instance].set(variable, value)
+    def setter(self, instance: str, variable: str) -> Callable[[Value], None]:
+        """A function that sets an unconnected input or a tunable parameter; the next step of the instance uses it."""
+        return self._members[instance].setter(variable)
+
+    def set(self, instance: str, values: Mapping[str, Value]) -> None:
+        """As `setter`, for several variables at once."""
+        self._members[instance].set(values)
 
     def save(self) -> SavedSystem:
         """Save the state of all instances between two points. `free` or `close` frees it."""
-        states: dict[str, _SavedMember] = {}
+        states: dict[str, SavedMember] = {}
         try:
             for name, member in self._members.items():
                 states[name] = member.save()
@@ -176,13 +189,29 @@ class LocalSystem:
 
     def close(self) -> None:
         """Free all states and close all instances. Never raises; may be called twice."""
+        if self._models is not None:
+            self._models.close()
+        with kept_state() if self._members else nullcontext():
+            self._free_all()
+            self._close(self._members)
+        self._members.clear()
+        self._threads.close()
+
+    def _free_all(self) -> None:
+        """Free all states."""
         for saved in self._kept.values():
             with suppress(FmuError):  # it has failed before, and now its memory goes anyway
                 self._free(saved)
         self._kept.clear()
-        for member in self._members.values():
-            member.instance.close()
-        self._threads.close()
+
+    def _close(self, names: Iterable[str]) -> None:
+        """Close instances, which leave their models to the next ones."""
+        for name in names:
+            self._members[name].instance.close()
+
+    def _limit_threads(self) -> None:
+        """Let the numeric libraries that are loaded by now use one thread."""
+        self._threads.limit(self._models.loads if self._models is not None else len(self._members))
 
     def _free(self, saved: SavedSystem) -> None:
         for name, own in saved.members.items():
@@ -226,201 +255,25 @@ class LocalSystem:
             for tear in loop.tears:
                 ends = tear.target, tear.input
                 c = next(c for c in self._plan.connections if (c.target_instance, c.target_name) == ends)
-                value = _at(known[c.source_instance, c.source.name], c.source_index)
+                value = element_at(known[c.source_instance, c.source.name], c.source_index)
                 brought.append(ValueChange.of_tear(tear).of(value, InitializationFailed))
             consistent = point.update(brought)
         for name, variable in point.assumed:
             members[name].settled.add(variable)
 
 
-class _SavedMember(NamedTuple):
-    """The state of one instance, its own steps done, those when something was last set, its rows, `LastValues.sent`."""
-
-    state: object
-    step: int
-    set_at: int
-    outputs: Rows
-    inputs: Rows
-    sent: Mapping[str, Sequence[int]]
-
-
 class SavedSystem(NamedTuple):
     """The state of a `LocalSystem` at a point."""
 
     point: int
-    members: Mapping[str, _SavedMember]
+    members: Mapping[str, SavedMember]
 
 
-class _Member:
-    """One instance of a `LocalSystem`.
-
-    Attributes:
-        settled: inputs that keep the values of the iteration of a loop at the start.
-        is_finite: checks a row of outputs.
-    """
-
-    def __init__(self, plan: Plan, name: str, instance: Guarded) -> None:
-        self.plan = plan.nodes[plan.node_of(name)].instance(name)
-        self.connections = [c for c in plan.connections if c.target_instance == name]
-        self.instance = instance
-        self._inputs = Ring(self.plan.input_row, 1)
-        # A slower instance reads values that are as old as its own step.
-        readers = {c.target_instance for c in plan.connections if c.source_instance == name} | {name}
-        oldest = max(plan.system.instances[reader].step_points for reader in readers)
-        self._outputs = Ring(self.plan.outputs, 1 << (2 * -(-oldest // self.plan.step_points)).bit_length())
-        self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs)
-        self._looks_at_rows = True
-        self._points = self.plan.step_points
-        self._feeds: list[_Feed] = []
-        self._set_at = -1
-        self._courses: dict[str, Course] = {}
-        self._last = LastValues((), {}, instance.description)
-        self._parameters: dict[str, str] = {}
-        self.step = 0
-        self.settled: set[str] = set()
-
-    def set_initial_inputs(
-        self, known: Mapping[tuple[str, str], Value], assumed: Mapping[tuple[str, str], Value] = MappingProxyType({})
-    ) -> None:
-        """Set every connected input whose source is known, or which has an assumed value."""
-        values: dict[str, Value] = {}
-        for c in self.connections:
-            key = (c.source_instance, c.source.name)
-            own = (c.target_instance, c.target_name)
-            if own in assumed:
-                value = assumed[own]
-            elif key in known and c.target_name not in self.settled:
-                value = _at(known[key], c.source_index)
-                value = ValueChange.of_connection(c).of(value, InitializationFailed)
-            else:
-                continue
-            if c.initial_only and self._has(c.target_name, value):
-                continue
-            if not c.target_index:
-                values[c.target.name] = value
-                continue
-            if c.target.name not in values:
-                values[c.target.name] = self.instance.get_values([c.target.name])[0]
-            row = values[c.target.name]
-            for i in c.target_index[:-1]:
-                row = _at(row, (i,))
-            assert isinstance(row, list)
-            row[c.target_index[-1]] = value
-        if values:
-            self.instance.set_values(values)
-
-    def _has(self, parameter: str, value: Value) -> bool:
-        """Whether a connected parameter has this value already; FMI 1.0 cannot set it a second time."""
-        before = self._parameters.get(parameter)
-        self._parameters[parameter] = text = repr(value)
-        return before == text
-
-    def bind(self, grid: TimeGrid, members: Mapping[str, _Member]) -> None:
-        """Prepare `step_from`: what it needs at every point is looked up here, once."""
-        self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
-        self._last = LastValues(self.plan.timeouts, self._courses, self.instance.description)
-        names = [column.name for column in self._inputs.layout.columns if column.shape or column.name in self._courses]
-        for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
-            self._inputs.put(0, name, value)  # elements that are not connected keep it
-        self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
-        self.is_finite.check_first(grid, self.instance.get_values)
-        self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
-        self._do_step = self.instance.do_step
-        for c in self.connections:
-            if c.initial_only:
-                continue
-            read, points = members[c.source_instance].reader(c.source_name)
-            lead = CouplingRule(c.delay or 0, points, self._points).lead
-            own = ValueChange.of_connection(c)
-            change: Callable[[Value], Value] | None = None
-            if (c.factor, c.offset) != (1.0, 0.0):
-                change = partial(scaled, factor=c.factor, offset=c.offset)
-            elif c.map or own.is_checked(c.source.type):
-                change = own.of
-            self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
-
-    def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
-        """See `LocalSystem.reader`."""
-        return self._outputs.reader(variable), self.plan.step_points
-
-    def step_from(self, point: int) -> None:
-        """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
-        if (point + 1) % self._points:
-            return
-        step = self.step
-        start = step * self._points
-        if self._courses or self.plan.timeouts:
-            changes = {name: course.change(step) for name, course in self._courses.items()}
-            prescribed = {name: value for name, value in changes.items() if value is not None}
-            if prescribed := prescribed | self._last.fall_back(step):
-                self._give(prescribed)
-        for read, points, lead, change, write in self._feeds:
-            value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
-            write(0, value if change is None else change(value))
-        self._do_step(step)
-        if floating_point_changed():
-            restore_floating_point()
-        if self._looks_at_rows and not self.is_finite.check(step + 1):
-            raise NotFinite("an output is not finite", instance=self.plan.name)
-        self.step = step + 1
-
-    def getter(self, name: str) -> Callable[[int], Value]:
-        """See `LocalSystem.getter`: from the row of the point, or from the model if something was set since then."""
-        variable = self.instance.description.variable_of(name)
-        assert variable is not None
-        column = Layout.of([variable]).columns[0]
-
-        def from_model(_point: int) -> Value:
-            return element_of(self.instance.get_values([column.name])[0], column, name)
-
-        if column.name not in self.plan.outputs.names:
-            return from_model
-        read = self._outputs.reader(name)
-        return lambda point: from_model(point) if self._set_at == self.step else read(point // self._points)
-
-    def set(self, name: str, value: Value) -> None:
-        """See `LocalSystem.set`."""
-        self._set_at = self.step
-        self._last.came(name, self.step)
-        self.instance.set_values({name: value})
-        if name in self._courses:
-            self._give({name: value})
-
-    def _give(self, values: Mapping[str, Value]) -> None:
-        """Give the next step values of the scenario, or of somebody instead of it: in the row of inputs, if it can."""
-        in_row = {*self._inputs.layout.names}
-        for name, value in values.items():
-            if name in in_row:
-                self._inputs.put(0, name, value)
-        if others := {name: value for name, value in values.items() if name not in in_row}:
-            self.instance.set_in_step(others)
-
-    def save(self) -> _SavedMember:
-        """See `LocalSystem.save`."""
-        rows = tuple(part.copy() for part in self._outputs.parts)
-        inputs = tuple(part.copy() for part in self._inputs.parts)
-        sent = {name: tuple(steps) for name, steps in self._last.sent.items()}
-        return _SavedMember(self.instance.get_state(), self.step, self._set_at, rows, inputs, sent)
-
-    def restore(self, saved: _SavedMember) -> None:
-        """See `LocalSystem.restore`."""
-        self.instance.set_state(saved.state)
-        self.step, self._set_at = saved.step, saved.set_at
-        self._last.sent.update((name, [*steps]) for name, steps in saved.sent.items())
-        for part, kept in zip(self._outputs.parts, saved.outputs, strict=True):
-            part[...] = kept
-        for part, kept in zip(self._inputs.parts, saved.inputs, strict=True):
-            part[...] = kept
-
-
-class _Feed(NamedTuple):
-    """How an input gets its value: ``read`` a row of the source; see `CouplingRule` for ``points`` and ``lead``."""
-
-    read: Callable[[int], Value]
-    points: int
-    lead: int
-    change: Callable[[Value], Value] | None
-    write: Callable[[int, Value], None]
+def forwarded(message: LogMessage) -> None:
+    """Give the log a message of a model."""
+    level = {"ok": logging.DEBUG, "warning": logging.WARNING}.get(message.status.lower(), logging.ERROR)
+    said = map(paragraph, (message.category, message.message))
+    log.log(level, "fmu_message instance=%s category=%s: %s", message.instance, *said)
 
 
 def opening_of(
@@ -429,11 +282,3 @@ def opening_of(
     """What the kind of an instance gets to open it; its files go into ``folder``."""
     node, description = plan.nodes[plan.node_of(name)], plan.system.instances[name].description
     return replace(opening_in(node, name, description, folder, log), showing=showing)
-
-
-def _at(value: Value, index: tuple[int, ...]) -> Value:
-    """An element of an array; the value itself if there is no index."""
-    for number in index:
-        assert isinstance(value, list)
-        value = value[number]
-    return value

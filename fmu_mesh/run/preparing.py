@@ -41,7 +41,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "planned", "planned_reset", "without_keys"]
+__all__ = ["KnownModels", "check_reset", "planned", "planned_reset", "without_keys"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -208,10 +208,19 @@ def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: 
     """
     plain = PlainConfig(configuration_of(run.loaded), run.loaded.file)
     again = planned(plain, PlanOptions(start_values=dict(start_values), allow_code=True), known=known)
+    check_reset(run, again)
+    return replace(run, loaded=again.loaded, plan=again.plan).after_resets(resets)
+
+
+def check_reset(run: RunPlan, again: RunPlan) -> None:
+    """Check that a run can be reset to another plan of the same mesh.
+
+    Raises:
+        ConfigurationError: more would change than values.
+    """
     if _without_start_values(again) != _without_start_values(run):
         text = f"mesh '{run.mesh}' cannot be reset: it would have other sizes, or a file of it has changed"
         raise ConfigurationError(text, hint="Start it again.")
-    return replace(run, loaded=again.loaded, plan=again.plan).after_resets(resets)
 
 
 def _without_start_values(run: RunPlan) -> object:

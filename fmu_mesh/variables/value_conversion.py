@@ -9,10 +9,12 @@ from __future__ import annotations
 import base64
 import binascii
 import math
+import sys
+from collections.abc import Callable
 from ctypes import c_float
 from typing import TYPE_CHECKING, Any, cast
 
-from ..text import listed, nearest
+from ..text import listed, nearest, shown
 from .model_description import Variable
 from .value_types import DTYPES, INTEGERS, PlainValue, Value, VariableType, flattened, nested
 
@@ -24,6 +26,7 @@ __all__ = [
     "MAX_TEXT_SIZE",
     "ValueRefused",
     "checked_value",
+    "checker",
     "from_plain",
     "is_finite",
     "range_of",
@@ -38,6 +41,7 @@ FINITE = "a finite number, or `not_finite: record` for its instance"
 """What is expected where a value that is NaN or infinite is refused."""
 
 _NOT_FINITE = {"NaN": math.nan, "INF": math.inf, "-INF": -math.inf}
+_LARGEST = sys.float_info.max
 _FLOAT32_MAX = (2 - 2**-23) * 2.0**127
 
 
@@ -116,6 +120,20 @@ def checked_value(plain: object, variable: Variable, said: str, *, finite: bool 
         what = "is out of its range" if refused.out_of_range else f"is no {variable.type_name} value for it"
         near = f" (did you mean '{refused.suggestion}'?)" if refused.suggestion else ""
         raise ValueRefused(f"{said} {what}; expected {refused.expected}{near}") from refused
+
+
+def checker(variable: Variable, *, finite: bool = False) -> Callable[[object], Value]:
+    """`checked_value` for one variable and many values: what depends on the variable only is looked up once."""
+    highest = _LARGEST if variable.maximum is None else min(variable.maximum, _LARGEST)
+    lowest = -_LARGEST if variable.minimum is None else max(variable.minimum, -_LARGEST)
+    is_number = variable.type == "Float64" and not variable.shape
+
+    def check(plain: object) -> Value:
+        if is_number and (isinstance(plain, float) or plain.__class__ is int) and lowest <= plain <= highest:
+            return float(plain)
+        return checked_value(plain, variable, shown(plain), finite=finite)
+
+    return check
 
 
 def to_plain(value: Value) -> PlainValue:

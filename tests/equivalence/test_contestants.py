@@ -11,7 +11,16 @@ import psutil
 import pytest
 
 from benchmarks.commands import Command, RunFailed, run_command
-from benchmarks.contestants import c_model_exchange, c_program, fmpy_model_exchange, fmu_mesh_kinds, ping_pong
+from benchmarks.contestants import (
+    c_environment,
+    c_model_exchange,
+    c_program,
+    fmpy_environment,
+    fmpy_model_exchange,
+    fmu_mesh_environment,
+    fmu_mesh_kinds,
+    ping_pong,
+)
 from benchmarks.contestants.entry import compiled
 from benchmarks.contestants.reference import rows_of
 from benchmarks.environment import Peers
@@ -139,6 +148,20 @@ def test_the_c_program_of_model_exchange_has_our_floats(place: Place) -> None:
     assert [*c_model_exchange.run(task).last.values()] == [*ours]
     theirs = [*fmpy_model_exchange.run(task).last.values()]
     assert theirs == pytest.approx([*ours], abs=1e-3)
+
+
+@needs_compiler
+@pytest.mark.parametrize("what", ["steps", "state", "values"])
+def test_an_environment_has_the_same_floats_in_c_and_fmpy(what: str) -> None:
+    task = Task(BY_NAME["environment"].system, 50, {"what": what})
+    ours = fmu_mesh_environment.run(task)
+
+    assert ours.last == c_environment.run(task).last
+    assert ours.last["cart.theta"] != 0.0 or what == "state"
+    if what != "state":
+        assert ours.last == fmpy_environment.run(task).last
+    if what == "values":
+        assert ours.last == fmu_mesh_environment.run(replace(task, options={"what": "open"})).last
 
 
 def started(tmp_path: Path, *labels: str) -> Bench:

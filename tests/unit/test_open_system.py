@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ import yaml
 from msgspec.structs import replace
 
 import fmu_mesh
-from fmu_mesh.api.open_system import System, SystemState
+from fmu_mesh.api.open_system import System
+from fmu_mesh.api.system_state import SystemState
 from fmu_mesh.errors import CallRefused, ConfigurationError, InitializationFailed, StepFailed, UnknownName
+from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 from tests.helpers import DEADLINE_S, wait_until, write_config
 from tests.planning import plan_run
@@ -119,6 +122,75 @@ def test_a_value_that_is_set_holds_from_the_next_step_on(system: System) -> None
     system.set("free.k", 1.0)
     system.step(5)
     assert system.get("free.y") == 3.0
+
+
+def test_several_values_are_set_at_once_or_none(system: System) -> None:
+    system.set_many({"free.u": 3, "free.k": np.float32(2.5)})
+    assert (system.get("free.u"), system.get("free.k")) == (3.0, 2.5)
+    system.set_many({})
+
+    for name, value, reason in (
+        ("gain.u", 1.0, "it is connected to 'pendulum'"),
+        ("free.U", 1.0, "Did you mean 'free.u'?"),
+        ("free.k", "one", "'one' is no Real value for it"),
+        ("free.k", float("nan"), "expected a finite number"),
+        ("free.k", float("inf"), "expected a finite number"),
+        ("free.k", 10**400, "expected a number"),
+    ):
+        with pytest.raises(CallRefused, match=re.escape(reason)):
+            system.set_many({"free.u": 9.0, name: value})
+    with pytest.raises(CallRefused, match="expected a mapping of values by name"):
+        system.set_many([("free.u", 9.0)])  # type: ignore[arg-type]  # what is tested
+
+    assert system.get("free.u") == 3.0
+    system.step()
+    assert system.get("free.y") == 7.5
+
+
+def test_values_set_at_once_are_one_event_of_their_fmu(
+    tmp_path: Path, event_fmu: EventFmu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where an FMU has no events, each is a call of its own, which takes less time."""
+    calls: list[list[str]] = []
+    set_values = FmuInstance.set_values
+
+    def counted(own: FmuInstance, values: Mapping[str, Any]) -> None:
+        calls.append([*values])
+        set_values(own, values)
+
+    monkeypatch.setattr(FmuInstance, "set_values", counted)
+    stairs = {"fmu": str(event_fmu("Stairs", 3)), "start_values": {"period": 0.125}}
+    with opened(tmp_path, instances={"stairs": stairs, "free": {"fmu": "Gain"}}, connections=[]) as system:
+        calls.clear()
+
+        system.set_many({"stairs.increment": 2, "free.u": 1.0, "stairs.end": 9, "free.k": 2.0})
+
+        assert calls == [["increment", "end"]]
+        assert [system.get(name) for name in ("stairs.increment", "free.u", "free.k")] == [2, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("value", [True, None, "1", [1.0], np.array([1.0]), float("nan"), 1j, "INF"])
+def test_wrong_values_are_refused_however_often(system: System, value: object) -> None:
+    system.set("free.u", 1.0)
+    for _ in range(2):
+        with pytest.raises(CallRefused, match=r"^instance free\.u: "):
+            system.set("free.u", value)
+        assert system.get("free.u") == 1.0
+
+
+@pytest.mark.parametrize("value", [2, 2.0, np.float64(2), np.float32(2), np.int32(2), np.array(2.0)])
+def test_numbers_of_every_kind_are_set_as_floats(system: System, value: object) -> None:
+    system.set("free.u", value)
+
+    assert repr(system.get("free.u")) == "2.0"
+
+
+@pytest.mark.parametrize("name", [5, None, ["free.u"], b"free.u"])
+def test_what_is_no_text_names_no_variable(system: System, name: Any) -> None:  # noqa: ANN401 what is tested
+    with pytest.raises(UnknownName):
+        system.get(name)
+    with pytest.raises(UnknownName):
+        system.set(name, 1.0)
 
 
 def test_setting_something_changes_no_other_float(tmp_path: Path) -> None:
@@ -304,6 +376,87 @@ def test_a_state_may_be_lost_on_another_thread_and_outlive_its_system(tmp_path: 
     last.close()
 
 
+# ---- from the first point again
+
+
+def test_a_reset_loads_nothing_and_leaves_the_other_systems_alone(tmp_path: Path, temporary: Path) -> None:
+    with opened(tmp_path) as system, opened(tmp_path) as other:
+        loaded, files = system._models.loads, sorted(temporary.rglob("*"))
+        for start_values in (None, {}, {"pendulum.a": 0.5}, None, {"pendulum.a": 0.7}):
+            system.set("free.u", 3.0)
+            system.step(10)
+            system.reset(start_values)
+            assert (system.point, system.get("free.u")) == (0, 0.0)
+            assert system.get("pendulum.a") == ({"pendulum.a": 1.5} | (start_values or {}))["pendulum.a"]
+
+        assert (system._models.loads, sorted(temporary.rglob("*"))) == (loaded, files)
+        assert (other.point, other.get("free.u")) == (0, 0.0)
+
+
+def test_states_stay_after_a_reset_to_a_state_only(system: System) -> None:
+    before = system.save()
+    system.reset()
+    with pytest.raises(CallRefused, match="the state is gone, because a reset has initialized the instances again"):
+        system.restore(before)
+
+    system.step(10)
+    state, angle = system.save(), system.get("pendulum.a")
+    system.reset()
+    system.restore(state)
+    assert (system.point, system.get("pendulum.a")) == (10, angle)
+
+    system.reset({"pendulum.a": 0.5})
+    with pytest.raises(CallRefused, match="the state is gone"):
+        system.restore(state)
+    before.close()
+    state.close()
+    with pytest.raises(CallRefused, match="that is not closed"):
+        system.restore(state)
+    system.restore(system.save())
+
+
+@pytest.mark.parametrize(
+    ("start_values", "reason"),
+    [
+        ({"pendulum.m": 1.0}, "unknown variable 'm' of instance 'pendulum'"),
+        ({"other.a": 1.0}, "other"),
+        ({"pendulum.a": "much"}, "'much' for the Real 'a'"),
+        ({"pendulum.l": float("nan")}, "'NaN' for 'l', which is out of its range"),
+    ],
+)
+def test_wrong_start_values_of_a_reset_change_nothing(
+    tmp_path: Path, start_values: dict[str, Any], reason: str
+) -> None:
+    mesh = fmu_mesh.load(write_config(tmp_path, **PENDULUM_AND_GAIN))
+    with mesh.open() as system:
+        system.step(5)
+        state, names = system.save(), [*start_values]
+        for _ in range(2):
+            with pytest.raises(ConfigurationError, match=re.escape(reason)) as refused:
+                system.reset(start_values)
+            with pytest.raises(ConfigurationError, match=f"^{re.escape(str(refused.value))}$"):
+                mesh.open(start_values)
+            assert system.point == 5
+        system.restore(state)
+        system.reset({name: 0.5 for name in names if name == "pendulum.a"})  # whose names are known from now on
+        with pytest.raises(ConfigurationError, match=re.escape(reason)):
+            system.reset(start_values)
+
+
+def test_start_values_of_a_reset_come_on_top_of_those_of_open(tmp_path: Path) -> None:
+    mesh = fmu_mesh.load(write_config(tmp_path, **PENDULUM_AND_GAIN))
+    with mesh.open({"pendulum.a": 0.25, "free.k": 4.0}) as system:
+        for given, expected in (
+            ({"free.k": 5.0}, (0.25, 5.0)),
+            ({"pendulum.a": 0.5}, (0.5, 4.0)),
+            (None, (0.25, 4.0)),
+        ):
+            system.reset(given)
+            assert (system.get("pendulum.a"), system.get("free.k")) == expected
+        with pytest.raises(CallRefused, match="start_values"):
+            system.reset(5)  # type: ignore[arg-type]  # what is tested
+
+
 # ---- who may call, and when
 
 
@@ -313,28 +466,30 @@ CALLS: dict[str, Callable[[System, SystemState], object]] = {
     "set": lambda system, _state: system.set("free.u", 1.0),
     "save": lambda system, _state: system.save(),
     "restore": lambda system, state: system.restore(state),
+    "set_many": lambda system, _state: system.set_many({"free.u": 1.0}),
 }
+LIVE_CALLS = CALLS | {"reset": lambda system, _state: system.reset()}
 
 
-@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("call", LIVE_CALLS)
 def test_a_closed_system_refuses_every_call_and_can_be_closed_again(system: System, call: str) -> None:
     state = system.save()
     system.close()
     system.close()
 
     with pytest.raises(CallRefused, match=f"^{call} is not possible, because the system is closed"):
-        CALLS[call](system, state)
+        LIVE_CALLS[call](system, state)
     assert system.time == 0.0
 
 
-@pytest.mark.parametrize("call", [*CALLS, "close"])
+@pytest.mark.parametrize("call", [*LIVE_CALLS, "close"])
 def test_another_thread_is_refused(system: System, call: str) -> None:
     state = system.save()
     refused: list[CallRefused] = []
 
     def call_it() -> None:
         try:
-            system.close() if call == "close" else CALLS[call](system, state)
+            system.close() if call == "close" else LIVE_CALLS[call](system, state)
         except CallRefused as error:
             refused.append(error)
 
@@ -442,6 +597,12 @@ def test_ctrl_c_ends_a_step_and_system_can_go_back_to_state(tmp_path: Path) -> N
         assert system.point >= 500
         with pytest.raises(CallRefused, match=r"because the last call was interrupted in the middle\. Restore"):
             system.get("pendulum.a")
+        system.reset()
+        assert (system.point, system.get("pendulum.a")) == (0, 1.5)
+        system.step(50)
+        assert system.get("pendulum.a") == angle
+        state = system.save()
+        system.step(1)
         system.restore(state)
         assert (system.point, system.get("pendulum.a")) == (50, angle)
         system.step(100)

@@ -126,6 +126,6 @@ def address_of(made: Function | Pointer) -> int:
     return int(_ffi.cast("uintptr_t", made))  # type: ignore[arg-type]  # it is one of cffi's own
 
 
-def memory(array: ctypes.Array[Any]) -> Pointer:
+def memory(array: Any) -> Pointer:  # noqa: ANN401 an array of ctypes or numpy
     """The memory of an array as an argument of a `cffi_function`; the pointer keeps the array alive."""
     return _ffi.from_buffer(array)

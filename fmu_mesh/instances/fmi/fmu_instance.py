@@ -210,7 +210,8 @@ class FmuInstance(ABC):
             return
         was_reset = False
         if self._live and self._state == "stepping":
-            resets = self._kept is not None and (self._kept.resets or self.description.only_once_per_process)
+            kept, only_once = self._kept, self.description.only_once_per_process
+            resets = kept is not None and not kept.is_closed and (kept.resets or only_once)
             was_reset = self._end_run(resets=resets)
         elif self._live:
             self._quietly(self._release)
@@ -319,6 +320,7 @@ class FmuInstance(ABC):
         model = self._model
         if (
             self._kept is None
+            or self._kept.is_closed
             or not self._live
             or self._state == "failed"
             or model.is_lost

@@ -131,8 +131,6 @@ class FmuLibrary(_Library):
 class _LoadedBefore:
     """Goes before FMPy's class of an FMU, which loads the library again: that gives the same one."""
 
-    component: int | None
-
     def __init__(self, library: FmuLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
         self._library = library
         self.environment = environment
@@ -142,8 +140,7 @@ class _LoadedBefore:
     def for_another(self, environment: int) -> Self:
         """The same library for another instance with an environment of its own: functions are looked up once."""
         other = copy(self)
-        other.environment = environment
-        other.component = None
+        vars(other).update(environment=environment, component=None)
         return other
 
     @property

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import chdir, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,14 +66,41 @@ class FmuToLoad(NamedTuple):
 
 
 class _Files:
-    """An extracted FMU, and the models that use it."""
+    """An extracted FMU with its library, and the models that use them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.used_by: list[LoadedFmu] = []
-        self.loaded: Any = None  # FMPy's object of the first of them
-        self.changes_process: bool | None = None
-        self.stays = False  # whether the library is never unloaded, because one of them has returned fatal
+        self._loaded: Any = None  # FMPy's object of the first of them
+        self._stays = False
+        self._changes_process: bool | None = None
+
+    def loaded(self, model: LoadedFmu, load: Callable[[], Any]) -> Any:  # noqa: ANN401 FMPy is untyped
+        """FMPy's object for a model; only that for the first one is loaded."""
+        if self._loaded is None:
+            self._loaded = load()
+            return self._loaded
+        return self._loaded.for_another(id(model))
+
+    @property
+    def changes_process(self) -> bool:
+        """See `LoadedFmu`."""
+        if self._changes_process is None:
+            self._changes_process = any(_CHANGING.fullmatch(name) for name in self._loaded.dll.imports)
+        return self._changes_process
+
+    def leave(self, model: LoadedFmu) -> None:
+        """A model is closed: the last one unloads the library and removes the files, if none has returned fatal."""
+        self._stays |= model.is_lost
+        if model in self.used_by:
+            self.used_by.remove(model)
+        if self.used_by:
+            return
+        if self._loaded is not None and not self._stays and not process_ends():
+            with suppress(FMICallException, OSError):
+                self._loaded.freeLibrary()
+        self._loaded = None
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 class LoadedFmu:
@@ -107,15 +134,15 @@ class LoadedFmu:
         """Load the library, if it is not loaded."""
         if self.calls is not None:
             return
+        functions = self._fmu.functions
+        self.calls = FmpyCalls(self._files.loaded(self, self._load), functions.values.prefix, functions.names)
+
+    def _load(self) -> Any:  # noqa: ANN401 FMPy is untyped
         functions, description = self._fmu.functions, self._fmu.description
-        if self._files.loaded is not None:
-            loaded = self._files.loaded.for_another(id(self))
-            self.calls = FmpyCalls(loaded, functions.values.prefix, functions.names)
-            return
         path = self._folder / library_name(description.model_identifier, description.fmi_version)
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
             library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
-            loaded = calling(functions.library)(
+            return calling(functions.library)(
                 library=library,
                 environment=id(self),
                 guid=description.guid,
@@ -123,16 +150,11 @@ class LoadedFmu:
                 unzipDirectory=str(self._folder),
                 instanceName=self._fmu.name,
             )
-        self._files.loaded = loaded
-        self.calls = FmpyCalls(loaded, functions.values.prefix, functions.names)
 
     @property
     def changes_process(self) -> bool:
         """See `ChangesProcess`; known once there is an instance, which may have loaded more libraries."""
-        files = self._files
-        if files.changes_process is None:
-            files.changes_process = any(_CHANGING.fullmatch(name) for name in self.calls.dll.imports)
-        return files.changes_process
+        return self._files.changes_process
 
     def instantiate(self, **arguments: object) -> None:
         """Make an instance with these arguments for FMPy, if none is there that was reset."""
@@ -171,17 +193,8 @@ class LoadedFmu:
         A process that ends anyway unloads nothing: the FMU may have left a thread or a timer, which needs the library.
         """
         self.free()
-        files, self.calls = self._files, None
-        files.stays |= self.is_lost
-        if self in files.used_by:
-            files.used_by.remove(self)
-        if files.used_by:
-            return
-        if files.loaded is not None and not files.stays and not process_ends():
-            with suppress(FMICallException, OSError):
-                files.loaded.freeLibrary()
-        files.loaded = None
-        self.remove_files()
+        self.calls = None
+        self._files.leave(self)
 
     def remove_files(self) -> None:
         """From any thread, when the process is about to be ended: remove the extracted files."""

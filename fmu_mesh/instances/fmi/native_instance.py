@@ -9,18 +9,22 @@ from __future__ import annotations
 import ctypes
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal
+
+import numpy as np
 
 from ...errors import NotFinite
 from ...rings import native
 from ...rings.native import CopyCall, MemberTable, Move, NativeStep, Span, Stage, StepKind
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
+from ...variables.model_description import Variable
+from ...variables.value_types import DTYPES, Value
 from ..instance_wrapper import of_kind
 from .buffers import NumberBuffer
-from .calls import Function, Pointer, address_of, cffi_function, pointer
+from .calls import Function, Pointer, address_of, cffi_function, memory, pointer
 from .fmu_instance import FmuInstance, FmuState
-from .fmu_values import PartCall, Verb
+from .fmu_values import WARNING, PartCall, Verb
 
 __all__ = ["NativeInstance"]
 
@@ -127,6 +131,43 @@ class NativeInstance(FmuInstance):
         size = sum(variable.size for variable in variables) if functions.sized else -1
         self._accesses = [*self._accesses, references]
         return CopyCall(function, self._component, ctypes.addressof(references), count, size)
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`."""
+        if (number := self._number("Set", name)) is None:
+            return None
+        variable, call, arguments, cell = number
+
+        def put(value: Value) -> None:
+            cell[0] = value
+            if (status := call(*arguments)) > WARNING:
+                raise self._transfer_failed("Set", variable.type, [variable], status)
+
+        return put
+
+    def getter(self, name: str) -> Callable[[], Value] | None:
+        """See `Prepares`."""
+        if (number := self._number("Get", name)) is None:
+            return None
+        variable, call, arguments, cell = number
+
+        def get() -> Value:
+            if (status := call(*arguments)) > WARNING:
+                raise self._transfer_failed("Get", variable.type, [variable], status)
+            value: Value = cell[0]
+            return value
+
+        return get
+
+    def _number(self, verb: Verb, name: str) -> tuple[Variable, Function, tuple[Any, ...], Any] | None:
+        """What sets or gets one number: a function, its arguments, and where the number is; None if it is none."""
+        variable = self._variables[name]
+        access = self.access(verb, [name]) if not variable.shape else None
+        if access is None:
+            return None
+        cell, size = np.zeros(1, DTYPES[variable.type]), (1,) if access.size >= 0 else ()
+        call = cffi_function(self._function(verb, variable.type), self._functions.values.declaration)
+        return variable, call, (self._self, pointer(access.references), 1, memory(cell), *size), cell.data
 
     def state_access(self, state: object) -> CopyCall | None:
         """See `AccessedNatively`."""

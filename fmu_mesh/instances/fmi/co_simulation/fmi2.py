@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
 
 from ....rings.native import StepKind
-from ....simtime import resolvable
+from ....rings.ring import Ring
+from ....simtime import TimeGrid, resolvable
 from ....variables.value_types import Value
 from ..calls import cffi_function
 from ..fmi_versions import Fmi2
@@ -32,6 +33,7 @@ class Fmi2Instance(NativeInstance, Fmi2):
 
     _kind = StepKind.FMI2
     _functions = FmuFunctions(FMU2Slave, Fmi2.VALUES, "fmi2FreeInstance", (*Fmi2.NEEDED, "fmi2DoStep"), Fmi2.NAMES)
+    _bound: tuple[object, ...] = ()  # what it is bound to
     _terminated = False  # whether the FMU has asked to end the simulation with the step that is complete now
 
     def advance(self, time: float, step_size: float) -> None:
@@ -47,6 +49,36 @@ class Fmi2Instance(NativeInstance, Fmi2):
         """Set variables by name; an FMU that has asked to end takes no more values (FMI 2.0, 4.2.4)."""
         if not self._terminated:
             super().set_values(values)
+
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`."""
+        if (put := super().setter(name)) is None:
+            return None
+
+        def put_before_end(value: Value) -> None:
+            if not self._terminated:
+                put(value)
+
+        return put_before_end
+
+    def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
+        """See `Instance`; with what it was bound to before, only the outputs are written."""
+        bound = inputs, tuple(outputs), grid, points
+        if bound == self._bound:
+            self._said.note(step=step)
+            self._read_outputs(step)
+            return
+        super().bind(inputs, outputs, grid, points, step)
+        self._bound = bound
+
+    def begin_again(self) -> bool:
+        """See `BeginsAgain` (fmi2Reset; FMI 2.0, 2.1.6)."""
+        if self._state != "stepping":
+            return False
+        self._state = "instantiated"
+        self._terminated, self._derivatives, self._last_messages = False, {}, []
+        self._said.note(step=-1, quiet_until=math.inf)
+        return self._end_run(resets=True)
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(**arguments)

@@ -59,6 +59,17 @@ class Fmi3Instance(NativeInstance, Fmi3):
         if not self._steps.terminated:
             self._checked(lambda: self._steps.event(self._said.time, lambda: set_values(values)))
 
+    def setter(self, name: str) -> Callable[[Value], None] | None:
+        """See `Prepares`."""
+        if (put := super().setter(name)) is None:
+            return None
+
+        def put_before_end(value: Value) -> None:
+            if not self._steps.terminated:
+                put(value)
+
+        return put_before_end
+
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """See `Instance`."""
         super().bind(inputs, outputs, grid, points, step)

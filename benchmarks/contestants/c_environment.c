@@ -1,0 +1,123 @@
+/* The limit of an environment that a program steps: one FMU with one input and one output, and nothing else.
+ *
+ *   c_environment WHAT LIBRARY GUID INPUT OUTPUT TIMES STEP_SIZE
+ *
+ * WHAT is `steps`, `state` or `values`; INPUT and OUTPUT are value references. With `steps`, each time sets the input,
+ * takes a step and reads the output, whose sign is the next input. Otherwise each time goes back to the first point and
+ * reads the output: by a state, or by fmi2Reset and an initialization in which OUTPUT has another start value. Prints
+ * the time of all in s, and the last output. */
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "fmi2FunctionTypes.h"
+
+typedef struct {
+    fmi2Component component;
+    fmi2SetRealTYPE *set;
+    fmi2GetRealTYPE *get;
+    fmi2DoStepTYPE *step;
+    fmi2ResetTYPE *reset;
+    fmi2SetupExperimentTYPE *setup;
+    fmi2EnterInitializationModeTYPE *enter;
+    fmi2ExitInitializationModeTYPE *leave;
+    fmi2SetFMUstateTYPE *set_state;
+    fmi2ValueReference input, output;
+} Instance;
+
+static void fail(const char *what) {
+    fprintf(stderr, "%s\n", what);
+    exit(1);
+}
+
+static void check(fmi2Status status, const char *what) {
+    if (status > fmi2Warning) fail(what);
+}
+
+static void no_message(fmi2ComponentEnvironment e, fmi2String i, fmi2Status s, fmi2String c, fmi2String m, ...) {
+    (void)e, (void)i, (void)s, (void)c, (void)m;
+}
+
+static void *function(void *library, const char *name) {
+    void *found = dlsym(library, name);
+    if (found == NULL) fail(name);
+    return found;
+}
+
+static void initialize(Instance *self, const double *start) {
+    check(self->setup(self->component, fmi2False, 0.0, 0.0, fmi2False, 0.0), "fmi2SetupExperiment");
+    if (start != NULL) check(self->set(self->component, &self->output, 1, start), "fmi2SetReal");
+    check(self->enter(self->component), "fmi2EnterInitializationMode");
+    check(self->leave(self->component), "fmi2ExitInitializationMode");
+}
+
+static double output(Instance *self) {
+    double value;
+    check(self->get(self->component, &self->output, 1, &value), "fmi2GetReal");
+    return value;
+}
+
+static double steps(Instance *self, long times, double step_size) {
+    double found = 0.0;
+    for (long k = 0; k < times; k++) {
+        const double value = found > 0.0 ? -1.0 : 1.0;
+        check(self->set(self->component, &self->input, 1, &value), "fmi2SetReal");
+        check(self->step(self->component, (double)k * step_size, step_size, fmi2True), "fmi2DoStep");
+        found = output(self);
+    }
+    return found;
+}
+
+static double states(Instance *self, long times, fmi2FMUstate state) {
+    double found = 0.0;
+    for (long k = 0; k < times; k++) {
+        check(self->set_state(self->component, state), "fmi2SetFMUstate");
+        found = output(self);
+    }
+    return found;
+}
+
+static double values(Instance *self, long times) {
+    double found = 0.0;
+    for (long k = 0; k < times; k++) {
+        const double start = 0.001 * (double)k;
+        check(self->reset(self->component), "fmi2Reset");
+        initialize(self, &start);
+        found = output(self);
+    }
+    return found;
+}
+
+int main(int argc, char **argv) {
+    static const fmi2CallbackFunctions callbacks = {no_message, calloc, free, NULL, NULL};
+    struct timespec from, to;
+    Instance one;
+    if (argc != 8) fail("arguments");
+    void *library = dlopen(argv[2], RTLD_NOW | RTLD_LOCAL);
+    if (library == NULL) fail(dlerror());
+    one.component = ((fmi2InstantiateTYPE *)function(library, "fmi2Instantiate"))(
+        "cart", fmi2CoSimulation, argv[3], "", &callbacks, fmi2False, fmi2False);
+    if (one.component == NULL) fail("fmi2Instantiate");
+    one.set = function(library, "fmi2SetReal"), one.get = function(library, "fmi2GetReal");
+    one.step = function(library, "fmi2DoStep"), one.reset = function(library, "fmi2Reset");
+    one.setup = function(library, "fmi2SetupExperiment");
+    one.enter = function(library, "fmi2EnterInitializationMode");
+    one.leave = function(library, "fmi2ExitInitializationMode");
+    one.set_state = function(library, "fmi2SetFMUstate");
+    one.input = (fmi2ValueReference)atol(argv[4]), one.output = (fmi2ValueReference)atol(argv[5]);
+    const long times = atol(argv[6]);
+    const double step_size = strtod(argv[7], NULL);
+    fmi2FMUstate state = NULL;
+    initialize(&one, NULL);
+    check(((fmi2GetFMUstateTYPE *)function(library, "fmi2GetFMUstate"))(one.component, &state), "fmi2GetFMUstate");
+    clock_gettime(CLOCK_MONOTONIC, &from);
+    double last;
+    if (strcmp(argv[1], "steps") == 0) last = steps(&one, times, step_size);
+    else last = strcmp(argv[1], "state") == 0 ? states(&one, times, state) : values(&one, times);
+    clock_gettime(CLOCK_MONOTONIC, &to);
+    printf("%.9f %a\n", (double)(to.tv_sec - from.tv_sec) + 1e-9 * (double)(to.tv_nsec - from.tv_nsec), last);
+    return 0;
+}
