@@ -42,7 +42,8 @@ def test_a_stage_that_there_is_not_is_refused() -> None:
 
     assert (done.returncode, done.stderr) == (
         2,
-        "zenohd is no stage; there are: bridge browser cuts gazebo kills live_data ros slurm tsan zenoh_bridge\n",
+        "zenohd is no stage; there are: "
+        "bridge browser cuts gazebo kills learning live_data ros slurm tsan zenoh_bridge\n",
     )
 
 
