@@ -184,7 +184,21 @@ def test_an_fmu_that_asked_to_end_begins_again(
             assert rows_of(system) == expected
 
 
-@pytest.mark.parametrize("solver", ["cvode", "dopri5"])
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_what_is_stiff_is_found_out_anew_after_a_reset(
+    version: int, tmp_path: Path, event_fmu: Callable[..., Path]
+) -> None:
+    fmu = {"fmu": str(event_fmu("Heater", version)), "kind": "model_exchange", "start_values": {"late": 0.12}}
+    with System(plan_of(tmp_path, {"one": fmu, **integrators()}, ["first.y -> one.u"])) as system:
+        expected = rows_of(system)
+        for points in (17, 40, 40):
+            system.reset()
+            assert rows_of(system, points) == expected[: points + 1]
+        system.reset({"one.late": 0.0})
+        assert rows_of(system)[-1] != expected[-1]
+
+
+@pytest.mark.parametrize("solver", ["auto", "cvode", "dopri5"])
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_model_exchange_begins_again_with_each_solver(
     version: int, solver: str, tmp_path: Path, event_fmu: Callable[..., Path]
