@@ -76,7 +76,7 @@ def main() -> None:
 def track(seed: int) -> Tracked:
     """Measure a pendulum, and track it."""
     random = np.random.default_rng(seed)
-    mesh = fmu_mesh.load(Path(__file__).with_name("pendulum.yaml"))
+    mesh = fmu_mesh.load(Path(__file__).with_name("tracked_pendulum.yaml"))
     times, true = real(mesh)
     measured = true[:, 0] + random.normal(0.0, NOISE, len(times))
     ensemble = GUESS + SPREAD * random.standard_normal((MEMBERS, len(STATE)))

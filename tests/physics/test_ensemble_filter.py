@@ -49,7 +49,7 @@ def test_one_seed_gives_the_same_floats_again() -> None:
 
 
 def test_without_measurements_a_member_moves_as_its_own_run_does() -> None:
-    mesh = fmu_mesh.load(FOLDER / "pendulum.yaml")
+    mesh = fmu_mesh.load(FOLDER / "tracked_pendulum.yaml")
     members = TRACK.GUESS + TRACK.SPREAD * np.random.default_rng(1).standard_normal((3, 3))
 
     with mesh.batch(3) as batch:
