@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 
 from ..awake import AwakeClock
-from ..errors import DeadlineExceeded, InitializationFailed
+from ..errors import DeadlineExceeded, InitializationFailed, ProtocolBroken
 from ..rings.array_elements import element_of, merged
 from ..rings.value_change import ValueChange
 from ..simtime import ENDLESS
@@ -39,14 +39,14 @@ Key = tuple[str, str]
 class Initialization:
     """Sets inputs and gets outputs while all instances of a node are in Initialization Mode.
 
-    ``wait`` waits for a message for at most this time in s, and handles it. The ``out_links`` are those that are needed
-    only during Initialization Mode.
+    ``wait`` waits for a message for at most this time in s, and handles it; None: there are no other nodes. The
+    ``out_links`` are those that are needed only during Initialization Mode.
     """
 
-    def __init__(self, plan: NodePlan, wait: Callable[[float], None]) -> None:
+    def __init__(self, plan: NodePlan, wait: Callable[[float], None] | None = None) -> None:
         self.out_links: list[OutLink] = []
         self._plan = plan
-        self._wait = wait
+        self._wait = wait or _nothing_comes
         self._columns: dict[Key, Column] = {}
         self._levels: dict[Key, int] = {}
         for link in plan.links_in:
@@ -218,3 +218,8 @@ class Initialization:
 
 def _outputs_at(runner: Runner, level: int) -> list[str]:
     return [name for name, own in runner.plan.initialization.items() if own == level]
+
+
+def _nothing_comes(_left_s: float) -> None:
+    """In the place of a wait for other nodes."""
+    raise ProtocolBroken("an initial value has no source in this process")

@@ -26,6 +26,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
+from ..instances.call_guard import Unwatched
 from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import SharedModels
 from ..instances.process_state import ProcessState
@@ -36,14 +37,15 @@ from ..node.inputs import TimedInputs
 from ..rings import native
 from ..rings.native import BurstEnd
 from ..system.memory_map import MemoryMap, RingPlace, map_memory
-from ..system.plan import Plan, make_plan
+from ..system.plan import Plan
 from ..system.process_sharing import SharedProcess
 from ..text import listed
 from ..variables.value_types import DTYPES, is_text
+from .hosted_system import IN_ONE_NODE, HostedSystem, in_one_node
 from .local_system import opening_of
 from .one_process import claims_in
 from .run_plan import RunPlan
-from .system_copy import IN_ONE_NODE, Overrides, SavedCopy, SystemCopy, Verb
+from .system_copy import Overrides, SavedCopy, SystemCopy, Verb
 from .threads import one_thread_meanwhile
 
 __all__ = ["Copies"]
@@ -75,8 +77,7 @@ class Copies:
     def __init__(self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None]) -> None:
         self.errors: dict[int, FmuMeshError] = {}
         self._run = run
-        self._plan = plan = _in_one_node(run.plan)
-        self._node = plan.nodes[IN_ONE_NODE]
+        self._plan = plan = in_one_node(run.plan, window=1)
         self._last = plan.grid.last_point
         self._places = _rings_of(plan)
         self._folder, self._log = folder, log
@@ -110,8 +111,8 @@ class Copies:
         self._check_sharing()
         self._threads.enter_context(one_thread_meanwhile())
         for number in range(len(self._table)):
-            self._copies.append(SystemCopy(self._node, self._places, self._opened))
-            self._begin(number, {})
+            self._copies.append(SystemCopy(self._system))
+            self._begin(number, {}, is_new=False)
             ready(number + 1)
         self._threads.enter_context(one_thread_meanwhile())  # with the libraries that components have imported
 
@@ -335,8 +336,8 @@ class Copies:
             if self._back is not None:
                 self._back.forget(number)
             self._ended[number] = True
-            copy.close()
-            self._begin(number, overrides(number) if overrides is not None else {})
+            is_new = isinstance(self.errors.get(number), FmuError)
+            self._begin(number, overrides(number) if overrides is not None else {}, is_new=is_new)
             if overrides is None and self.why_not_saved is None:
                 self._note_first(number)
 
@@ -349,9 +350,9 @@ class Copies:
             self._back = self._back or _WaysBack(len(self._copies), len(calls), len(keeps))
             self._back.note(number, *by_calls)
 
-    def _begin(self, number: int, overrides: Overrides) -> None:
+    def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
         copy = self._copies[number]
-        copy.begin(overrides)
+        copy.begin(overrides, is_new=is_new)
         if isinstance(copy.engine, BurstEngine):
             self._table[number] = copy.engine.as_copy()
         for key, accesses in self._accesses.items():
@@ -388,6 +389,10 @@ class Copies:
                     raise NotInOneProcess(
                         why, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
                     )
+
+    def _system(self) -> HostedSystem:
+        """The system of one copy; this object looks after the state of the process."""
+        return HostedSystem(self._plan, Unwatched(), self._opened, self._log, alone=True, places=self._places)
 
     def _opened(self, name: str) -> Instance:
         opening = opening_of(self._plan, name, self._folder, self._log, self._run.showing)
@@ -429,14 +434,6 @@ class _WaysBack:
         reached = native.library.copies_restore(*addresses, self._count, every.ctypes.data)
         back[reached:] = False
         return back
-
-
-def _in_one_node(plan: Plan) -> Plan:
-    """The plan of the same system with all instances in one node."""
-    system = plan.system
-    config = replace(system.config, simulation=replace(system.config.simulation, window=1))
-    instances = {name: replace(own, node=IN_ONE_NODE) for name, own in system.instances.items()}
-    return make_plan(replace(system, config=config, instances=instances))
 
 
 def _rings_of(plan: Plan) -> tuple[MemoryMap, Mapping[str, RingPlace]]:

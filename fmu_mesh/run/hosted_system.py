@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Literal
+from typing import Final
 
 from msgspec.structs import replace
 
-from ..errors import ProtocolBroken
-from ..instances.call_guard import CallWatch, Guarded
+from ..instances.call_guard import CallWatch, Guarded, Unwatched
 from ..instances.contract import Instance, LogMessage
 from ..instances.process_state import ProcessState
 from ..node.burst_engine import make_engine
@@ -24,13 +23,16 @@ from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..system.layout import row_bytes
+from ..system.memory_map import MemoryMap, RingPlace
 from ..system.plan import Plan, make_plan
 from ..variables.value_types import PlainValue
-from .run_plan import RunPlan
 
-__all__ = ["HostedSystem"]
+__all__ = ["IN_ONE_NODE", "HostedSystem", "in_one_node"]
 
-_NODE = "instances"
+IN_ONE_NODE: Final = "instances"
+"""The node with all instances."""
+
+
 # Of rows that are wider, a few are in memory.
 _WIDE_ROW_BYTES = 2**20
 
@@ -44,48 +46,43 @@ class HostedSystem:
     of the process is then looked after once in each later run, and the floating-point mode still after each call.
 
     Args:
-        run: the plan; its nodes and its window are not used.
-        files: how many of its result files are written.
-        watch: watches all calls.
-        open_instance: opens the instance with this name in this plan.
+        plan: a plan of `in_one_node`.
+        watch: watches all calls, if somebody does.
+        open_instance: opens the instance with this name.
         log: called with what inputs over time warn of.
         alone: whether nothing else in this process changes its state between the runs, so that it is looked after as
             between steps: several times a second, and not once in each run.
+        places: where the rings are in memory, if not as in the plan.
 
     Attributes:
-        plan: the plan of the same system with all instances in one node.
+        plan: the plan.
         runners: the instances, by name.
         loads: whether the next `open` opens instances, and does not use those that are there.
     """
 
     def __init__(  # noqa: PLR0913  what a system needs of its surroundings
         self,
-        run: RunPlan,
-        files: int,
-        watch: CallWatch,
-        open_instance: Callable[[Plan, str], Instance],
+        plan: Plan,
+        watch: CallWatch | Unwatched,
+        open_instance: Callable[[str], Instance],
         log: Callable[[LogMessage], None],
         *,
         alone: bool,
+        places: tuple[MemoryMap, Mapping[str, RingPlace]] | None = None,
     ) -> None:
-        self.plan = _in_one_node(run.plan, files)
-        self.node = self.plan.nodes[_NODE]
-        self.memory = HostMemory.private(self.node.memory, _NODE)
+        self.plan = plan
+        self.node = node = plan.nodes[IN_ONE_NODE]
+        map_, self._places = places or (node.memory, {place.instance: place for place in node.rings})
+        self.memory = HostMemory.private(map_, IN_ONE_NODE)
         self.runners: dict[str, Runner] = {}
         self.loads = True
-        self.watch = watch
-        self._made_for = run, files
+        self._watch = watch
         self._open_instance, self._log = open_instance, log
         self._instances: list[Guarded] = []
         self._engine: Engine | None = None
         self._alone = alone
         self._state: ProcessState | None = None
         self._begins_again = True
-
-    def fits(self, run: RunPlan, files: int, watch: CallWatch) -> bool:
-        """Whether it can take a run of this plan, which is the same object, with so many result files."""
-        own, own_files = self._made_for
-        return not self.loads and own is run and own_files == files and self.watch is watch
 
     def open(self) -> None:
         """Open all instances; after `end`, they begin again.
@@ -100,11 +97,10 @@ class HostedSystem:
                 instance.run_again()
             return
         node = self.node
-        places = {place.instance: place for place in node.rings}
         for item in node.instances:
-            instance = Guarded(item.name, partial(self._open_instance, self.plan, item.name), self.watch, node.timeouts)
+            instance = Guarded(item.name, partial(self._open_instance, item.name), self._watch, node.timeouts)
             self._instances.append(instance)
-            place = places[item.name]
+            place = self._places[item.name]
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
             self._begins_again = self._begins_again and timed is instance and instance.runs_again
@@ -121,7 +117,7 @@ class HostedSystem:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
-        Initialization(node, _nothing_comes).run(self.runners.values(), start_values, again=engine is not None)
+        Initialization(node).run(self.runners.values(), start_values, again=engine is not None)
         if engine is None:
             units = [[self.runners[name] for name in names] for names in node.units]
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
@@ -136,7 +132,7 @@ class HostedSystem:
         if not self._begins_again:
             return False
         state = self._state or (None if self._alone else ProcessState())
-        with self.watch.surviving(", ".join(self.plan.order)):
+        with self._watch.surviving(", ".join(self.plan.order)):
             ended = [instance.end_run() for instance in reversed(self._instances)]
         self.loads = not all(ended) or (state is not None and state.restore())
         return not self.loads
@@ -155,16 +151,14 @@ class HostedSystem:
         self._engine = None
 
 
-def _in_one_node(plan: Plan, files: int) -> Plan:
-    """The plan of the same system with all instances in one node and the first ``files`` result files."""
+def in_one_node(plan: Plan, files: int | None = None, window: int | None = None) -> Plan:
+    """The plan of the same system with all instances in one node, and the first ``files`` result files; None: all.
+
+    Without a window, it is as large as the memory for rows allows.
+    """
     system = plan.system
     rows = [row_bytes(item.outputs) for node in plan.nodes.values() for item in node.instances]
-    window: int | Literal["auto"] = 1 if max(rows, default=0) > _WIDE_ROW_BYTES else "auto"
-    config = replace(system.config, simulation=replace(system.config.simulation, window=window))
-    instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
+    chosen = window or (1 if max(rows, default=0) > _WIDE_ROW_BYTES else "auto")
+    config = replace(system.config, simulation=replace(system.config.simulation, window=chosen))
+    instances = {name: replace(own, node=IN_ONE_NODE) for name, own in system.instances.items()}
     return make_plan(replace(system, config=config, instances=instances, records=system.records[:files]))
-
-
-def _nothing_comes(_left_s: float) -> None:
-    """In the place of a wait for other nodes."""
-    raise ProtocolBroken("an initial value has no source in this process")

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
+from operator import is_
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -47,7 +48,7 @@ from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..system.plan import Plan
 from ..variables.value_types import PlainValue
-from .hosted_system import HostedSystem
+from .hosted_system import HostedSystem, in_one_node
 from .local_system import opening_of
 from .one_process import OneProcess
 from .outcome import Outcome, outcome_at
@@ -117,6 +118,7 @@ class RepeatedRuns:
         self._thread = 0
         self._run: _Run | None = None
         self._system: HostedSystem | None = None
+        self._made_for: tuple[object, ...] = ()
         self._stop: str | None = None
 
     def run(
@@ -143,7 +145,7 @@ class RepeatedRuns:
                 self._run = current = _Run(system, writer, self._around)
                 if self._stop is not None:
                     current.interrupt(self._stop)
-                return current.run(start_values, self._threads)
+                return current.run(start_values, self._watch_here(), self._threads)
         finally:
             self._stop = None
             if self._system is None or self._system.loads:
@@ -200,7 +202,8 @@ class RepeatedRuns:
     def _system_for(self, run: RunPlan, files: int) -> HostedSystem:
         """That of the run before, if it can begin again with this plan."""
         watch, system, around = self._watch_here(), self._system, self._around
-        if system is not None and system.fits(run, files, watch):
+        made_for = run, files, watch
+        if system is not None and not system.loads and all(map(is_, made_for, self._made_for)):
             return system
         if system is not None:
             system.close()
@@ -209,14 +212,16 @@ class RepeatedRuns:
         if around.open_instance is None:
             self._process.check(run.plan, run.contents)
 
-        def opened(plan: Plan, name: str) -> Instance:
+        plan = in_one_node(run.plan, files)
+
+        def opened(name: str) -> Instance:
             if around.open_instance is not None:
                 return around.open_instance(name)
             around.scratch.mkdir(mode=0o700, exist_ok=True)
             opening = opening_of(plan, name, around.scratch, around.log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
-        self._system = HostedSystem(run, files, watch, opened, around.log, alone=self._alone)
+        self._system, self._made_for = HostedSystem(plan, watch, opened, around.log, alone=self._alone), made_for
         return self._system
 
     def _remove_scratch(self) -> None:
@@ -284,7 +289,9 @@ class _Run:
         """The deadlines."""
         return self._node.timeouts
 
-    def run(self, start_values: Mapping[str, Mapping[str, PlainValue]], threads: LimitedThreads) -> Outcome:
+    def run(
+        self, start_values: Mapping[str, Mapping[str, PlainValue]], watch: CallWatch, threads: LimitedThreads
+    ) -> Outcome:
         """See `RepeatedRuns.run`."""
         system = self._system
         with ExitStack() as stack:
@@ -298,7 +305,7 @@ class _Run:
             self.writer.begin(self._plan, self._runners)
             stack.callback(self._write_rest, engine)
             started = time.perf_counter()
-            with system.watch.stepping(self._position, self._node.timeouts.step):
+            with watch.stepping(self._position, self._node.timeouts.step):
                 self._step_to_the_end(engine, system.memory)
             self._seconds = time.perf_counter() - started
             if self._first is not None and isinstance(self._first[1], FmuError):

@@ -8,34 +8,25 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
-from typing import Any, Final, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import FmuError, FmuMeshError, ProtocolBroken
-from ..instances.call_guard import Guarded, Unwatched
-from ..instances.contract import AccessedNatively, Instance, KeepsState, StepsNatively
-from ..node.burst_engine import BurstEngine, make_engine
+from ..instances.contract import AccessedNatively, KeepsState, StepsNatively
+from ..node.burst_engine import BurstEngine
 from ..node.engine import Engine, PlainEngine
-from ..node.initialization import Initialization
-from ..node.inputs import TimedInputs, set_input, with_times
-from ..node.stepping import Runner, connect
+from ..node.inputs import TimedInputs, set_input
+from ..node.stepping import Runner
 from ..rings import native
-from ..rings.host_memory import HostMemory
 from ..rings.native import BurstEnd
-from ..system.memory_map import MemoryMap, RingPlace
-from ..system.plan import NodePlan
-from ..variables.value_types import Value
+from ..variables.value_types import PlainValue, Value
+from .hosted_system import HostedSystem
 
-__all__ = ["IN_ONE_NODE", "Overrides", "SavedCopy", "SystemCopy", "Verb"]
-
-IN_ONE_NODE: Final = "instances"
-"""The node with all instances."""
+__all__ = ["Overrides", "SavedCopy", "SystemCopy", "Verb"]
 
 Verb = Literal["Get", "Set"]
-Overrides = Mapping[str, Mapping[str, Value]]
+Overrides = Mapping[str, Mapping[str, PlainValue]]
 
 
 class SavedCopy(NamedTuple):
@@ -49,47 +40,42 @@ class SavedCopy(NamedTuple):
 class SystemCopy:
     """One copy: its memory, its instances and what steps them."""
 
-    def __init__(
-        self, node: NodePlan, places: tuple[MemoryMap, Mapping[str, RingPlace]], opened: Callable[[str], Instance]
-    ) -> None:
-        self._node, self._opened = node, opened
-        self._map, self._places = places
-        self.runners: dict[str, Runner] = {}
+    def __init__(self, made: Callable[[], HostedSystem]) -> None:
+        self._made = made
+        self._system = made()
         self.engine: Engine
 
-    def begin(self, overrides: Overrides) -> None:
-        """Open new instances and initialize them; then they are at point 0.
+    @property
+    def runners(self) -> dict[str, Runner]:
+        """The instances, by name."""
+        return self._system.runners
 
-        These start values, by instance and variable, stand in the place of those of the plan.
+    def begin(self, overrides: Overrides, *, is_new: bool) -> None:
+        """Initialize all instances; then they are at point 0. Those that cannot begin again are opened anew.
+
+        Args:
+            overrides: start values by instance and variable, in the place of those of the plan.
+            is_new: whether nothing of what is there can be used again.
+
+        Raises:
+            FmuError: an instance cannot be opened or initialized.
         """
-        node, memory = self._node, HostMemory.private(self._map, IN_ONE_NODE)
-        guards: list[Instance] = []
+        if is_new or (self._system.runners and not self._system.end()):
+            self._system.close()
+            self._system = self._made()
         try:
-            for item in node.instances:
-                own = overrides.get(item.name)
-                plan = replace(item, start_values=item.start_values | dict(own)) if own else item
-                guards.append(Guarded(item.name, partial(self._opened, item.name), Unwatched(), node.timeouts))
-                timed = with_times(guards[-1], plan, node.grid, lambda _message: None)
-                place = self._places[item.name]
-                ring, counter = memory.ring(place), memory.counter(place.counter)
-                self.runners[item.name] = Runner(plan, timed, node.grid, ring, counter)
-            connect(node, self.runners, memory, memory)
-            Initialization(node, _nothing_comes).run(self.runners.values())
-            units = [[self.runners[name] for name in names] for names in node.units]
-            self.engine = make_engine(node, units, memory, spins=False)
-            for runner in self.runners.values():
-                runner.begin()
-            memory.grant.raise_to(node.grid.last_point)
+            self._system.open()
+            self.engine = self._system.begin(overrides)
         except BaseException:
-            for guarded in guards:
-                guarded.close()
-            self.runners.clear()
+            self._system.close()
+            self._system = self._made()
             raise
+        self._system.memory.grant.raise_to(self._system.plan.grid.last_point)
 
     @property
     def point(self) -> int:
         """Without the library: the last point that all instances have reached."""
-        return min(self.engine.covered, self._node.grid.last_point)
+        return min(self.engine.covered, self._system.plan.grid.last_point)
 
     def step_to(self, goal: int) -> None:
         """Without the library: step to a point."""
@@ -205,17 +191,9 @@ class SystemCopy:
 
     def close(self) -> None:
         """Close all instances. May be called twice."""
-        for runner in self.runners.values():
-            runner.instance.close()
-            runner.follow(native.MemberTable())
-        self.runners.clear()
+        self._system.close()
 
 
 def _texts(runner: Runner) -> Collection[NDArray[Any]]:
     rings = (runner.outputs, runner.inputs)
     return [part for ring in rings for part in ring.parts if part.dtype.hasobject]
-
-
-def _nothing_comes(_left_s: float) -> None:
-    """In the place of a wait for other nodes."""
-    raise ProtocolBroken("an initial value has no source in this process")
