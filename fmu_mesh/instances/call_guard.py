@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from typing import Any, Final, TypeVar, cast
 
 import msgspec
@@ -300,6 +301,7 @@ class Guarded(AroundNativeSteps):
         self._running = False
         self._careful = False
         self._trusted = is_harmless
+        self._is_watched = not isinstance(watch, Unwatched)
         with watch.calling(name, LoadFailed, "call", timeouts.call), self._kept():
             super().__init__(open_())
         self.runs_again = isinstance(self._instance, RunsAgain) and self._instance.runs_again
@@ -369,13 +371,13 @@ class Guarded(AroundNativeSteps):
         """See `Prepares`; nothing is prepared where calls are watched."""
         own = self._preparing
         put = own.setter(name) if own is not None else None
-        return self._with_kept_mode(put) if put is not None else None
+        return partial(self._forward, put) if put is not None else None
 
     def getter(self, name: str) -> Callable[[], Value] | None:
         """See `setter`."""
         own = self._preparing
         get = own.getter(name) if own is not None else None
-        return self._with_kept_mode(get) if get is not None else None
+        return partial(self._forward, get) if get is not None else None
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
@@ -391,24 +393,19 @@ class Guarded(AroundNativeSteps):
     @property
     def _preparing(self) -> Prepares | None:
         own = self._instance
-        return own if isinstance(own, Prepares) and isinstance(self._watch, Unwatched) else None
-
-    def _with_kept_mode(self, call: Callable[..., Result]) -> Callable[..., Result]:
-        """As `_forward` between two steps, in less time."""
-
-        def kept(*arguments: Any) -> Result:  # noqa: ANN401 those of the call
-            if self._careful:
-                return self._forward(call, *arguments)
-            was_changed = floating_point_changed()
-            try:
-                return call(*arguments)
-            finally:
-                if not was_changed and floating_point_changed():
-                    restore_floating_point()
-
-        return kept
+        return own if isinstance(own, Prepares) and not self._is_watched else None
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
+        if self._careful or self._is_watched or not (self._running or self._trusted):
+            return self._looked_after(call, *arguments)
+        was_changed = floating_point_changed()
+        try:
+            return call(*arguments)
+        finally:
+            if not was_changed and floating_point_changed():
+                restore_floating_point()
+
+    def _looked_after(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 as above
         if self._running:
             watched = self._watch.calling(self._name, StepFailed, "step", self._timeouts.step)
         else:

@@ -39,6 +39,7 @@ __all__ = [
     "Gate",
     "HeardTable",
     "IncomingTable",
+    "Keep",
     "Last",
     "Lookup",
     "MemberTable",
@@ -404,6 +405,11 @@ class CopyTable(Structure):
 @_declared("CopyCall")
 class CopyCall(Structure):
     """A getter or setter of one copy, for one variable."""
+
+
+@_declared("Keep")
+class Keep(Structure):
+    """Memory of a copy, and what it has to be again."""
 
 
 @_declared("CopyOutput")

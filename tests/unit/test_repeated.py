@@ -211,6 +211,30 @@ def test_models_with_events_of_all_versions_give_the_same_bytes(
 @ENGINES
 @RESETS
 @pytest.mark.usefixtures("_engine")
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_each_run_finds_out_anew_whether_a_model_is_stiff(
+    tmp_path: Path, event_fmu: Callable[..., Path], version: int, *, reset: bool
+) -> None:
+    heater = {"fmu": str(event_fmu("Heater", version)), "kind": "model_exchange"}
+    connection: Any = {"from": "one.F", "to": "two.u", "factor": 0.1}
+    config = write_config(
+        tmp_path,
+        instances={"one": heater, "two": heater},
+        connections=[connection],
+        simulation={"step_size": 0.1},
+        stop_time=3.0,
+    )
+    late = [{"one.late": start, "two.late": 1.0} for start in (0.0, 1.05, 100.0)]
+
+    with repeating(tmp_path, reset=reset) as runs:
+        expected = assert_equal(runs, plans_of(config, late))
+
+    assert len({rows for rows, _ in expected}) == len(late)
+
+
+@ENGINES
+@RESETS
+@pytest.mark.usefixtures("_engine")
 @pytest.mark.parametrize("name", ["AllTypes", "AllTypes1", "AllTypes3"])
 def test_all_types_and_texts_give_the_same_bytes(tmp_path: Path, name: str, *, reset: bool) -> None:
     model = {"fmu": str(find_fmu(name, tmp_path))}
