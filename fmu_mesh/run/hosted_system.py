@@ -140,7 +140,7 @@ class HostedSystem:
     def close(self) -> None:
         """Close all instances, and free the memory. May be called twice."""
         self.loads = True
-        if self._engine is not None:
+        if self._alone and self._engine is not None:  # elsewhere each run has looked, and the program goes on
             self._engine.look_after()
         for instance in reversed(self._instances):
             instance.close()

@@ -106,7 +106,7 @@ def run_variants(task: bytes, functions: OwnReductions, variants: Sequence[Varia
 
     Called in a worker, by whichever executor.
     """
-    return _mine.loaded_for(task).rows(variants, functions)
+    return _mine.loaded_for(task, functions).rows(variants, functions)
 
 
 class _Mine(threading.local):
@@ -115,9 +115,10 @@ class _Mine(threading.local):
     def __init__(self) -> None:
         self._loaded: _Loaded | None = None
 
-    def loaded_for(self, task: bytes) -> _Loaded:
+    def loaded_for(self, task: bytes, functions: OwnReductions) -> _Loaded:
         if self._loaded is None or self._loaded.task != task or self._loaded.hung.stuck:
-            self._loaded = _Loaded(task)
+            alone = parent_process() is not None and not functions  # those of a user may change what they like
+            self._loaded = _Loaded(task, alone=alone)
         return self._loaded
 
 
@@ -127,7 +128,7 @@ _mine = _Mine()
 class _Loaded:
     """The models of a sweep in this process, and the thread that runs them; it ends with this object."""
 
-    def __init__(self, task: bytes) -> None:
+    def __init__(self, task: bytes, *, alone: bool) -> None:
         self.task = task
         self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
         self._reductions = [read_reduction(text) for text in self._task.reductions]
@@ -142,7 +143,7 @@ class _Loaded:
         weakref.finalize(self, os.close, self._memory)
         self._bytes = 0
         self._started = 0.0
-        work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset)
+        work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset, alone=alone)
         threading.Thread(target=work, name="variants", daemon=True).start()
         weakref.finalize(self, self._jobs.put, None)
 
@@ -267,10 +268,9 @@ class _Hung:
         self.ended.set_result(end)
 
 
-def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool) -> None:
+def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool, alone: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
     own = mesh.from_configuration(mesh.configuration, keeps_code=True)
-    alone = parent_process() is not None  # a thread of a program is not
     with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, alone=alone, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
             run_all, ended = job

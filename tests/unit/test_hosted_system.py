@@ -135,6 +135,19 @@ def test_another_file_of_a_model_is_loaded_by_the_next_run(tmp_path: Path) -> No
             runs.run(start_values={"pendulum.d": 0.2})
 
 
+def test_a_program_may_change_its_folder_between_two_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = fmu_mesh.load(write_config(tmp_path))
+
+    with mesh.repeated() as runs:
+        for number in range(3):
+            (own := tmp_path / f"{number}").mkdir()
+            monkeypatch.chdir(own)
+            runs.run(start_values={"pendulum.d": 0.1 * number}, stop_time=0.1)
+            assert Path.cwd() == own
+        monkeypatch.chdir(tmp_path)
+    assert Path.cwd() == tmp_path
+
+
 def test_after_a_failure_the_next_run_opens_all_instances(faulty: Path, tmp_path: Path, opened: list[bool]) -> None:
     config = write_config(tmp_path, instances={"f": {"fmu": str(faulty)}}, connections=[], stop_time=0.01)
     mesh = fmu_mesh.load(config)
