@@ -32,7 +32,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     ),
     "fmi3": ("float64_out -> float64_in", "int32_out -> int32_in", "boolean_out -> boolean_in"),
     "model_exchange": ("x -> u",),
-    "model_exchange_in_c": ("x -> u",),
+    "model_exchange_dopri5": ("x -> u",),
+    "model_exchange_cvode": ("x -> u",),
     "component": ("y -> u",),
 }
 """The connections between two instances of each kind."""
@@ -60,8 +61,9 @@ def _instance(kind: str) -> dict[str, Any]:
     if kind == "component":
         return {"python": f"{_ROOT / 'benchmarks' / 'models' / 'doubling.py'}:Doubling"}
     if kind.startswith("model_exchange"):
-        solver = {"name": "dopri5" if kind == "model_exchange_in_c" else "cvode"}
-        return {"fmu": str(build_event_fmu("Oscillator", 2, BUILT)), "kind": "model_exchange", "solver": solver}
+        solver = kind.removeprefix("model_exchange").removeprefix("_") or "auto"
+        oscillator = str(build_event_fmu("Oscillator", 2, BUILT))
+        return {"fmu": oscillator, "kind": "model_exchange", "solver": {"name": solver}}
     return {"fmu": str(build(_ROOT / "tests" / "fmus" / "src" / _MODELS[kind], BUILT))}
 
 

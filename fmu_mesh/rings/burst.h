@@ -121,7 +121,7 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
 
 /* ---- model exchange: see model_exchange.c */
 
-enum Solved { AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON }; /* Equations.result */
+enum Solved { AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON, TOO_STIFF, LEFT }; /* Equations.result */
 
 typedef struct { /* the equations of an FMU for model exchange, and their solver */
   int64_t kind;
@@ -147,12 +147,14 @@ typedef struct { /* the equations of an FMU for model exchange, and their solver
   int64_t steps, rejected;
   int64_t stiff, not_stiff; /* steps in a row that were so; see `count_stiff` */
   int64_t doubted;          /* whether the user knows that the model is stiff */
+  int64_t leaves;           /* whether another solver takes over a model that is stiff */
   const Call *setters;      /* of held inputs, which are values in a row */
   int64_t n_setters;
   const char *row; /* the inputs of the step, and those that the model has */
   char *held;
   int64_t row_bytes, is_held;
   int64_t result, terminated; /* terminated: the FMU has asked to end the simulation */
+  void *vector_data;          /* N_VGetArrayPointer of SUNDIALS, where CVode is the solver */
 } Equations;
 
 int equations_step(Equations *own, double end);
@@ -291,6 +293,12 @@ typedef struct { /* an output in the rows of one copy: `place` in bytes */
   const Member *member;
   int64_t place;
 } CopyOutput;
+
+typedef struct { /* memory of a copy, and what it has to be again */
+  void *memory;
+  const void *kept;
+  int64_t size;
+} Keep;
 
 enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* why node_run returns */
 

@@ -43,10 +43,15 @@ class LibraryFunctions:
         self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
         self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
         self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
+        by_cvode = CFUNCTYPE(ctypes.c_int, c_double, address, address, address)
+        self.equations_derivatives = by_cvode(("equations_derivatives", slow))
+        self.equations_indicators = by_cvode(("equations_indicators", slow))
         self.copies_step = CFUNCTYPE(c_int64, address, c_int64)(("copies_step", slow))
         called = (address, c_int64, address, address, c_int64)
         self.copies_call = CFUNCTYPE(c_int64, *called)(("copies_call", slow))
         read = (address, address, c_int64, c_int64, address, c_int64)
+        restored = (address, c_int64, address, c_int64, c_int64, address)
+        self.copies_restore = CFUNCTYPE(c_int64, *restored)(("copies_restore", slow))
         self.copies_read = CFUNCTYPE(None, *read)(("copies_read", slow))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
         self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))
@@ -82,7 +87,8 @@ def why_no_library() -> str | None:
     if why is None:
         return None
     return (
-        f"not used: {why}. Results are the same, and steps are slower. See 'The library of C' in docs/installation.md."
+        f"not used: {why}. Steps are slower. Results are the same, except with `solver: {{name: auto}}`. "
+        "See 'The library of C' in docs/installation.md."
     )
 
 

@@ -12,7 +12,8 @@
  * What may go wrong, and what is done about it: the FMU discards an evaluation (a quarter of the step, FMI 2.0, 2.1.3), or
  * a stage is NaN (the same); at the start of a step, that ends the run. An indicator passes zero: the time is found on the
  * interpolant, as the first time at which an indicator is on the other side. Exactly 0 is not above 0 (FMI 2.0, 3.1). The
- * system is stiff: steps are as short as stability needs, which is counted, and Python tells it.
+ * system is stiff: steps are as short as stability needs, which is counted. Python tells it; or, if the model `leaves`, its
+ * other solver goes on there. The counts are those of steps, so this is at the same point in each run (ADR 80).
  *
  * Only additions, multiplications and divisions: `pow` of the C library differs between systems, and floats may not. */
 #include <stddef.h>
@@ -28,7 +29,7 @@ enum { UPDATE_DISCRETE_STATES = ENTER_EVENT_MODE + 1, ENTER_CONTINUOUS_TIME_MODE
 enum { STAGES = 7, ENOUGH = 40, STIFF = 15, UPDATES = 1000, LOOK = 102 };
 
 static const double EPSILON = 0x1p-52;
-static const double SAFETY = 0.9, LEAST = 0.2, MOST = 10.0;
+static const double SAFETY = 0.9, LEAST = 0.2, MOST = 10.0, WORSE = 10.0;
 
 static const double NODE[STAGES] = {0.0, 1.0 / 5, 3.0 / 10, 4.0 / 5, 8.0 / 9, 1.0, 1.0};
 static const double FROM[STAGES][STAGES - 1] = {
@@ -207,8 +208,9 @@ static int guess(Equations *own, double stop) {
   return 0;
 }
 
-/* Steps whose size is at the limit of stability: STIFF of them without 6 others in a row. */
-static void count_stiff(Equations *own, double h) {
+/* Steps whose size is at the limit of stability: STIFF of them without 6 others in a row. If fewer than WORSE of them fit
+ * into `span`, no other solver takes fewer by much: none of its steps goes beyond `stop` either. */
+static void count_stiff(Equations *own, double h, double span) {
   const int64_t n = own->n_states;
   double of_slopes = 0.0, of_states = 0.0;
   for (int64_t i = 0; i < n; i++) {
@@ -216,7 +218,7 @@ static void count_stiff(Equations *own, double h) {
     of_slopes += slope * slope;
     of_states += state * state;
   }
-  if (of_states > 0.0 && h * h * of_slopes > 3.25 * 3.25 * of_states) {
+  if (of_states > 0.0 && h * h * of_slopes > 3.25 * 3.25 * of_states && WORSE * h <= span) {
     own->not_stiff = 0;
     own->stiff++;
   } else if (own->stiff < STIFF && ++own->not_stiff == 6) {
@@ -307,8 +309,9 @@ static int begin(Equations *own, double stop) {
   return own->step_size > 0.0 || guess(own, stop) == 0 ? AT_STOP : FAILED;
 }
 
-/* One step that meets the tolerance, not beyond `stop`; the model is at its end. `*event`: an indicator has passed 0. */
-static int step(Equations *own, double stop, int *event) {
+/* One step that meets the tolerance, not beyond `stop`; the model is at its end. `*event`: an indicator has passed 0.
+ * `span`: the longest step that was possible since `stop` was given. */
+static int step(Equations *own, double stop, double span, int *event) {
   const double time = own->time, shortest = 16.0 * EPSILON * greater(size_of(time), size_of(stop));
   for (double most = MOST;; most = 1.0, own->rejected++) {
     const double size = greater(lesser(own->step_size, own->longest), shortest);
@@ -322,7 +325,7 @@ static int step(Equations *own, double stop, int *event) {
     if (!status && error <= 1.0) {
       if (!(status = indicate(own, own->last_indicators)))
         *event = on_other_side(own->indicators, own->last_indicators, own->n_indicators);
-      count_stiff(own, h);
+      count_stiff(own, h, span);
       if (*event) status = locate(own, end, &end);
       if (!status) {
         own->step_size = h < size ? greater(size, h * change) : h * change; /* one that `stop` has cut says little */
@@ -351,13 +354,14 @@ PUBLIC int64_t equations_restart(Equations *own) {
   return 0;
 }
 
-/* Step up to `stop`, or to the first event or step after which the FMU asks for something. */
+/* Step up to `stop`, or to the first event or step after which the FMU asks for something, or another solver is due. */
 PUBLIC int64_t equations_solve(Equations *own, double stop) {
+  const double span = lesser(stop - own->time, own->longest);
   own->asks_event = own->asks_end = 0;
   for (;;) {
     const int64_t n = own->n_states;
     int event, result = begin(own, stop);
-    if (result == AT_STOP) result = step(own, stop, &event);
+    if (result == AT_STOP) result = step(own, stop, span, &event);
     if (result != AT_STOP) return result;
     own->steps++;
     if (own->tells && complete(own)) return FAILED;
@@ -369,7 +373,32 @@ PUBLIC int64_t equations_solve(Equations *own, double stop) {
     own->is_new = event;
     if (event || own->asks_event || own->asks_end) return AT_EVENT;
     if (own->time >= stop) return AT_STOP;
+    if (own->leaves && own->stiff >= STIFF) return TOO_STIFF;
   }
+}
+
+/* ---- what CVode calls, which gives its vectors and the equations */
+
+typedef double *(*VectorData)(void *);
+
+/* A discarded evaluation asks for a smaller step (FMI 2.0, 2.1.3); Python gives the error of any other. */
+static int for_cvode(int status) { return status == 0 ? 0 : status == DISCARD ? 1 : -1; }
+
+PUBLIC int equations_derivatives(double time, void *states, void *slopes, void *equations) {
+  Equations *own = equations;
+  const VectorData data = (VectorData)own->vector_data;
+  double *to = data(slopes);
+  if (own->n_states == 0) to[0] = 0.0; /* the one state that CVode has for a model without states */
+  return for_cvode(derive(own, time, data(states), to));
+}
+
+PUBLIC int equations_indicators(double time, void *states, double *indicators, void *equations) {
+  Equations *own = equations;
+  int status = put(own, time, ((VectorData)own->vector_data)(states));
+  if (!status) status = indicate(own, indicators);
+  for (int64_t i = 0; !status && i < own->n_indicators; i++)
+    if (indicators[i] == 0.0) indicators[i] = -0x1p-1022; /* as in solver.py: CVode never sees a 0 */
+  return for_cvode(status);
 }
 
 /* ---- a step of a node */
@@ -427,6 +456,10 @@ int equations_step(Equations *own, double end) {
   own->result = GO_ON;
   own->call = own->n_setters;
   if (own->terminated) return LOOK;
+  if (own->leaves && own->stiff >= STIFF) {
+    own->result = LEFT; /* Python sets the inputs, too: its solver begins anew with them */
+    return LOOK;
+  }
   if (own->row_bytes > 0 && (!own->is_held || memcmp(own->held, own->row, (size_t)own->row_bytes) != 0)) {
     memcpy(own->held, own->row, (size_t)own->row_bytes);
     own->is_held = 1;

@@ -14,19 +14,24 @@ import msgspec
 
 from .. import __version__
 from ..text import listed
+from .system import ResolvedSystem
 
 __all__ = ["difference", "digest_of"]
 
 _CONFIGURATION_DIGITS, _MODEL_DIGITS = 16, 12
 
 
-def digest_of(configuration: object, models: Mapping[str, tuple[str, str]]) -> str:
+def digest_of(configuration: object, system: ResolvedSystem, contents: Mapping[str, str]) -> str:
     """The digest of a mesh: our version, a hash of the configuration, and one of the model of each instance.
 
     A model is the GUID and the SHA-256 of its content; the configuration is what must be equal, as JSON can hold it.
+    What the solver `auto` is depends on the host: without the library of C, the same configuration gives other floats.
     """
-    hashes = [_hash(models[name])[:_MODEL_DIGITS] for name in sorted(models)]
-    return " ".join([__version__, _hash(configuration)[:_CONFIGURATION_DIGITS], *hashes])
+    models = [(name, own.description) for name, own in sorted(system.instances.items())]
+    hashes = [_hash((model.guid, contents.get(name, "")))[:_MODEL_DIGITS] for name, model in models]
+    solved = [(name, model) for name, model in models if model.kind == "model_exchange"]
+    solvers = [system.config.instances[name].summary(model) for name, model in solved]
+    return " ".join([__version__, _hash((configuration, solvers))[:_CONFIGURATION_DIGITS], *hashes])
 
 
 def difference(own: str, other: str, instances: Iterable[str]) -> str:

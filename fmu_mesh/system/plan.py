@@ -288,8 +288,7 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
         )
         for node in nodes.values()
     ]
-    models = {name: (own.description.guid, contents.get(name, "")) for name, own in system.instances.items()}
-    return digest_of(agreed, models)
+    return digest_of(agreed, system, contents)
 
 
 def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:

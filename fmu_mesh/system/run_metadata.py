@@ -57,11 +57,14 @@ class ModelOrigin(msgspec.Struct, frozen=True):
         path: its file, absolute.
         sha256: the SHA-256 of its content; empty for a model without files.
         guid: the GUID or instantiation token of its model description.
+        computed_by: what computes it, as `fmu-mesh check` shows it: `FMI 3.0 model exchange, auto 1e-06`. Empty in
+            files of older versions.
     """
 
     path: str
     sha256: str
     guid: str
+    computed_by: str = ""
 
 
 class RecordedVariable(msgspec.Struct, frozen=True):
@@ -152,7 +155,12 @@ def metadata_of(
         first=record.first,
         every=record.every,
         models={
-            name: ModelOrigin(own.fmu, contents.get(name, ""), own.description.guid)
+            name: ModelOrigin(
+                own.fmu,
+                contents.get(name, ""),
+                own.description.guid,
+                loaded.config.instances[name].summary(own.description),
+            )
             for name, own in system.instances.items()
         },
         files=scenario_files(loaded, system),

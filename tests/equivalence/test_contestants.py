@@ -131,7 +131,7 @@ def test_two_instances_of_each_kind_step_in_one_process(kind: str) -> None:
 @needs_compiler
 def test_the_c_program_of_model_exchange_has_our_floats(place: Place) -> None:
     """So the job `model_exchange` compares the same calculation. FMPy interpolates the input, which we hold."""
-    task = Task(System("chain", "jacobi", 1.0, ()), 300, {"kind": "model_exchange_in_c"})
+    task = Task(System("chain", "jacobi", 1.0, ()), 300, {"kind": "model_exchange_dopri5"})
     fmu_mesh_kinds.run(task)
     oscillator = {"fmu": str(fmu_mesh_kinds.BUILT / "Oscillator2.fmu"), "kind": "model_exchange"}
     config = write_config(

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
+import fmu_mesh
 from fmu_mesh.api.open_system import System
 from fmu_mesh.run.options import PlanOptions
 from tests.equivalence import test_equivalence as meshes
@@ -109,6 +110,59 @@ def test_events_and_linear_inputs_give_the_same_floats(
     assert_the_same_floats(place, config)
 
 
+def test_models_that_turn_out_to_be_stiff_give_the_same_floats(place: Place, event_fmu: EventFmu) -> None:
+    content = events.stiff_system(event_fmu)
+    del content["instances"]["moving"]  # its FMI has no states
+    content["connections"] = content["connections"][:2]
+    config = meshes.written(content, place.folder)
+    columns = ["always.T", "always.F", "late.T", "late.F", "never.T", "never.F"]
+
+    assert_the_same_floats(place, config)
+
+    with opened(config) as system:
+        start = system.save()
+        first = rows_stepped(system, columns)
+        system.restore(start)
+        system.step(25)
+        state = system.save()
+        second = rows_stepped(system, columns)
+        system.restore(start)
+        third = rows_stepped(system, columns)
+        system.restore(state)
+        fourth = rows_stepped(system, columns)
+
+    assert first == third
+    assert second == fourth
+    assert first[25] == second[0]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_each_copy_and_each_reset_find_out_anew_what_is_stiff(
+    version: Version, place: Place, event_fmu: EventFmu
+) -> None:
+    heater = {"fmu": str(event_fmu("Heater", version)), "kind": "model_exchange"}
+    content = {"simulation": {"stop_time": 3.0, "step_size": 0.1}, "instances": {"heater": heater}, "connections": []}
+    config = meshes.written(content, place.folder)
+    columns, late = ["heater.T", "heater.F"], [0.0, 1.05, 100.0]
+    alone = []
+    for start in late:
+        with opened(config, f"heater.late={start}") as system:
+            alone.append([row[1:] for row in rows_stepped(system, columns)])
+
+    with fmu_mesh.load(config).batch(len(late)) as batch:
+        found = []
+        for _ in range(2):
+            batch.reset(start_values={"heater.late": late})
+            rows = [[batch.get(name).tolist() for name in columns]]
+            for _ in range(30):
+                batch.step(1)
+                rows.append([batch.get(name).tolist() for name in columns])
+            found.append([[[column[copy] for column in row] for row in rows] for copy in range(len(late))])
+
+    assert found == [alone, alone]
+    assert alone[0] != alone[1] != alone[2]
+
+
 @pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER))
 def test_all_types_and_arrays_give_the_same_values(place: Place) -> None:
     config = types.written(place.folder)
@@ -184,7 +238,7 @@ def test_a_state_within_the_steps_of_slower_instances_is_complete(at: int, algor
 
 
 @pytest.mark.parametrize("kinds", [events.ALL_2, events.ALL_3], ids=["FMI 2", "FMI 3"])
-@pytest.mark.parametrize("solver", ["cvode", "dopri5", "euler"])
+@pytest.mark.parametrize("solver", ["auto", "cvode", "euler"])
 def test_models_with_events_and_linear_inputs_go_back_to_a_state(
     kinds: Mapping[str, tuple[Version, str]], solver: str, place: Place, event_fmu: EventFmu
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.opening import open_instance, stepped
 from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
+from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
@@ -135,6 +136,29 @@ def test_a_line_that_goes_on_is_no_event(version: Version, solver: Solver, event
     assert {row[1] for row in rows} == {2}
     if solver in EXACT:
         assert rows[-1][0] == pytest.approx(0.5, rel=1e-5)  # ten steps of a tolerance of 1e-6 each
+
+
+@pytest.mark.skipif(native.library is None, reason="the library is not built here")
+@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("model", ["Oscillator", "Integral", "Ball", "Heater"])
+@pytest.mark.parametrize("extrapolation", ["hold", 0, 1])
+def test_what_cvode_calls_in_c_gives_the_floats_of_python(
+    extrapolation: Extrapolation,
+    model: str,
+    version: Version,
+    event_fmu: EventFmu,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fmu = event_fmu(model, version)
+    system = Driven(model, "u", tuple(v.name for v in read_description(fmu).with_causality("output")), {}, 1.0)
+    rows = []
+    for library in (native.library, None):
+        monkeypatch.setattr(native, "library", library)
+        solver = SolverSettings("cvode", 1e-6)
+        rows.append(driven(fmu, tmp_path, system, sine(1.0, 0.05), 0.05, extrapolation, solver=solver))
+
+    assert repr(rows[0]) == repr(rows[1])
 
 
 @pytest.mark.parametrize("extrapolation", ["hold", 0, 1])

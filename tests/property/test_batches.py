@@ -42,7 +42,7 @@ NATIVE: dict[str, Any] = {
 MIXED: dict[str, Any] = {
     "instances": {
         "fast": {"fmu": "Integrator", "start_values": {"y": 1.0}},
-        "oscillator": {"event": ("Oscillator", 2), "kind": "model_exchange", "solver": {"name": "dopri5"}},
+        "oscillator": {"event": ("Oscillator", 2), "kind": "model_exchange"},
         "stairs": {"event": ("Stairs", 3), "start_values": {"period": 0.07}},
         "free": {"fmu": "Gain"},
         "pid": {"controller": "position_pid", "start_values": {"p": 3.0, "i": 2.0}},

@@ -21,7 +21,7 @@ from urllib.parse import unquote
 
 import fmpy
 
-__all__ = ["FlatSystem", "Flow", "Fmu", "name_of", "read_system"]
+__all__ = ["FlatSystem", "Flow", "Fmu", "name_of", "read_system", "solver_of"]
 
 SSD = "{http://ssp-standard.org/SSP1/SystemStructureDescription}"
 SSC = "{http://ssp-standard.org/SSP1/SystemStructureCommon}"
@@ -182,6 +182,12 @@ def name_of(path: Path_) -> str:
 
     joined = "-".join(map(escaped, path))
     return f"_{joined}" if joined.startswith("-") else joined
+
+
+def solver_of(system: FlatSystem) -> dict[str, str]:
+    """The values of a configuration that name the solver of the reference, which is CVode, for model exchange."""
+    exchanging = [path for path, fmu in system.fmus.items() if fmu.kind == "model_exchange"]
+    return {f"instances.{name_of(path)}.solver.name": "cvode" for path in exchanging}
 
 
 def read_system(package: Path, folder: Path, ssd: str = "SystemStructure.ssd") -> FlatSystem:

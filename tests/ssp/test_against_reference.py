@@ -10,7 +10,7 @@ from tests.helpers import Place
 from tests.ssp.comparing import differences
 from tests.ssp.own_systems import SYSTEMS, make_folder, make_package
 from tests.ssp.reference_run import run_system
-from tests.ssp.reference_system import read_system
+from tests.ssp.reference_system import read_system, solver_of
 
 
 @pytest.mark.parametrize("algorithm", ["jacobi", "gauss_seidel"])
@@ -22,7 +22,8 @@ def test_a_launched_package_equals_a_plain_loop(name: str, algorithm: str, place
     outputs, rows = run_system(system, step_size=own.step_size, stop_time=own.stop_time, algorithm=algorithm)
 
     result = place.folder / "result.csv"
-    done = launch(place, package, result, "--step-size", str(own.step_size), "--algorithm", algorithm)
+    solver = [f"--set-config={key}={value}" for key, value in solver_of(system).items()]
+    done = launch(place, package, result, "--step-size", str(own.step_size), "--algorithm", algorithm, *solver)
 
     assert done == 0, place.story()
     assert differences(result, outputs, rows) == []

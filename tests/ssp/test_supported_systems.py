@@ -13,7 +13,7 @@ import fmu_mesh
 from tests.ssp.comparing import differences
 from tests.ssp.packages import write_package
 from tests.ssp.reference_run import run_system
-from tests.ssp.reference_system import read_system
+from tests.ssp.reference_system import read_system, solver_of
 from tests.ssp.supported_systems import SUPPORTED, Supported
 
 RUNS = [(own, algorithm) for own in SUPPORTED for algorithm in own.algorithms]
@@ -86,7 +86,9 @@ def test_a_run_equals_the_independent_reference(own: Supported, algorithm: str, 
     file = own.ssd if own.ssd in own.files(tmp_path / "built") else "SystemStructure.ssd"
     reference = read_system(path, tmp_path / "unpacked", file or "SystemStructure.ssd")
 
-    fmu_mesh.load(path, ssd=file).run(output=result, processes=False, **options_of(own, algorithm))
+    fmu_mesh.load(path, ssd=file).run(
+        output=result, processes=False, config_values=solver_of(reference), **options_of(own, algorithm)
+    )
 
     outputs, rows = run_system(reference, step_size=0.125, stop_time=1.0, algorithm=algorithm)
     assert differences(result, outputs, rows) == []

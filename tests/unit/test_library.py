@@ -27,7 +27,10 @@ from tests.helpers import write_config
 
 LIBRARY = build_library.library_path("linux-x86_64")
 NAME = "fmu_mesh/rings/burst-linux-x86_64.so"
-COST = "Results are the same, and steps are slower. See 'The library of C' in docs/installation.md."
+COST = (
+    "Steps are slower. Results are the same, except with `solver: {name: auto}`. "
+    "See 'The library of C' in docs/installation.md."
+)
 ASK = "from fmu_mesh.rings.library import *; print(load_library(), why_no_library(), sep='\\n')"
 
 

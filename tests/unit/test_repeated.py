@@ -84,10 +84,10 @@ def ended(plan: RunPlan, run: Callable[[RunPlan], Outcome]) -> Ended:
 
 
 def assert_equal(runs: RepeatedRuns, plans: Sequence[RunPlan]) -> list[Ended]:
-    """Each plan in a row, and the first once more: each ends as it does alone."""
+    """Each plan in a row, and the first twice more, where the last run may begin again: each ends as it does alone."""
     expected = [ended(plan, local) for plan in plans]
-    found = [ended(plan, lambda plan: repeated(runs, plan)) for plan in (*plans, plans[0])]
-    assert found == [*expected, expected[0]]
+    found = [ended(plan, lambda plan: repeated(runs, plan)) for plan in (*plans, plans[0], plans[0])]
+    assert found == [*expected, expected[0], expected[0]]
     return expected
 
 
@@ -206,6 +206,30 @@ def test_models_with_events_of_all_versions_give_the_same_bytes(
 
     with repeating(tmp_path, reset=reset) as runs:
         assert_equal(runs, plans_of(config, [{"ball.e": 0.7}, {"ball.e": 0.4}]))
+
+
+@ENGINES
+@RESETS
+@pytest.mark.usefixtures("_engine")
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_each_run_finds_out_anew_whether_a_model_is_stiff(
+    tmp_path: Path, event_fmu: Callable[..., Path], version: int, *, reset: bool
+) -> None:
+    heater = {"fmu": str(event_fmu("Heater", version)), "kind": "model_exchange"}
+    connection: Any = {"from": "one.F", "to": "two.u", "factor": 0.1}
+    config = write_config(
+        tmp_path,
+        instances={"one": heater, "two": heater},
+        connections=[connection],
+        simulation={"step_size": 0.1},
+        stop_time=3.0,
+    )
+    late = [{"one.late": start, "two.late": 1.0} for start in (0.0, 1.05, 100.0)]
+
+    with repeating(tmp_path, reset=reset) as runs:
+        expected = assert_equal(runs, plans_of(config, late))
+
+    assert len({rows for rows, _ in expected}) == len(late)
 
 
 @ENGINES
@@ -548,7 +572,7 @@ def test_an_instance_is_reset_where_the_fmu_can(
     with repeating(tmp_path, reset=True) as runs:
         assert_equal(runs, [fmu_mesh.load(config).plan()] * 2)
 
-    assert found == [resets] * 3
+    assert found == [resets] * 4
 
 
 def test_messages_go_to_the_instance_of_the_run(tmp_path: Path, faulty: Path) -> None:

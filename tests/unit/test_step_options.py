@@ -173,7 +173,7 @@ def test_check_shows_the_solver_the_slopes_and_what_needs_a_tool(event_fmu: Even
 
     page = "\n".join(plan_page(plan))
 
-    assert "Integral3.fmu (FMI 3.0 model exchange, cvode 1e-08)" in page
+    assert "Integral3.fmu (FMI 3.0 model exchange, auto 1e-08)" in page
     assert "changes linearly in the step" in page
     assert "the FMU of 'ball' needs an execution tool (it does not say which); expected that tool on the host" in page
 

@@ -35,7 +35,7 @@ from tests.fmus.helpers import NO_COMPILER, build_test_fmu
 EventFmu = Callable[..., Path]
 CO_SIMULATION: list[tuple[Version, Kind]] = [(2, "co_simulation"), (3, "co_simulation")]
 WITH_STATE: list[tuple[Version, Kind]] = [*CO_SIMULATION, (2, "model_exchange"), (3, "model_exchange")]
-EXACT = [StepOptions(), StepOptions(SolverSettings("dopri5"))]
+EXACT = [StepOptions(), StepOptions(SolverSettings("cvode")), StepOptions(SolverSettings("dopri5"))]
 ALL: list[tuple[Version, Kind]] = [*WITH_STATE, (1, "model_exchange")]
 
 
@@ -200,7 +200,7 @@ def test_discrete_states_that_never_converge_are_an_error_and_no_hang(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
+@pytest.mark.parametrize("options", EXACT, ids=["auto", "cvode", "dopri5"])
 def test_where_a_model_cannot_be_evaluated_the_solver_ends_with_its_words(
     options: StepOptions, version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
@@ -219,7 +219,7 @@ def test_where_a_model_cannot_be_evaluated_the_solver_ends_with_its_words(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
+@pytest.mark.parametrize("options", EXACT, ids=["auto", "cvode", "dopri5"])
 def test_completed_steps_are_told_and_step_events_are_handled(
     options: StepOptions, version: Version, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
@@ -268,7 +268,7 @@ def test_euler_takes_as_many_steps_at_late_times_as_at_early_ones(
 
 @pytest.mark.parametrize(("version", "kind"), WITH_STATE)
 @pytest.mark.parametrize("model", ["Ball", "Stairs"])
-@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
+@pytest.mark.parametrize("options", EXACT, ids=["auto", "cvode", "dopri5"])
 def test_instance_goes_on_bit_by_bit_from_state_that_it_was_in(
     options: StepOptions, version: Version, kind: Kind, model: str, event_fmu: EventFmu, tmp_path: Path
 ) -> None:
@@ -285,7 +285,7 @@ def test_instance_goes_on_bit_by_bit_from_state_that_it_was_in(
 
 
 @pytest.mark.parametrize(("version", "kind"), WITH_STATE)
-@pytest.mark.parametrize("options", EXACT, ids=["cvode", "dopri5"])
+@pytest.mark.parametrize("options", EXACT, ids=["auto", "cvode", "dopri5"])
 def test_another_instance_goes_on_bit_by_bit_from_a_serialized_state(
     options: StepOptions, version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path
 ) -> None:

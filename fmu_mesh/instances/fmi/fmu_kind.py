@@ -31,7 +31,7 @@ from ...rings.library import why_no_library
 from ...system.process_sharing import Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
-from .step_options import SolverSettings, StepOptions, Terms
+from .step_options import SolverName, SolverSettings, StepOptions, Terms
 
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
@@ -42,16 +42,17 @@ class SolverConfig(Base, frozen=True, kw_only=True):
     """How the continuous states of a model-exchange FMU are solved."""
 
     name: Annotated[
-        Literal["cvode", "dopri5", "euler"],
+        SolverName,
         Meta(
-            description="cvode: variable step and order, finds events exactly, also for stiff models; dopri5: the same "
-            "with order 5 and in C, for models that are not stiff; euler: fixed steps, for checks."
+            description="auto: dopri5, and cvode from where the model turns out to be stiff; dopri5: variable steps of "
+            "order 5 in C, for models that are not stiff; cvode: variable step and order, also for stiff models; both "
+            "find events exactly; euler: fixed steps, for checks."
         ),
-    ] = "cvode"
+    ] = "auto"
     relative_tolerance: Annotated[
         float | None,
         Meta(
-            description="Relative tolerance of cvode and dopri5; default: that of the default experiment of the FMU, "
+            description="Relative tolerance of dopri5 and cvode; default: that of the default experiment of the FMU, "
             "or 1e-6.",
             extra_json_schema=POSITIVE,
             examples=[1e-6],
@@ -170,9 +171,12 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
         return f"FMI {description.fmi_version}{solver}"
 
     def solver_settings(self, description: ModelDescription) -> SolverSettings:
-        """How the continuous states of a model-exchange FMU are solved."""
+        """How the continuous states of a model-exchange FMU are solved; without the library of C, `auto` is `cvode`."""
+        name = self.solver.name
+        if name == "auto" and why_no_library() is not None:
+            name = "cvode"
         tolerance = self.solver.relative_tolerance or description.default_experiment.tolerance or _DEFAULT_TOLERANCE
-        return SolverSettings(self.solver.name, tolerance, self.solver.maximum_step_size)
+        return SolverSettings(name, tolerance, self.solver.maximum_step_size)
 
 
 class FmuKind(Kind[FmuConfig]):

@@ -9,7 +9,9 @@ import msgspec
 from ...config.mesh import LimitsConfig
 from ...system.linear_inputs import LinearInput
 
-__all__ = ["SolverSettings", "StepOptions", "Terms"]
+__all__ = ["SolverName", "SolverSettings", "StepOptions", "Terms"]
+
+SolverName = Literal["auto", "dopri5", "cvode", "euler"]
 
 
 class Terms(msgspec.Struct, frozen=True):
@@ -23,7 +25,7 @@ class Terms(msgspec.Struct, frozen=True):
 class SolverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How the continuous states of a model-exchange FMU are solved."""
 
-    name: Literal["cvode", "dopri5", "euler"] = "cvode"
+    name: SolverName = "auto"
     # bound of the local error. The absolute tolerance of a state is this times its nominal value.
     relative_tolerance: float = 1e-6
     maximum_step_size: float | None = None  # in s; None: at most the communication step.

@@ -125,6 +125,9 @@ class ContinuousInstance(NativeInstance):
         if loop.terminated:
             raise self._end_requested()
         own = solver.table
+        if own.result == Solved.LEFT:
+            self._take_step(step)
+            return
         if own.result == Solved.FAILED and own.call < own.n_setters:
             raise self._part_failed("Set", self._setters[own.call], own.status)
         at_event = own.result == Solved.AT_EVENT
@@ -135,11 +138,15 @@ class ContinuousInstance(NativeInstance):
         self._tell_doubt()
 
     def _step_by_calls(self, step: int) -> None:
+        self._take_step(step)
+        self._said.note(step=step + 1)
+        self._read_outputs(step + 1)
+
+    def _take_step(self, step: int) -> None:
+        """One step without the outputs."""
         self._checked(lambda: self._take_inputs(step, self._time_of(step)))
         self._advance(self._time_of(step + 1))
-        self._said.note(step=step + 1)
         self._tell_doubt()
-        self._read_outputs(step + 1)
 
     def _tables(self) -> NativeStep:
         return super()._tables()._replace(setters=())  # the equations have them

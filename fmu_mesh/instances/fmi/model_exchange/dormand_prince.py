@@ -1,7 +1,7 @@
 """The method of Dormand and Prince of order 5(4), whose steps are taken by the library of C (`rings/model_exchange.c`).
 
-Owns the memory of the library, and what its results mean. The method has no history, so an input that jumps costs one
-evaluation, and a state keeps little more than the step size.
+Owns the memory of the library, what its results mean, and the change to CVode where a model turns out to be stiff. The
+method has no history, so an input that jumps costs one evaluation, and a state keeps little more than the step size.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from enum import IntEnum
 from typing import Any, Final, cast
 
 import numpy as np
-from fmpy.fmi1 import FMICallException
 
 from ....rings import native
 from ....rings.library import why_no_library
@@ -21,22 +20,19 @@ from ....rings.ring import Ring
 from ..clocks import unsettled
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
-from .model_calls import ModelCalls
-from .solver import ModelPlace, Solver
+from .model_calls import LibraryCalls, ModelCalls
+from .solver import CVodeSolver, ModelPlace, Solver
 
-__all__ = ["NOT_SET", "DormandPrinceSolver", "HeldRow", "RowBytes", "Solved"]
-
-_FUNCTIONS: Final = [field for field, *_ in EquationsTable._fields_][2:12]
-"""The fields that are functions; the library names them by their place."""
+__all__ = ["NOT_SET", "AutoSolver", "DormandPrinceSolver", "HeldRow", "RowBytes", "Solved"]
 
 _IS_STIFF: Final = 15
-"""So many steps in a row at the limit of stability, with few others between them (`count_stiff`)."""
+"""So many steps in a row at the limit of stability, with few others between them; see `count_stiff` in the library."""
 
 
 class Solved(IntEnum):
     """Why the steps of the library have ended; `burst.h` has the same names."""
 
-    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON = range(8)
+    AT_STOP, AT_EVENT, FAILED, TOO_SMALL, NOT_A_NUMBER, UNSETTLED, ENDS, GO_ON, TOO_STIFF, LEFT = range(10)
 
 
 RowBytes = tuple[bytes | list[Any], ...]
@@ -93,22 +89,21 @@ class DormandPrinceSolver(Solver):
     ``tells`` the FMU of completed steps, it learns of each.
     """
 
+    _advice = "`solver: {name: cvode}` can take longer ones"  # what to do about a stiff model
+
     def __init__(self, equations: ModelCalls, settings: SolverSettings, *, tells: bool) -> None:
         super().__init__(equations)
         if native.library is None:
             raise SolverFailed(f"it needs the library of C, which is {why_no_library()}")
         self._library = native.library
         n, m = equations.n_states, equations.n_indicators
-        functions, self._names = equations.table()
-        self._line = equations.line
         self._memory = np.zeros(12 * n + 4 * m)
         at = self._memory.ctypes.data
         states = [at + 8 * n * number for number in range(12)]
         indicators = [at + 8 * (12 * n + m * number) for number in range(4)]
         self._address = states[0]
-        self.table = EquationsTable(
-            n_states=n,
-            n_indicators=m,
+        self._calls = LibraryCalls(
+            equations,
             states=ctypes.cast(states[0], _DOUBLES),
             weights=states[1],
             ends=states[2],
@@ -122,9 +117,8 @@ class DormandPrinceSolver(Solver):
             tolerance=settings.relative_tolerance,
             longest=settings.maximum_step_size or np.inf,
             tells=tells,
-            next_event=np.inf,
-            **functions,
         )
+        self.table = self._calls.table
         self.at = cast("ModelPlace", self.table)
 
     @property
@@ -143,13 +137,15 @@ class DormandPrinceSolver(Solver):
 
     def doubt(self) -> str | None:
         """See `Solver.doubt`."""
-        if self.table.stiff < _IS_STIFF or self.table.doubted:
+        if not self.is_stiff or self.table.doubted:
             return None
         self.table.note(doubted=True)
-        return (
-            f"the model is stiff: dopri5 needs steps of {self.table.step_size:.2g} s to stay stable. "
-            "`solver: {name: cvode}` can take longer ones"
-        )
+        return f"the model is stiff: dopri5 needs steps of {self.table.step_size:.2g} s to stay stable. {self._advice}"
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether the model has turned out to be stiff."""
+        return bool(self.table.stiff >= _IS_STIFF)
 
     def share(self, setters: Sequence[Call], inputs: Ring) -> HeldRow:
         """Let the library set the held inputs of a ring with one row, and step up to the end of a step of the node."""
@@ -161,13 +157,13 @@ class DormandPrinceSolver(Solver):
     def restart(self) -> None:
         """See `Solver.restart`."""
         if self._library.equations_restart(ctypes.addressof(self.table)):
-            raise self.failure()
+            raise self._calls.failure()
 
     def step(self, time: float, stop: float) -> tuple[float, bool]:
         """See `Solver.step`."""
         own = self.table
         own.note(time=time)
-        self._follow()
+        self._calls.follow()
         result = self._library.equations_solve(ctypes.addressof(own), stop)
         self.check(result)
         return own.time, result == Solved.AT_EVENT
@@ -175,7 +171,7 @@ class DormandPrinceSolver(Solver):
     def check(self, result: int) -> None:
         """Raise the error of a step of the library that has failed; see `Solver.step`."""
         if result == Solved.FAILED:
-            raise self.failure()
+            raise self._calls.failure()
         if result == Solved.UNSETTLED:
             raise SolverFailed(unsettled(self.table.time))
         if result in _GIVEN_UP:
@@ -186,16 +182,58 @@ class DormandPrinceSolver(Solver):
         """See `Solver.complete`; `step` has told the FMU."""
         return bool(self.table.asks_event), bool(self.table.asks_end)
 
-    def _follow(self) -> None:
-        """Let the library set the linear inputs of this step; they are other ones than before."""
-        line = self._equations.line
-        if line is not self._line:
-            self._line = line
-            self.table.note(is_new=True, **(line.table() if line is not None else {"line": None}))
 
-    def failure(self) -> FMICallException:
-        """The call that has failed."""
-        names = [self._names.get(field, "") for field in _FUNCTIONS]
-        if self._line is not None:
-            names.append(self._line.name)
-        return FMICallException(function=names[self.table.function], status=self.table.status)
+class AutoSolver(DormandPrinceSolver):
+    """The same, until the model turns out to be stiff; from there on CVode, up to the end of the run.
+
+    The counts of `place` say which of the two it is. So a state from before the change goes on with steps of order 5,
+    and one from after it with CVode.
+    """
+
+    _advice = "cvode goes on from here"
+
+    def __init__(self, equations: ModelCalls, settings: SolverSettings, *, tells: bool) -> None:
+        super().__init__(equations, settings, tells=tells)
+        self.table.note(leaves=True)
+        self._settings = settings
+        self._cvode: CVodeSolver | None = None
+        self._by_cvode = False  # whether CVode has taken the last step, or takes the next one
+
+    def restart(self) -> None:
+        """See `Solver.restart`."""
+        self._by_cvode = self.is_stiff
+        if self._by_cvode:
+            self._other().restart()
+        else:
+            super().restart()
+
+    def step(self, time: float, stop: float) -> tuple[float, bool]:
+        """See `Solver.step`."""
+        if not self.is_stiff:
+            return super().step(time, stop)
+        if not self._by_cvode:
+            self.restart()
+        return self._other().step(time, stop)
+
+    def check(self, result: int) -> None:
+        """As that of `dopri5`; but where its steps get too small, the model is stiff."""
+        if result != Solved.TOO_SMALL:
+            super().check(result)
+            return
+        self._equations.set_point(self.table.time, self._address)
+        self.table.note(stiff=_IS_STIFF)
+
+    def complete(self) -> tuple[bool, bool]:
+        """See `Solver.complete`."""
+        return self._equations.completed_step() if self._by_cvode else super().complete()
+
+    def close(self) -> None:
+        """See `Solver.close`."""
+        if self._cvode is not None:
+            self._cvode.close()
+
+    def _other(self) -> CVodeSolver:
+        if self._cvode is None:
+            own = self._settings
+            self._cvode = CVodeSolver(self._equations, own.relative_tolerance, own.maximum_step_size)
+        return self._cvode

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 from fmpy.fmi1 import FMICallException, fmi1EventInfo
 from fmpy.fmi2 import fmi2EventInfo
 
-from ....rings.native import Call, StepKind
+from ....rings.native import Call, EquationsTable, StepKind
 from ....variables.model_description import ModelDescription
 from ..calls import Function, Pointer, address_of, checked_function, memory
 from ..clocks import EventInfo, updated
 from ..fmu_library import MISSING
 from ..fmu_values import WARNING
 
-__all__ = ["Fmi1Calls", "Fmi3Calls", "InputLine", "InputSetter", "ModelCalls"]
+__all__ = ["Fmi1Calls", "Fmi3Calls", "InputLine", "InputSetter", "LibraryCalls", "ModelCalls"]
 
 _ARRAY = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
 _TIME = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_double)
@@ -29,6 +29,9 @@ _EVENT_UPDATE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, c
 _COMPLETED = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
 _INITIALIZE = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char, ctypes.c_double, ctypes.c_void_p)
 
+
+_FUNCTIONS = [field for field, *_ in EquationsTable._fields_][2:12]
+"""The fields that are functions; the library names them by their place."""
 
 _MODES = {
     "enter_event_mode": "EnterEventMode",
@@ -257,3 +260,28 @@ class Fmi3Calls(ModelCalls):
     def update_discrete_states(self) -> EventInfo:
         """One event iteration, in event mode."""
         return updated(self._fmu)
+
+
+class LibraryCalls:
+    """The same functions as the library calls them; ``fields`` are those of `EquationsTable` that a solver adds."""
+
+    def __init__(self, equations: ModelCalls, **fields: Any) -> None:  # noqa: ANN401 fields of C
+        functions, self._names = equations.table()
+        counts = {"n_states": equations.n_states, "n_indicators": equations.n_indicators}
+        self.table = EquationsTable(next_event=math.inf, **counts, **functions, **fields)
+        self._equations = equations
+        self._line: InputLine | None = None
+
+    def follow(self) -> None:
+        """Let the library set the linear inputs of this step, if they are other ones than before."""
+        line = self._equations.line
+        if line is not self._line:
+            self._line = line
+            self.table.note(is_new=True, **(line.table() if line is not None else {"line": None}))
+
+    def failure(self) -> FMICallException:
+        """The call that has failed."""
+        names = [self._names.get(field, "") for field in _FUNCTIONS]
+        if self._line is not None:
+            names.append(self._line.name)
+        return FMICallException(function=names[self.table.function], status=self.table.status)

@@ -19,11 +19,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ....rings import native
 from ....simtime import resolvable
 from ..clocks import EVENT_ITERATIONS, NO_CLOCKS, Clocks
 from ..fmu_values import SolverFailed
 from ..step_options import SolverSettings
-from .dormand_prince import DormandPrinceSolver
+from .dormand_prince import AutoSolver, DormandPrinceSolver
 from .model_calls import InputLine, ModelCalls
 from .solver import CVodeSolver, EulerSolver, Solver
 
@@ -187,6 +188,8 @@ def _solver_for(settings: SolverSettings, equations: ModelCalls, *, tells: bool)
     """The solver for these settings; one that does nothing for a model without states and event indicators."""
     if settings.name == "dopri5":
         return DormandPrinceSolver(equations, settings, tells=tells)
+    if settings.name == "auto" and native.library is not None:
+        return AutoSolver(equations, settings, tells=tells)
     if equations.n_states == 0 and equations.n_indicators == 0:
         return Solver(equations)
     if settings.name == "euler":

@@ -18,16 +18,19 @@ from typing import Any, Final, NoReturn, Protocol
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
+from ....rings import native
 from ....simtime import resolvable, steps_between
 from ..fmu_values import DISCARD, SolverFailed
-from .model_calls import ModelCalls
+from .model_calls import LibraryCalls, ModelCalls
 
 __all__ = ["CVodeSolver", "EulerSolver", "ModelPlace", "Solver"]
 
 # Who meets here: one thread, in three languages. Python calls CVode, CVode calls back (`_RHS`, `_ROOT`), and this calls
-# the FMU. No exception may cross C: it is kept in `_failure`, CVode is told to give up, and it is raised once CVode has
-# returned. ctypes gives up the lock of the interpreter meanwhile, so other threads run; none of them may use this
-# solver. ADR 11 says why each instance has a solver of its own, and why no step of it crosses a communication point.
+# the FMU. The library of C has these two functions, too; then no evaluation needs Python, and the floats are the same.
+# No exception may cross C: it is kept in `_failure`, or by the library as the call that has failed; CVode is told to
+# give up, and it is raised once CVode has returned. ctypes gives up the lock of the interpreter meanwhile, so other
+# threads run; none of them may use this solver. ADR 11 says why each instance has a solver of its own, and why no step
+# of it crosses a communication point.
 #
 # What may go wrong, and what is done about it:
 #
@@ -216,8 +219,14 @@ class CVodeSolver(Solver):
         def told(_line: int, function: bytes, _file: bytes, message: bytes, *_rest: object) -> None:
             self._said = f"{function.decode(errors='replace')}: {message.decode(errors='replace')}"
 
-        self._rhs = _RHS(lambda time, x, dx, _: self._guarded(self._derivatives, time, data(x), data(dx)))
-        self._root = _ROOT(lambda time, x, z, _: self._guarded(self._indicators, time, data(x), z))
+        self._calls: LibraryCalls | None = None
+        if native.library is None:
+            self._rhs = _RHS(lambda time, x, dx, _: self._guarded(self._derivatives, time, data(x), data(dx)))
+            self._root = _ROOT(lambda time, x, z, _: self._guarded(self._indicators, time, data(x), z))
+        else:
+            self._calls = LibraryCalls(equations, vector_data=ctypes.cast(data, ctypes.c_void_p))
+            self._rhs = native.library.equations_derivatives
+            self._root = native.library.equations_indicators
         self._handler = _HANDLER(told)
         self._is_new = True  # whether CVode begins anew in its next step
         self._started = False
@@ -260,6 +269,8 @@ class CVodeSolver(Solver):
         self._check(api.CVodeInit(self._memory, self._rhs, time, self._x))
         self._check(api.CVodeSVtolerances(self._memory, self._relative_tolerance, self._tolerances))
         self._check(api.CVodeSetLinearSolver(self._memory, self._linear, self._matrix))
+        if self._calls is not None:
+            self._check(api.CVodeSetUserData(self._memory, ctypes.addressof(self._calls.table)))
         self._check(api.CVodeSetNoInactiveRootWarn(self._memory))
         if self._equations.n_indicators:
             self._check(api.CVodeRootInit(self._memory, self._equations.n_indicators, self._root))
@@ -300,6 +311,9 @@ class CVodeSolver(Solver):
     def _call(self, time: float, stop: float, reached: ctypes.c_double) -> int:
         """Call CVode for one of its steps; its result, which is negative after a failure."""
         self._failure = None
+        if self._calls is not None:
+            self._calls.follow()
+            self._calls.table.note(status=0)
         if self._is_new:
             self._begin(time)
         self._check(self._api.CVodeSetStopTime(self._memory, stop))
@@ -309,6 +323,8 @@ class CVodeSolver(Solver):
         """End with what the model failed with during this step, or else with ``why``."""
         if self._failure is not None:
             raise self._failure
+        if self._calls is not None and self._calls.table.status:
+            raise self._calls.failure()
         self._give_up(why, time, self._x_data)
 
     def _derivatives(self, time: float, x: int, dx: int) -> None:
@@ -373,6 +389,7 @@ def _sundials() -> Any:  # noqa: ANN401 ctypes has no types
             "CVodeReInit": (integer, pointer, real, pointer),
             "CVodeSVtolerances": (integer, pointer, real, pointer),
             "CVodeSetLinearSolver": (integer, pointer, pointer, pointer),
+            "CVodeSetUserData": (integer, pointer, pointer),
             "CVodeSetNoInactiveRootWarn": (integer, pointer),
             "CVodeRootInit": (integer, pointer, integer, _ROOT),
             "CVodeSetMaxStep": (integer, pointer, real),
