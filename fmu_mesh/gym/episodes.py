@@ -35,19 +35,16 @@ class SpaceColumn(NamedTuple):
     Attributes:
         name: `instance.variable`.
         variable: what the model description says about it.
+        size: how many elements of an observation or action it has.
         low: its lower bound; -inf without one.
         high: its upper bound; inf without one.
     """
 
     name: str
     variable: Variable
+    size: int
     low: float
     high: float
-
-    @property
-    def size(self) -> int:
-        """How many elements of an observation or action it has."""
-        return self.variable.size
 
     @property
     def is_whole(self) -> bool:
@@ -142,7 +139,7 @@ class Episodes:
         """
         batch, copies = self._batch, self._batch.copies
         done = self._set(np.asarray(actions).reshape(copies, -1), over)
-        before = self._values.copy()
+        before = self._values
         if not over.all():
             batch.step(self._points)
         self._read()
@@ -185,35 +182,39 @@ class Episodes:
         for column in self.acted:
             part = actions[:, begin : begin + column.size]
             begin += column.size
-            if not column.is_whole:
+            if column.is_whole:
+                part = np.where(over[:, None], int(column.low), part)
+                if (wrong := ~((part >= column.low) & (part <= column.high)).all(axis=1)).any():
+                    told = f"{part[wrong][0].tolist()} for '{column.name}'"
+                    raise CallRefused(f"an action has {told}; expected {column.low:g} to {column.high:g}.")
+                part = part.astype(bool if column.variable.type == "Boolean" else np.int64)
+            else:
                 part = np.where(over[:, None], 0.0, part.astype(np.float64))
                 if self._task.scaled:
                     part = column.low + (part + 1.0) * (0.5 * (column.high - column.low))
                 part = np.clip(part, column.low, column.high)
-            elif (wrong := ((part < column.low) | (part > column.high)).any(axis=1) & ~over).any():
-                told = f"{part[wrong][0].tolist()} for '{column.name}'"
-                raise CallRefused(f"an action has {told}; expected {column.low:g} to {column.high:g}.")
-            elif column.variable.type == "Boolean":
-                part = part.astype(bool)
             done[column.name] = part.reshape(len(part), *column.variable.shape)
         self._batch.set(done)
         return done
 
     def _read(self) -> None:
+        """Read what is observed into a new array: a function of the task may have kept a part of the last one."""
+        values, begin = np.empty_like(self._values), 0
         if self._scalars:
-            self._batch.get(self._scalars, out=self._values)
-            return
-        begin = 0
-        for column in self.observed:
-            part = self._values[:, begin : begin + column.size]
-            part[:] = self._batch.get(column.name).reshape(part.shape)
-            begin += column.size
+            self._batch.get(self._scalars, out=values)
+        else:
+            for column in self.observed:
+                part = values[:, begin : begin + column.size]
+                part[:] = self._batch.get(column.name).reshape(part.shape)
+                begin += column.size
+        self._values = values
 
     def _named(self, values: Floats) -> dict[str, NDArray[Any]]:
         named, begin = {}, 0
         for column in self.observed:
-            named[column.name] = values[:, begin : begin + column.size].reshape(len(values), *column.variable.shape)
-            begin += column.size
+            end, shape = begin + column.size, column.variable.shape
+            named[column.name] = values[:, begin:end].reshape(-1, *shape) if shape else values[:, begin]
+            begin = end
         return named
 
     def _computed(self, name: str, function: Callable[[Step], ArrayLike], step: Step, dtype: type) -> NDArray[Any]:
@@ -250,7 +251,7 @@ def _columns(option: str, run: RunPlan, names: Names) -> tuple[SpaceColumn, ...]
         low, high = given if given is not None else _bounds_of(variable)
         if not low < high:
             raise CallRefused(f"the bounds of '{name}' are {low:g} and {high:g}; expected a lower and an upper one.")
-        columns.append(SpaceColumn(name, variable, float(low), float(high)))
+        columns.append(SpaceColumn(name, variable, variable.size, float(low), float(high)))
     return tuple(columns)
 
 

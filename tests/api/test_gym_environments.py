@@ -392,6 +392,40 @@ def test_whole_actions_out_of_bounds_are_refused(machine: fmu_mesh.Mesh, vector:
         environments.step(np.array([0, 4]))
 
 
+def test_an_action_of_a_copy_that_begins_anew_does_not_count(machine: fmu_mesh.Mesh, vector: Maker) -> None:
+    task = Task(
+        mesh=machine,
+        observations=["it.speed"],
+        actions={"it.gear": (1, 3)},
+        reward=total,
+        terminated=lambda step: step["it.speed"] > 0.25,
+    )
+    environments = vector(task, 2)
+    environments.reset()
+    assert environments.step(np.array([1, 3]))[2].tolist() == [False, True]
+
+    seen, rewards, *_ = environments.step(np.array([1, -7]))
+
+    assert np.abs(seen[:, 0] - [0.2, 0.0]).max() < 1e-6
+    assert np.abs(rewards - [0.1, 0.0]).max() < 1e-12
+
+
+def test_what_a_function_keeps_of_a_step_stays_as_it_was(vector: Maker) -> None:
+    kept: list[Step] = []
+
+    def reward(step: Step) -> float:
+        kept.append(step)
+        return 0.0
+
+    environments = vector(replace(DRAWN, episode_time=0.04, reward=reward), 2)
+    first, _ = environments.reset(seed=1)
+    seen = [first, *(environments.step(np.ones((2, 1)))[0] for _ in range(4))]
+
+    for number in (0, 1, 3):  # the third step begins new episodes
+        assert kept[number].before["cart.x"].tolist() == seen[number][:, 0].tolist()
+        assert kept[number]["cart.x"].tolist() == seen[number + 1][:, 0].tolist()
+
+
 def test_only_the_environments_import_gymnasium() -> None:
     program = "import sys, fmu_mesh; fmu_mesh.load; fmu_mesh.System; assert 'gymnasium' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
