@@ -15,6 +15,7 @@ __all__ = ["JOBS", "OTHER", "OURS", "Entry", "Job", "with_checkout"]
 
 OURS = "fmu_mesh_launch"
 KINDS = "fmu_mesh_kinds"
+SWEEP = "fmu_mesh_sweep"
 STEPPED = "fmu_mesh_environment"
 OTHER = ", other checkout"
 """The end of the label of a row that another checkout runs."""
@@ -22,6 +23,7 @@ OTHER = ", other checkout"
 _MODULES_NEED = {
     "c_program": ("fmpy",),
     "c_model_exchange": ("fmpy",),
+    "c_sweep": ("fmpy",),
     "c_environment": ("fmpy",),
     "fmpy_environment": ("fmpy",),
     "fmpy_loop": ("fmpy",),
@@ -71,7 +73,7 @@ class Entry:
     @property
     def is_ours(self) -> bool:
         """Whether it runs fmu_mesh, of this checkout or of another one."""
-        return self.module in (OURS, KINDS, STEPPED)
+        return self.module in (OURS, KINDS, STEPPED, SWEEP)
 
 
 @dataclass(frozen=True)
@@ -147,6 +149,8 @@ _CHATTY = System("chain", "gauss_seidel", 0.001, (Member("chatty", CHATTY, "u", 
 _SIZES = (2, 16, 64)
 _US = "fmu_mesh"
 _DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
+_BATCH, _C_LOOP = "fmu_mesh, batch()", "C, a loop over copies"
+_BATCH_TO_STATE = "reset() of a batch to states"
 _OPEN, _RESET_TO_STATE, _RESET_WITH_VALUES = "fmu_mesh, open()", "reset() to a state", "reset() with start values"
 _NO_FILE = "fmu_mesh, nothing recorded"
 _LOCAL = "fmu_mesh, launch --local"
@@ -400,6 +404,17 @@ JOBS = (
         ),
     ),
     Job(
+        "sweep",
+        "a sweep of 2,000 variants of 2,000 points, two workers, no curves, one reduction; a point is a variant",
+        _NOTHING,
+        (
+            Entry("C, two processes, new instances", "c_sweep", 2_000, 500),
+            Entry("fmu_mesh, from the call to the table", SWEEP, 2_000, 500),
+            Entry("fmu_mesh, while its workers run", SWEEP, 2_000, 500, {"timed": "rows"}),
+            Entry("fmu_mesh, instances reset", SWEEP, 2_000, 500, {"reset": "yes"}),
+        ),
+    ),
+    Job(
         "environment",
         "one cart pole (fmus/CartPole.fmu) that a program steps: set, step and get at each point",
         _CART,
@@ -410,12 +425,23 @@ JOBS = (
         ),
     ),
     Job(
+        "batch",
+        "1,024 such cart poles as arrays: set, step and four outputs of each copy at each point",
+        _CART,
+        (
+            Entry(_BATCH, STEPPED, 1_024_000, 204_800, {"what": "batch", "copies": "1024"}),
+            Entry(_C_LOOP, "c_environment", 1_024_000, 204_800, {"what": "batch", "copies": "1024"}),
+            Entry("FMPy loop over 64", "fmpy_environment", 25_600, 12_800, {"what": "batch", "copies": "64"}),
+        ),
+    ),
+    Job(
         "resets",
         "the same cart pole: one way back to its first point, and get",
         _CART,
         (
             Entry(_RESET_TO_STATE, STEPPED, 100_000, 20_000, {"what": "state"}),
-            Entry("C: fmi2SetFMUstate", "c_environment", 10_000_000, 1_000_000, {"what": "state"}),
+            Entry(_BATCH_TO_STATE, STEPPED, 1_024_000, 204_800, {"what": "batch_state", "copies": "1024"}),
+            Entry("C: fmi2SetFMUstate", "c_environment", 10_000_000, 1_000_000, {"what": "state", "copies": "1024"}),
             Entry(_RESET_WITH_VALUES, STEPPED, 2_000, 500, {"what": "values"}),
             Entry("C: fmi2Reset and initialization", "c_environment", 10_000_000, 1_000_000, {"what": "values"}),
             Entry("FMPy: reset and initialization", "fmpy_environment", 10_000, 5_000, {"what": "values"}),

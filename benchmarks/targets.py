@@ -1,4 +1,4 @@
-"""What our own figures should be: what issues 17 and 38 ask for, and what is aimed at."""
+"""What our own figures should be: what issues 17, 38 and 41 ask for, and what is aimed at."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ _EIGHT, _TWO = "fmu_mesh, chain of 8", "fmu_mesh, chain of 2"
 _ROUND_TRIP = "shared memory, C: one round trip"
 _STREAMS, _BY_ZENOH, _MEMORY = "fmu_mesh, row streams", "fmu_mesh, Zenoh", "fmu_mesh, shared memory"
 _TCP, _ZENOH = "TCP, C, spinning: one round trip", "Zenoh in Python: one round trip"
+_BATCH, _C_LOOP = "fmu_mesh, batch()", "C, a loop over copies"
+_BATCH_TO_STATE, _C_STATE = "reset() of a batch to states", "C: fmi2SetFMUstate"
 _DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
+_SWEEP, _C_SWEEP = "fmu_mesh, from the call to the table", "C, two processes, new instances"
 _WINDOW1 = "fmu_mesh, gauss_seidel"
 _OPEN, _TO_STATE, _VALUES = "fmu_mesh, open()", "reset() to a state", "reset() with start values"
 
@@ -79,7 +82,10 @@ TARGETS = (
     Target("FMI 1.0, against the other checkout", "kinds", _FMI1, "times as fast", 2, 4, _FMI1 + OTHER),
     Target("Boolean, Enumeration, against the other checkout", "kinds", _FMI2, "times as fast", 2, 4, _FMI2 + OTHER),
     Target("model exchange with dopri5, against C", "model_exchange", _DOPRI5, "times as long", 2.5, 1.2, _C_SOLVER),
+    Target("sweep of short runs, against C", "sweep", _SWEEP, "times as long", 2, 1.3, _C_SWEEP),
     Target("open(): set, step and get, against C", "environment", _OPEN, "times as long", 15, 8, "C, one process"),
+    Target("a batch, a copy and step, against C", "batch", _BATCH, "times as long", 1.5, 1.1, _C_LOOP),
+    Target("reset() of a batch to states, against C", "resets", _BATCH_TO_STATE, "times as long", 5, 2, _C_STATE),
     Target("reset() to a state, against C", "resets", _TO_STATE, "times as long", 5, 2, "C: fmi2SetFMUstate"),
     Target("reset() with start values, against open()", "resets", _VALUES, "times as long", 0.05, 0.01, "a new open()"),
     Target("main job, launch --local", "pendulum", "fmu_mesh, launch --local", "points/s", 437_000, 800_000),

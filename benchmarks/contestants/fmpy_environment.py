@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from time import perf_counter
 
-from benchmarks.contestants.c_environment import INPUT, OUTPUT
+from benchmarks.contestants.c_environment import INPUT, OUTPUT, OUTPUTS
 from benchmarks.contestants.entry import main, versions
 from benchmarks.contestants.fmu import Fmu
 from benchmarks.task import Member, Outcome, Task
@@ -13,7 +13,9 @@ __all__ = ["run"]
 
 
 def run(task: Task) -> Outcome:
-    """Timed is the loop alone; `what` is `steps` or `values`."""
+    """Timed is the loop alone; `what` is `steps`, `batch` or `values`."""
+    if task.options["what"] == "batch":
+        return _batch(task)
     cart = Fmu(Member("cart", "CartPole", INPUT, OUTPUT), None)
     try:
         cart.fmu.exitInitializationMode()
@@ -24,6 +26,26 @@ def run(task: Task) -> Outcome:
     finally:
         cart.close()
     return Outcome(seconds, {f"cart.{OUTPUT}": last}, versions("fmpy"))
+
+
+def _batch(task: Task) -> Outcome:
+    carts = [Fmu(Member("cart", "CartPole", INPUT, OUTPUT), None) for _ in range(int(task.options["copies"]))]
+    step_size, found = task.system.step_size, [[0.0] * len(OUTPUTS) for _ in carts]
+    references = [carts[0].references[name] for name in OUTPUTS]
+    try:
+        for cart in carts:
+            cart.fmu.exitInitializationMode()
+        started = perf_counter()
+        for point in range(task.points // len(carts)):
+            for number, cart in enumerate(carts):
+                cart.fmu.setReal(cart.inputs, [-1.0 if found[number][0] > 0.0 else 1.0])
+                cart.fmu.doStep(currentCommunicationPoint=point * step_size, communicationStepSize=step_size)
+                found[number] = cart.fmu.getReal(references)
+        seconds = perf_counter() - started
+    finally:
+        for cart in carts:
+            cart.close()
+    return Outcome(seconds, {f"cart.{OUTPUT}": found[-1][0]}, versions("fmpy"))
 
 
 def _steps(cart: Fmu, task: Task) -> float:

@@ -33,6 +33,7 @@ class Fmu:
 
     Attributes:
         fmu: FMPy's object.
+        references: value references by name.
         inputs: value references of the connected input, as FMPy's functions take them.
         outputs: likewise of the output.
         messages: what it has logged.
@@ -41,7 +42,7 @@ class Fmu:
     def __init__(self, member: Member, stop_time: float | None) -> None:
         path = str(FMUS / f"{member.fmu}.fmu")
         description = read_model_description(path, validate=False)
-        references = {variable.name: variable.valueReference for variable in description.modelVariables}
+        self.references = references = {one.name: one.valueReference for one in description.modelVariables}
         self.inputs = [references[member.input]]
         self.outputs = [references[member.output]]
         self.messages: list[tuple[Any, ...]] = []

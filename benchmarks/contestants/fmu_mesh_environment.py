@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from time import perf_counter
 
+import numpy as np
+
 import fmu_mesh
+from benchmarks.contestants.c_environment import OUTPUTS
 from benchmarks.contestants.entry import FMUS, main, versions
 from benchmarks.task import Outcome, Task
 
@@ -13,9 +16,13 @@ __all__ = ["run"]
 
 
 def run(task: Task) -> Outcome:
-    """Timed is the loop alone; `what` is `steps`, `state`, `values` or `open`."""
+    """Timed is the loop alone; `what` is `steps`, `batch`, `state`, `values` or `open`."""
     mesh = fmu_mesh.Mesh("environment", step_size=task.system.step_size, stop_time=None)
     mesh.add("cart", fmu=FMUS / "CartPole.fmu")
+    if task.options["what"] == "batch":
+        return _batch(mesh, task)
+    if task.options["what"] == "batch_state":
+        return _batch_states(mesh, task)
     with mesh.open() as system:
         system.reset()  # from now on there is a state of point 0
         loop = _LOOPS[task.options["what"]]
@@ -25,7 +32,34 @@ def run(task: Task) -> Outcome:
     return Outcome(seconds, {"cart.theta": last}, versions("fmu-mesh", "numpy"))
 
 
-def _steps(_: fmu_mesh.Mesh, system: fmu_mesh.System, points: int) -> float:
+def _batch(mesh: fmu_mesh.Mesh, task: Task) -> Outcome:
+    copies = int(task.options["copies"])
+    names = [f"cart.{name}" for name in OUTPUTS]
+    with mesh.batch(copies) as batch:
+        found = np.zeros((copies, len(names)))
+        started = perf_counter()
+        for _ in range(task.points // copies):
+            batch.set("cart.force", np.where(found[:, 0] > 0.0, -1.0, 1.0))
+            batch.step()
+            batch.get(names, out=found)
+        seconds = perf_counter() - started
+    return Outcome(seconds, {names[0]: float(found[-1, 0])}, versions("fmu-mesh", "numpy"))
+
+
+def _batch_states(mesh: fmu_mesh.Mesh, task: Task) -> Outcome:
+    copies = int(task.options["copies"])
+    with mesh.batch(copies) as batch:
+        batch.reset()  # from now on there are states of point 0
+        found = np.zeros(copies)
+        started = perf_counter()
+        for _ in range(task.points // copies):
+            batch.reset()
+            batch.get("cart.theta", out=found)
+        seconds = perf_counter() - started
+    return Outcome(seconds, {"cart.theta": float(found[-1])}, versions("fmu-mesh", "numpy"))
+
+
+def _steps(_mesh: fmu_mesh.Mesh, system: fmu_mesh.System, points: int) -> float:
     found = 0.0
     for _ in range(points):
         system.set("cart.force", -1.0 if found > 0.0 else 1.0)
@@ -34,7 +68,7 @@ def _steps(_: fmu_mesh.Mesh, system: fmu_mesh.System, points: int) -> float:
     return found
 
 
-def _states(_: fmu_mesh.Mesh, system: fmu_mesh.System, points: int) -> float:
+def _states(_mesh: fmu_mesh.Mesh, system: fmu_mesh.System, points: int) -> float:
     found = 0.0
     for _ in range(points):
         system.reset()

@@ -1,29 +1,29 @@
-"""A mesh as an environment of Gymnasium: the cart of `fmus/CartPole.fmu`, and a pole to keep up.
+"""The task of the cart of `configs/cart_pole.yaml`: keep the pole up.
 
-A training program steps the mesh in its own process (`Mesh.open`). From the root of the repository, with random pushes:
+A training program steps the mesh in its own process. From the root of the repository, one episode with random pushes:
 
     python examples/cart_pole/environment.py
 """
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-import fmu_mesh
+from fmu_mesh.gym import MeshEnv, Step, Task
 
-__all__ = ["CartPole"]
+__all__ = ["STATE", "TASK"]
 
-STATE = ("x", "der(x)", "theta", "der(theta)")
+STATE = ("cart.x", "cart.der(x)", "cart.theta", "cart.der(theta)")
+"""m, m/s, rad, rad/s."""
+
 STARTS = np.array([0.5, 0.5, 0.2, 0.5])
-"""Largest start values of the state in m, m/s, rad, rad/s."""
+"""Largest start values of the state."""
 
-LIMITS = np.array([4.8, 20.0, 1.6, 20.0], dtype=np.float32)
+LIMITS = np.array([4.8, 20.0, 1.6, 20.0])
 """No episode comes so far."""
 
 LARGEST_FORCE = 10.0
@@ -35,70 +35,46 @@ END_OF_TRACK = 2.4
 FALLEN = 0.8
 """rad."""
 
+Array = NDArray[np.float64]
 
-class CartPole(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Keep the pole up, and the cart near the middle of its track.
 
-    An observation is x, der(x), theta, der(theta). An action is the force as a part of 10 N, from -1 to 1; it is held
-    for 0.02 s. The reward of a step is 1, less what the pole and the cart are off. An episode ends when the pole has
-    fallen or the cart has left its track (terminated), or after 10 s (truncated).
-    """
+def reward(step: Step) -> Array:
+    """1 for each step, less what the pole and the cart are off and what the push costs; 0 when it is over."""
+    off = (step["cart.theta"] / FALLEN) ** 2 + 0.5 * (step["cart.x"] / END_OF_TRACK) ** 2
+    cost = off + 0.01 * (step["cart.force"] / LARGEST_FORCE) ** 2
+    return np.where(is_over(step), 0.0, 1.0 - cost)
 
-    def __init__(self, fmu: str | Path = Path(__file__).parents[2] / "fmus" / "CartPole.fmu") -> None:
-        self.observation_space = Box(-LIMITS, LIMITS, dtype=np.float32)
-        self.action_space = Box(-1.0, 1.0, (1,), dtype=np.float32)
-        self._mesh = fmu_mesh.Mesh("cart_pole", step_size=0.02, stop_time=10.0)
-        self._mesh.add("cart", fmu=str(fmu))
-        self._system: fmu_mesh.System | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode from a random state, or from that of `options`, such as `{"theta": 0.1}`."""
-        super().reset(seed=seed)
-        self.close()
-        start = dict(zip(STATE, (STARTS * self.np_random.uniform(-1.0, 1.0, len(STATE))).tolist(), strict=True))
-        start |= options or {}
-        self._system = self._mesh.open(start_values={f"cart.{name}": value for name, value in start.items()})
-        return self._observation(), {}
+def is_over(step: Step) -> NDArray[np.bool_]:
+    """Whether the pole has fallen or the cart has left its track."""
+    return (np.abs(step["cart.theta"]) > FALLEN) | (np.abs(step["cart.x"]) > END_OF_TRACK)
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Push the cart for one step."""
-        system = self._running()
-        system.set("cart.force", LARGEST_FORCE * float(np.clip(action[0], -1.0, 1.0)))
-        system.step()
-        observation = self._observation()
-        x, _, theta, _ = observation.tolist()
-        terminated = abs(x) > END_OF_TRACK or abs(theta) > FALLEN
-        reward = 0.0 if terminated else 1.0 - (theta / FALLEN) ** 2 - 0.1 * (x / END_OF_TRACK) ** 2
-        return observation, reward, terminated, system.point == system.last_point, {}
 
-    def close(self) -> None:
-        """Free the FMU."""
-        if self._system is not None:
-            self._system.close()
-            self._system = None
+def start_values(random: np.random.Generator, copies: int) -> dict[str, Array]:
+    """A random state for each copy."""
+    return dict(zip(STATE, STARTS[:, None] * random.uniform(-1.0, 1.0, (len(STATE), copies)), strict=True))
 
-    def _observation(self) -> NDArray[np.float32]:
-        system = self._running()
-        return np.array([system.get(f"cart.{name}") for name in STATE], dtype=np.float32)
 
-    def _running(self) -> fmu_mesh.System:
-        if self._system is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        return self._system
+TASK = Task(
+    mesh=Path(__file__).parents[2] / "configs" / "cart_pole.yaml",
+    observations=dict(zip(STATE, zip(-LIMITS, LIMITS, strict=True), strict=True)),
+    actions={"cart.force": (-LARGEST_FORCE, LARGEST_FORCE)},
+    reward=reward,
+    terminated=is_over,
+    start_values=start_values,
+)
+"""An action from -1 to 1 stands for -10 N to 10 N, and holds for 0.02 s. An episode takes 10 s at most."""
 
 
 def main() -> None:
     """Let one episode go by with random pushes."""
-    environment = CartPole()
-    environment.reset(seed=1)
-    environment.action_space.seed(1)
-    total, steps, over = 0.0, 0, False
-    while not over:
-        _, reward, terminated, truncated, _ = environment.step(environment.action_space.sample())
-        total, steps, over = total + reward, steps + 1, terminated or truncated
-    environment.close()
+    with closing(MeshEnv(TASK)) as environment:
+        environment.reset(seed=1)
+        environment.action_space.seed(1)
+        total, steps, over = 0.0, 0, False
+        while not over:
+            _, gained, terminated, truncated, _ = environment.step(environment.action_space.sample())
+            total, steps, over = total + gained, steps + 1, terminated or truncated
     print(f"{steps} steps with random pushes: reward {total:.1f}")
 
 

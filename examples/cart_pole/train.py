@@ -1,7 +1,8 @@
 """Trains a small network that balances the pole of `fmus/CartPole.fmu`, and writes it as `policy.onnx`.
 
-The method is the cross-entropy method: draw networks around a mean, let all of them balance from random starts,
-and move the mean to the best ones. It needs numpy only, and onnx to write the file. From the root of the repository:
+The method is the cross-entropy method: draw networks around a mean, let all of them balance from random starts, and
+move the mean to the best ones. All episodes of a generation are copies of one vector environment, which are stepped in
+one call. The method needs numpy only, and onnx to write the file. From the root of the repository:
 
     python examples/cart_pole/train.py --output policy.onnx
 """
@@ -9,105 +10,118 @@ and move the mean to the best ones. It needs numpy only, and onnx to write the f
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import onnx
+from environment import LARGEST_FORCE, TASK
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from fmu_mesh.gym import MeshVectorEnv
+
 Array = NDArray[np.float64]
-
-STEP_SIZE = 0.02
-"""s, as in `balance.yaml`."""
-
-STARTS = np.array([0.5, 0.5, 0.2, 0.5])
-"""Largest start values of x, der(x), theta, der(theta) in m, m/s, rad, rad/s."""
-
-LARGEST_FORCE = 10.0
-"""N."""
 
 HIDDEN = 8
 SHAPES = ((4, HIDDEN), (HIDDEN,), (HIDDEN, 1))
 SIZES = [int(np.prod(shape)) for shape in SHAPES]
 
-CANDIDATES, BEST, EPISODES, STEPS = 64, 12, 24, 400
+
+class Effort(NamedTuple):
+    """How much is tried.
+
+    Attributes:
+        generations: how often the mean moves.
+        candidates: networks in a generation.
+        best: how many of them the mean moves to.
+        episodes: starts that each of them balances from.
+        steps: of an episode of the training, 0.02 s each.
+    """
+
+    generations: int = 60
+    candidates: int = 24
+    best: int = 5
+    episodes: int = 4
+    steps: int = 300
 
 
 def main() -> None:
-    """Train, and write the best network."""
+    """Train, write the network, and show what it is worth."""
     parser = argparse.ArgumentParser(description="Train a policy for CartPole.fmu.")
     parser.add_argument("--output", type=Path, default=Path(__file__).with_name("policy.onnx"))
-    parser.add_argument("--generations", type=int, default=60)
+    parser.add_argument("--generations", type=int, default=Effort().generations)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    mean = trained(options.generations, np.random.default_rng(options.seed))
-    onnx.save(as_onnx(mean), options.output)
+    network = trained(Effort(generations=options.generations), options.seed)
+    onnx.save(as_onnx(network), options.output)
     print(f"{options.output}: {options.output.stat().st_size} bytes")
+    print(f"reward of an episode: {worth(network):.1f} with the network, {worth(None):.1f} with random pushes")
 
 
-def trained(generations: int, random: np.random.Generator) -> Array:
-    """The parameters of a network after so many generations."""
+def trained(effort: Effort, seed: int) -> Array:
+    """The parameters of a network that was trained."""
+    random = np.random.default_rng(seed)
     mean, spread = np.zeros(sum(SIZES)), np.ones(sum(SIZES))
-    for generation in range(generations):
-        candidates = mean + spread * random.standard_normal((CANDIDATES, len(mean)))
-        starts = STARTS * random.uniform(-1.0, 1.0, (EPISODES, 4))
-        costs = cost(candidates, starts)
-        best = candidates[np.argsort(costs)[:BEST]]
-        mean, spread = best.mean(axis=0), best.std(axis=0) + 0.1 * 0.95**generation
-        if generation % 10 == 9:
-            print(f"generation {generation + 1}: cost {cost(mean[None], starts)[0]:.4f}")
+    with closing(MeshVectorEnv(TASK, effort.candidates * effort.episodes)) as environments:
+        for generation in range(effort.generations):
+            networks = mean + spread * random.standard_normal((effort.candidates, len(mean)))
+            starts = TASK.start_values(random, effort.episodes)
+            # All networks balance from the same starts: it is the network that makes the difference.
+            starts = {name: np.tile(values, effort.candidates) for name, values in starts.items()}
+            act = acting(np.repeat(networks, effort.episodes, axis=0))
+            rewards = (
+                episode_rewards(environments, act, effort.steps, starts).reshape(effort.candidates, -1).mean(axis=1)
+            )
+            best = networks[np.argsort(-rewards)[: effort.best]]
+            mean, spread = best.mean(axis=0), best.std(axis=0) + 0.1 * 0.95**generation
+            if generation % 10 == 9:
+                print(f"generation {generation + 1}: reward {rewards.max():.1f} of {effort.steps}")
     return mean
 
 
-def cost(candidates: Array, starts: Array) -> Array:
-    """The mean cost of each candidate over all starts and steps."""
-    state = np.broadcast_to(starts, (len(candidates), *starts.shape))
-    total = np.zeros(state.shape[:2])
-    fallen = np.zeros(state.shape[:2], dtype=bool)
-    for _ in range(STEPS):
-        force = forces(candidates, state)
-        state = np.where(fallen[..., None], state, runge_kutta(state, force))
-        fallen |= (np.abs(state[..., 2]) > 0.8) | (np.abs(state[..., 0]) > 2.4)
-        total += np.where(fallen, 2.0, 4.0 * state[..., 2] ** 2 + 0.2 * state[..., 0] ** 2 + 1e-4 * force**2)
-    return np.asarray(total.mean(axis=1) / STEPS)
+def worth(network: Array | None, episodes: int = 100, seed: int = 1) -> float:
+    """The mean reward of episodes of 10 s; None: of random pushes."""
+    with closing(MeshVectorEnv(TASK, episodes)) as environments:
+        environments.action_space.seed(seed)
+        act = acting(network[None]) if network is not None else lambda _: environments.action_space.sample()
+        starts = TASK.start_values(np.random.default_rng(seed), episodes)
+        return float(episode_rewards(environments, act, 500, starts).mean())
 
 
-def forces(candidates: Array, state: Array) -> Array:
-    """The force in N of each candidate in each of its episodes."""
-    first, bias, second = parts(candidates)
-    hidden = np.tanh(state @ first + bias[:, None, :])
-    return np.asarray(LARGEST_FORCE * np.tanh((hidden @ second)[..., 0]))
+def episode_rewards(
+    environments: MeshVectorEnv, act: Callable[[Array], Array], steps: int, starts: dict[str, Array]
+) -> Array:
+    """The sum of the rewards of the first episode of each copy, over so many steps at most."""
+    observations, _ = environments.reset(options=starts)
+    total, goes_on = np.zeros(environments.num_envs), np.ones(environments.num_envs, dtype=bool)
+    for _ in range(steps):
+        observations, rewards, terminated, truncated, _ = environments.step(act(observations))
+        total += np.where(goes_on, rewards, 0.0)
+        goes_on &= ~(terminated | truncated)
+        if not goes_on.any():
+            break
+    return total
 
 
-def parts(candidates: Array) -> list[Array]:
-    """The parameters as matrices, of shape (candidates, ...)."""
-    pieces = np.split(candidates, np.cumsum(SIZES)[:-1], axis=-1)
-    return [piece.reshape(*candidates.shape[:-1], *shape) for piece, shape in zip(pieces, SHAPES, strict=True)]
+def acting(networks: Array) -> Callable[[Array], Array]:
+    """What each network does, or one network everywhere: observations of shape (copies, 4) to actions (copies, 1)."""
+    first, bias, second = parts(networks)
+    return lambda seen: np.tanh(np.tanh(seen[:, None, :] @ first + bias[:, None, :]) @ second)[:, 0]
 
 
-def runge_kutta(state: Array, force: Array) -> Array:
-    """The states one step later, while the force is held."""
-    k1 = rates(state, force)
-    k2 = rates(state + 0.5 * STEP_SIZE * k1, force)
-    k3 = rates(state + 0.5 * STEP_SIZE * k2, force)
-    k4 = rates(state + STEP_SIZE * k3, force)
-    return state + STEP_SIZE / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+def parts(networks: Array) -> list[Array]:
+    """The parameters as matrices, of shape (networks, ...)."""
+    pieces = np.split(networks, np.cumsum(SIZES)[:-1], axis=-1)
+    return [piece.reshape(*networks.shape[:-1], *shape) for piece, shape in zip(pieces, SHAPES, strict=True)]
 
 
-def rates(state: Array, force: Array) -> Array:
-    """How fast the states change, with the default parameters of the FMU (docs/models/CartPole.md)."""
-    pole_mass, mass, length, gravity = 0.1, 1.1, 0.5, 9.81
-    _, velocity, angle, turning = np.moveaxis(state, -1, 0)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    push = (force + pole_mass * length * turning**2 * sine) / mass
-    turn = (gravity * sine - cosine * push) / (length * (4.0 / 3.0 - pole_mass * cosine**2 / mass))
-    return np.stack([velocity, push - pole_mass * length * turn * cosine / mass, turning, turn], axis=-1)
-
-
-def as_onnx(mean: Array) -> onnx.ModelProto:
+def as_onnx(network: Array) -> onnx.ModelProto:
     """The network with one input of four elements and one output: observation and force."""
-    weights = dict(zip(("first", "bias", "second"), (piece.astype(np.float32) for piece in parts(mean)), strict=True))
+    names = ("first", "bias", "second")
+    weights = dict(zip(names, (piece.astype(np.float32) for piece in parts(network)), strict=True))
     weights["scale"] = np.array(LARGEST_FORCE, dtype=np.float32)
     nodes = [
         helper.make_node("MatMul", ["observation", "first"], ["product"]),

@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from ..results.recording import Columns, ResultFile, joined
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
+from ..run.preparing import OtherStartValues
 from ..run.repeated import RepeatedRuns
 from ..run.run_plan import RunPlan
 from ..variables.value_types import DTYPES
@@ -53,25 +55,29 @@ class RepeatedMesh:
     Args:
         mesh: the mesh in words; ``plan`` plans a run of it, as `Mesh.plan`.
         reset: as in `Mesh.repeated`, and so is ``on_hang``.
+        alone: whether nothing else in this process changes its working directory, locale or the like between runs.
         before_close: called with the result of a run, or why it failed, before its instances are closed. With it,
             ``on_hang`` is also called if an FMU crashes then; the thread of the runs never goes on.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a caller may want to hear of
         self,
         mesh: str,
         plan: Callable[..., RunPlan],
         *,
         reset: bool,
         on_hang: Callable[[FmuError], None],
+        alone: bool = False,
         before_close: Callable[[Result | BaseException], None] | None = None,
     ) -> None:
         self._mesh, self._plan = mesh, plan
         self._thread = threading.get_ident()
         self._before_close = before_close
         self._rows: _CollectedRows | None = None
+        self._key: Hashable = None
+        self._planned: _Planned | None = None
         told = self._tell_end if before_close is not None else None
-        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, before_close=told)
+        self._make = partial(RepeatedRuns, on_hang=on_hang, reset=reset, alone=alone, before_close=told)
         self._loaded: list[tuple[RepeatedRuns, Path]] = []
         self._release = weakref.finalize(self, _release, self._loaded, self._thread)
 
@@ -98,17 +104,35 @@ class RepeatedMesh:
             CallRefused: this is not the thread that made this object, or it is closed.
             FmuMeshError: the run ended early; its `result` has what was recorded up to then.
         """
+        if options.output is None and options.record is None:
+            options = replace(options, record="memory")
+        values = dict(options.start_values or {})
+        # A copy: what was given may change.
+        key = msgspec.json.encode((list(values), replace(options, start_values=None).given()), enc_hook=repr)
+        return self.run_planned(key, values, options.given)
+
+    def run_planned(
+        self, key: Hashable, start_values: Mapping[str, Any], options: Callable[[], Mapping[str, Any]]
+    ) -> Result:
+        """As `run`, for a program that knows which of its runs have equal options.
+
+        Args:
+            key: equal for runs whose ``options`` differ in the start values only, of the same variables.
+            start_values: those of the options.
+            options: returns the options as `Mesh.plan` takes them; called where the run has to be planned.
+        """
         if not self._release.alive or threading.get_ident() != self._thread:
             why = "it belongs to the thread that made it" if self._release.alive else "it is closed"
             raise CallRefused(f"run is not possible, because {why}.")
-        if options.output is None and options.record is None:
-            options = replace(options, record="memory")
-        plan = self._plan(**options.given())
-        check_memory(plan, sys.maxsize, to_its_end=True)
-        self._rows = rows = _CollectedRows(plan)
+        others = self._planned.others.taken(start_values) if self._planned is not None and key == self._key else None
+        if others is None or self._planned is None:
+            self._key, self._planned, others = key, None, {}
+            self._planned = _Planned.of(self._plan(**options()))
+        plan = self._planned.run
+        self._rows = rows = _CollectedRows(plan, in_memory=self._planned.in_memory)
         runs = self._runs(plan.mesh)
         try:
-            outcome = runs.run(plan, rows.open)
+            outcome = runs.run(plan, rows.open, others)
         except FmuMeshError as error:
             point = runs.point
             time, warnings = plan.plan.grid.time(point), runs.warnings
@@ -136,19 +160,33 @@ class RepeatedMesh:
         return self._loaded[0][0]
 
 
+class _Planned(NamedTuple):
+    """What runs share that differ in start values only."""
+
+    run: RunPlan
+    others: OtherStartValues
+    in_memory: bool
+
+    @classmethod
+    def of(cls, run: RunPlan) -> _Planned:
+        check_memory(run, sys.maxsize, to_its_end=True)
+        return cls(run, OtherStartValues(run), memory_of(run) is not None)
+
+
 class _CollectedRows:
     """The rows of a run in memory, and in its result file if it has one; see `ResultFile`."""
 
-    def __init__(self, plan: RunPlan) -> None:
-        self._plan = plan
+    def __init__(self, plan: RunPlan, *, in_memory: bool) -> None:
+        self._plan, self._in_memory = plan, in_memory
         self._file: ResultFile | None = None
         nothing = {name: np.zeros(0, DTYPES[type_]) for name, type_ in (types_of(plan.plan.system) or {}).items()}
         self._pieces = [Columns(np.zeros(0), nothing)]
         self.rows = 0
+        self._made: tuple[Outcome, Result] | None = None
 
     def open(self) -> list[ResultFile]:
         """This object, whose file is open now."""
-        if memory_of(self._plan) is None:
+        if not self._in_memory:
             self._file = open_result(self._plan.loaded, self._plan.plan.system)
         return [self]
 
@@ -180,6 +218,12 @@ class _CollectedRows:
             self._file.close()
 
     def result(self, outcome: Outcome) -> Result:
+        """The result of a run that has ended in this way; the same one for the same outcome."""
+        if self._made is None or self._made[0] is not outcome:
+            self._made = outcome, self._result(outcome)
+        return self._made[1]
+
+    def _result(self, outcome: Outcome) -> Result:
         system, file = self._plan.plan.system, self._file.path if self._file is not None else None
         files = ((str(file), outcome.rows),) if file is not None else ()
         outcome = replace(outcome, file=str(file) if file is not None else None, files=files)

@@ -17,6 +17,7 @@ from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_options import SweepOptions
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
 from ..sweeps.variants import Values, read_values
+from ..sweeps.worker_pool import prepare_workers
 from ..text import short_path, shown
 from .arguments import Runs
 from .output.json_output import Failure, failure_of, print_json
@@ -73,6 +74,8 @@ def _sweep(arguments: argparse.Namespace) -> int:
 
 def _planned(arguments: argparse.Namespace) -> PlannedSweep:
     given = given_options(arguments, SweepOptions)
+    if not arguments.slurm and arguments.dask is None:
+        prepare_workers()
     if is_sweep(arguments.config):
         if given.keys() - _OF_FOLDER or any(getattr(arguments, name) for name in ("ssd", "ssv", "vary")):
             text = f"'{arguments.config}' is the folder of a sweep, which says what varies"

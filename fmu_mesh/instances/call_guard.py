@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from typing import Any, Final, TypeVar, cast
 
 import msgspec
@@ -28,6 +29,7 @@ from ..text import short_path
 from ..variables.model_description import Value
 from .contract import BeginsAgain, ChangesProcess, Instance, Prepares
 from .instance_wrapper import AroundNativeSteps
+from .kept_models import RunsAgain
 from .process_end import surviving
 from .process_state import floating_point_changed, kept_mode, kept_state, restore_floating_point
 
@@ -49,10 +51,12 @@ Result = TypeVar("Result")
 # and for each `CallWatch` one thread that waits for the deadlines of its calls. ADR 12 says what is guarded, ADR 56 how
 # the line of a component is found, ADR 57 which steps are taken without Python.
 #
-# They share two attributes. Only the calling thread writes `_call` and `_position` (or the one that crashes in its last
-# call), each with one assignment, and it never waits for the watching thread to look. That one reads both once in a
-# round and compares them with those of the round before. It holds the lock of the condition from there until it waits,
-# so a call that begins meanwhile wakes it.
+# They share three attributes. Only the calling thread writes `_call` and `_position` (or the one that crashes in its
+# last call), each with one assignment, and it never waits for the watching thread to look. That one reads both once in
+# a round and compares them with those of the round before. To wake a thread takes longer than a short call, so it looks
+# on its own four times a second. After a round in which nothing was called, it writes `_asleep`, looks once more, and
+# sleeps until it is woken; whoever begins a call looks at `_asleep` after it has written the call. It holds the lock of
+# the condition from there until it waits, so that a wake-up between the two is not lost.
 #
 # A call that hangs cannot be cancelled: no exception of Python reaches C, and a signal would interrupt the FMU
 # anywhere, perhaps while it holds a lock of malloc. So an overrun is told on the watching thread, and whoever owns the
@@ -68,7 +72,7 @@ Result = TypeVar("Result")
 # component come from `sys._current_frames`: `faulthandler` tells the same only to a file.
 
 _WATCH_S: Final = 0.25
-"""How often a step is compared with what it was: an overrun is told this much late at most."""
+"""How often a call or a step is compared with what it was: an overrun is told this much late at most."""
 _DO_STEP: Final = "doStep"
 
 _functions: dict[int, str] = {}
@@ -115,6 +119,7 @@ class CallWatch:
         self._position: Callable[[], tuple[str, int, str]] | None = None
         self._step_limit_s = 0.0
         self._closed = False
+        self._asleep = False
         self._crash: FmuError | None = None
         self._thread = threading.Thread(target=self._run, name="call watch", daemon=True)
         self._thread.start()
@@ -123,18 +128,20 @@ class CallWatch:
     def calling(self, instance: str, kind: type[FmuError], setting: str, limit_s: float) -> Iterator[None]:
         """Around one call of an FMU, of ``limit_s`` at most; ``setting`` is the key of `timeouts` with this limit."""
         self._call = _Call(instance, kind, setting, limit_s, time.monotonic())
-        self._notify()
+        if self._asleep:
+            self._notify()
         try:
             yield
         finally:
             self._call = None  # the watching thread reads this when it wakes up
 
     def surviving(self, instance: str) -> AbstractContextManager[None]:
-        """Around the last call of an FMU: a crash is reported as a call that does not return."""
+        """Around the last calls of FMUs: a crash is reported as a call that does not return."""
 
         def crashed(how: str) -> None:
-            function = current_function(self._caller) or "its last call"
-            self._crash = FmuError(f"the FMU ended its process in {function} ({how})", instance=instance)
+            function, call = current_function(self._caller) or "its last call", self._call
+            name = call.instance if call is not None else instance
+            self._crash = FmuError(f"the FMU ended its process in {function} ({how})", instance=name)
             self._call = _Call(instance, FmuError, "terminate", 0.0, time.monotonic())  # whose deadline is now
             self._notify()
 
@@ -147,7 +154,8 @@ class CallWatch:
         A step has the whole time for all that it does, so the last one is for the error only.
         """
         self._position, self._step_limit_s = position, limit_s
-        self._notify()
+        if self._asleep:
+            self._notify()
         try:
             yield
         finally:
@@ -171,10 +179,10 @@ class CallWatch:
                 if self._closed:
                     return
                 call, position = self._call, self._position
-                if call is None:
-                    self._changed.wait(_WATCH_S if position is not None else None)
-                elif call == watched:
-                    self._changed.wait(min(_WATCH_S, max(0.0, since + call.limit_s - clock())))
+                if call is None or call == watched:
+                    left = since + call.limit_s - clock() if call is not None else _WATCH_S
+                    if not self._changed.wait(min(_WATCH_S, max(0.0, left))):
+                        self._rest()
                 if call is not self._call or position is not self._position:
                     continue
             place: object = call
@@ -190,6 +198,13 @@ class CallWatch:
             if now - since >= call.limit_s:
                 self._on_overrun(self._overrun(call, now - since, otherwise))
                 return
+
+    def _rest(self) -> None:
+        """If nothing is called, sleep until a call begins; it holds the lock of the condition."""
+        self._asleep = True
+        if self._call is None and self._position is None and not self._closed:
+            self._changed.wait()
+        self._asleep = False
 
     def _overrun(self, call: _Call, seconds: float, otherwise: str) -> FmuError:
         return self._crash or call.kind(
@@ -286,8 +301,10 @@ class Guarded(AroundNativeSteps):
         self._running = False
         self._careful = False
         self._trusted = is_harmless
+        self._is_watched = not isinstance(watch, Unwatched)
         with watch.calling(name, LoadFailed, "call", timeouts.call), self._kept():
             super().__init__(open_())
+        self.runs_again = isinstance(self._instance, RunsAgain) and self._instance.runs_again
         if isinstance(self._instance, ChangesProcess) and self._instance.changes_process:
             self._careful = True
 
@@ -330,17 +347,37 @@ class Guarded(AroundNativeSteps):
         with self._kept():
             self._instance.set_values(values)
 
+    def end_run(self) -> bool:
+        """See `RunsAgain`; who ends several looks after crashes and the state of the process once for all of them."""
+        if self._careful or not self.runs_again:
+            return False
+        watch, name, self._running = self._watch, self._name, False
+        ending = watch.calling(name, FmuError, "terminate", self._timeouts.terminate)
+        with ending, kept_mode():
+            return cast("RunsAgain", self._instance).end_run()
+
+    def run_again(self) -> None:
+        """See `RunsAgain`. What was harmless until now is taken for it."""
+        self._trusted = self.is_harmless
+        with self._watch.calling(self._name, LoadFailed, "call", self._timeouts.call), self._kept():
+            cast("RunsAgain", self._instance).run_again()
+
+    def bind_again(self) -> None:
+        """See `RunsAgain`."""
+        self._forward(cast("RunsAgain", self._instance).bind_again)
+        self._running = True
+
     def setter(self, name: str) -> Callable[[Value], None] | None:
         """See `Prepares`; nothing is prepared where calls are watched."""
         own = self._preparing
         put = own.setter(name) if own is not None else None
-        return self._with_kept_mode(put) if put is not None else None
+        return partial(self._forward, put) if put is not None else None
 
     def getter(self, name: str) -> Callable[[], Value] | None:
         """See `setter`."""
         own = self._preparing
         get = own.getter(name) if own is not None else None
-        return self._with_kept_mode(get) if get is not None else None
+        return partial(self._forward, get) if get is not None else None
 
     def close(self) -> None:
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
@@ -356,24 +393,19 @@ class Guarded(AroundNativeSteps):
     @property
     def _preparing(self) -> Prepares | None:
         own = self._instance
-        return own if isinstance(own, Prepares) and isinstance(self._watch, Unwatched) else None
-
-    def _with_kept_mode(self, call: Callable[..., Result]) -> Callable[..., Result]:
-        """As `_forward` between two steps, in less time."""
-
-        def kept(*arguments: Any) -> Result:  # noqa: ANN401 those of the call
-            if self._careful:
-                return self._forward(call, *arguments)
-            was_changed = floating_point_changed()
-            try:
-                return call(*arguments)
-            finally:
-                if not was_changed and floating_point_changed():
-                    restore_floating_point()
-
-        return kept
+        return own if isinstance(own, Prepares) and not self._is_watched else None
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
+        if self._careful or self._is_watched or not (self._running or self._trusted):
+            return self._looked_after(call, *arguments)
+        was_changed = floating_point_changed()
+        try:
+            return call(*arguments)
+        finally:
+            if not was_changed and floating_point_changed():
+                restore_floating_point()
+
+    def _looked_after(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 as above
         if self._running:
             watched = self._watch.calling(self._name, StepFailed, "step", self._timeouts.step)
         else:

@@ -6,6 +6,7 @@ Also owns the form in which a wrapper stores its own part of a state next to tha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar, cast
 
 import msgspec
@@ -123,19 +124,24 @@ def unpacked(data: bytes, kind: type[Own], instance: str | None) -> tuple[Own, b
 class AroundNativeSteps(AroundInstance[Instance]):
     """Also forwards the calls of `StepsNatively`, where the inner instance has such steps."""
 
+    @cached_property
+    def _stepping(self) -> StepsNatively | None:
+        """The inner instance, if it has such steps: to ask whether it has takes longer than a step."""
+        return self._instance if isinstance(self._instance, StepsNatively) else None
+
     @property
     def native(self) -> NativeStep | None:
         """See `StepsNatively`; None if the inner instance has no such steps."""
-        return self._instance.native if isinstance(self._instance, StepsNatively) else None
+        return self._stepping.native if self._stepping is not None else None
 
     @property
     def stage(self) -> int:
         """See `StepsNatively`; `IN_PYTHON` if the inner instance has no such steps."""
-        return self._instance.stage if isinstance(self._instance, StepsNatively) else Stage.IN_PYTHON
+        return self._stepping.stage if self._stepping is not None else Stage.IN_PYTHON
 
     def check_rows(self, spans: Sequence[Span]) -> bool:
         """See `StepsNatively`; False if the inner instance has no such steps."""
-        return self._instance.check_rows(spans) if isinstance(self._instance, StepsNatively) else False
+        return self._stepping.check_rows(spans) if self._stepping is not None else False
 
     def access(self, verb: Literal["Get", "Set"], names: Sequence[str]) -> CopyCall | None:
         """See `AccessedNatively`; None if the inner instance is none."""

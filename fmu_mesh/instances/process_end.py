@@ -85,10 +85,11 @@ def surviving(on_crash: Callable[[str], None]) -> Iterator[None]:
     _handle_exit()
     for number in _SIGNALS:
         action = ctypes.create_string_buffer(_ACTION_BYTES)
-        _libc.sigaction(number, None, action)
+        _libc.sigaction(number, _own_action(), action)  # one call of the system for most, and not two
         if ctypes.c_void_p.from_buffer(action).value is None:  # the default
-            _libc.signal(number, _handler)
             _handled.add(number)
+        elif number not in _handled:
+            _libc.sigaction(number, action, None)
     _closing[threading.get_ident()] = os.getpid(), on_crash
     try:
         yield
@@ -113,6 +114,16 @@ def _crashed(number: int) -> None:
 
 
 _handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(_crashed)
+
+
+@cache
+def _own_action() -> ctypes.Array[ctypes.c_char]:
+    """The `struct sigaction` of the handler, as `signal` of the C library fills it in."""
+    action, before = (ctypes.create_string_buffer(_ACTION_BYTES) for _ in range(2))
+    _libc.sigaction(signal.SIGFPE, None, before)
+    _libc.signal(signal.SIGFPE, _handler)
+    _libc.sigaction(signal.SIGFPE, before, action)
+    return action
 
 
 @cache

@@ -10,7 +10,7 @@ from typing import cast
 
 from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.contract import StepsNatively
-from ..instances.process_state import floating_point_changed, restore_floating_point
+from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
@@ -77,6 +77,11 @@ class BurstEngine(Engine):
         self._address = ctypes.addressof(self._node)
         for runner in self.runners:
             runner.refit()
+
+    def begin_again(self, looked_after: ProcessState | None) -> None:
+        """See `Engine`."""
+        super().begin_again(looked_after)
+        self._node.note(allowed=0, stride=1, patience=0)  # nothing of the grant before is known any more
 
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library

@@ -102,6 +102,15 @@ class Engine(ABC):
     def follow_inputs(self, runner: Runner) -> None:  # noqa: B027  an engine whose steps ask the runner needs nothing
         """On the main thread, between steps: inputs over time of the runner change in other steps than before."""
 
+    def begin_again(self, looked_after: ProcessState | None) -> None:
+        """All runners begin another run (`Runner.bind_again`).
+
+        ``looked_after`` is the state of the process now; None: it is to be as it was before.
+        """
+        self.waited_s, self.is_blocked, self._looked_after = 0.0, False, looked_after or self._looked_after
+        for unit, _ in zip(self._units, self.units, strict=False):
+            unit.note(tick=0, next=0, spent_ns=0, blocked_by=None)
+
     def run(self, wait_s: float, *, eager: bool, quiet: bool = False) -> bool:
         """Step for about a millisecond, and wait for up to ``wait_s`` where nothing can step; whether there was a step.
 
@@ -121,11 +130,15 @@ class Engine(ABC):
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
-                self._look_at = perf_counter() + STATE_CHECK_S
-                if self._looked_after.restore():
-                    for runner in self.runners:
-                        runner.take_care()
+                self.look_after()
         return stepped
+
+    def look_after(self) -> None:
+        """Restore the state of the process, if a model has changed it since the first step."""
+        self._look_at = perf_counter() + STATE_CHECK_S
+        if self._looked_after is not None and self._looked_after.restore():
+            for runner in self.runners:
+                runner.take_care()
 
     @abstractmethod
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:

@@ -7,7 +7,8 @@ the values of the last one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from types import MappingProxyType
 
 from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, InitializationFailed
@@ -19,7 +20,7 @@ from ..system.feeds import FeedColumn
 from ..system.initialization_plan import Loop
 from ..system.layout import Column
 from ..system.plan import Link, NodePlan
-from ..variables.value_types import Value, split_element
+from ..variables.value_types import PlainValue, Value, split_element
 from ..wire.frames import initial_values
 from .links import OutLink
 from .stepping import Runner
@@ -68,8 +69,19 @@ class Initialization:
         for name, value in initial_values(link, level, data).items():
             self._known[link.source, name, sweep if iterated else None] = value
 
-    def run(self, runners: Collection[Runner]) -> None:
+    def run(
+        self,
+        runners: Collection[Runner],
+        start_values: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
+        *,
+        again: bool = False,
+    ) -> None:
         """Take all instances through Initialization Mode; afterwards their outputs are those of point 0.
+
+        Args:
+            runners: the instances.
+            start_values: by instance and variable, those that are not as in the plan.
+            again: whether the instances were bound for an earlier run.
 
         Raises:
             DeadlineExceeded: the initial value of another node did not come in time.
@@ -79,7 +91,8 @@ class Initialization:
         grid = self._plan.grid
         for runner in runners:
             stop_time = grid.told_stop_time(runner.plan.step_points)
-            runner.instance.enter_initialization(grid.start_time, stop_time, runner.plan.start_values)
+            values = {**runner.plan.start_values, **start_values.get(runner.name, {})}
+            runner.instance.enter_initialization(grid.start_time, stop_time, values)
         self._end = self._clock() + self._plan.timeouts.initialize
         loops = {loop.first: loop for loop in self._plan.loops}
         iterated = {level for loop in self._plan.loops for level in range(loop.first, loop.last + 1)}
@@ -97,7 +110,7 @@ class Initialization:
         self.out_links.clear()
         for runner in runners:
             runner.instance.exit_initialization()
-            runner.bind()
+            runner.bind_again() if again else runner.bind()
 
     def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
         """Iterate the levels of a loop until its values are consistent."""

@@ -12,7 +12,8 @@ from typing import NamedTuple, Protocol, cast
 
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
-from ..instances.instance_wrapper import AroundInstance
+from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
+from ..instances.kept_models import RunsAgain
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -105,6 +106,18 @@ class Runner:
         for part, kept in zip(self.outputs.parts, row, strict=False):
             part[slot] = kept
         self.refit()
+
+    def bind_again(self) -> None:
+        """As `bind`, for an instance that has begun another run; see `RunsAgain`."""
+        self.outputs.stamps[: self.step + 1] = 0  # of the rows of the run before
+        connected = [own.target for source in self.sources for own in source.transfer.columns]
+        fill_unconnected(self.inputs, connected, self.instance.get_values)
+        cast("RunsAgain", self.instance).bind_again()
+        own = self.instance.native if isinstance(self.instance, AroundNativeSteps) else None
+        component = own.component if own is not None else None
+        self.table.note(component=component, step=0, stage=native.Stage.WAITING, outcome=0)
+        for gate in self.table.gates[: self.table.n_gates]:
+            gate.note(known=0)
 
     def begin(self) -> None:
         """The outputs after Initialization Mode are complete: row 0.

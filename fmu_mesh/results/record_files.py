@@ -95,7 +95,7 @@ class RecordFiles:
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
-        self._keys = KeysFile(files[0].path) if files else None
+        self._keys = KeysFile(files[0].path) if files and files[0].path.name else None
         self._files = [
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)
             for number, file in enumerate(files)

@@ -24,8 +24,11 @@ def merged(values: Mapping[str, Value], layout: Layout, get: Get) -> dict[str, V
 
     ``get`` reads the current values of variables; the other elements of an array keep them.
     """
+    found = {name: layout.column(name) for name in values}
+    if all(_is_number(column, name) and isinstance(values[name], float) for name, column in found.items()):
+        return dict(values)
     row = Ring(layout, 1)
-    columns = {name: layout.column(name).name for name in values}
+    columns = {name: column.name for name, column in found.items()}
     arrays = list(dict.fromkeys(column for name, column in columns.items() if name != column))
     if arrays:
         for array, value in zip(arrays, get(arrays), strict=True):
@@ -37,9 +40,16 @@ def merged(values: Mapping[str, Value], layout: Layout, get: Get) -> dict[str, V
 
 def element_of(value: Value, column: Column, name: str) -> Value:
     """The element called ``name`` of the value of a column, or the value itself if that is the column's own name."""
+    if _is_number(column, name) and isinstance(value, float):
+        return value
     row = Ring(Layout((column,)), 1)
     row.put(0, column.name, value)
     return row.value(0, name)
+
+
+def _is_number(column: Column, name: str) -> bool:
+    """Whether the value of a column called ``name`` is the same in a ring: to make one takes a while."""
+    return column.type == "Float64" and not column.shape and column.name == name
 
 
 def fill_unconnected(ring: Ring, connected: Iterable[str], get: Get) -> None:

@@ -742,3 +742,17 @@ PUBLIC void copies_read(const Copy *copies, const CopyOutput *outputs, int64_t n
       memcpy(to + i * stride, from, (size_t)size);
   }
 }
+
+/* Bring the `wanted` copies back to where they were: each has some states, one for each FMU, and memory that was kept. Returns
+ * the number of the first copy whose FMU refuses its state, or that has none; `n` if there is none. */
+PUBLIC int64_t copies_restore(const CopyCall *states, int64_t n_states, const Keep *keeps, int64_t n_keeps, int64_t n,
+                              const uint8_t *wanted) {
+  for (int64_t i = 0; i < n; i++) {
+    if (!wanted[i]) continue;
+    const CopyCall *own = &states[i * n_states];
+    const Keep *keep = &keeps[i * n_keeps];
+    if (keep->kept == NULL || copies_call(own, n_states, NULL, NULL, 0) < n_states) return i;
+    for (int64_t j = 0; j < n_keeps; j++) memcpy(keep[j].memory, keep[j].kept, (size_t)keep[j].size);
+  }
+  return n;
+}

@@ -295,6 +295,12 @@ typedef struct { /* an output in the rows of one copy: `place` in bytes */
   int64_t place;
 } CopyOutput;
 
+typedef struct { /* memory of a copy, and what it has to be again */
+  void *memory;
+  const void *kept;
+  int64_t size;
+} Keep;
+
 enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* why node_run returns */
 
 #endif

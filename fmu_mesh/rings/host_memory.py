@@ -47,6 +47,7 @@ __all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
 
 _NAME: Final = "fmu_mesh"
 _TOKEN_BYTES: Final = 16
+_ZERO: Final = bytes(8)
 
 ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
 """Whether the process that somebody waits for cannot run meanwhile."""
@@ -195,6 +196,12 @@ class HostMemory:
         with self._lock:
             self._rung = True
             self._lock.notify_all()
+
+    def begin_again(self) -> None:
+        """Of private memory: all counters are 0, as at the start; the rings have their rows."""
+        for counter in (self.map.grant, self.map.sent, self.map.finish, *self.map.progress, *self.map.rings):
+            self._view[counter : counter + 8] = _ZERO
+            self._view[counter + 16 : counter + 24] = _ZERO  # what is claimed
 
     def close(self) -> None:
         """Close the descriptor: from now on no other process can open this memory."""

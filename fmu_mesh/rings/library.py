@@ -50,6 +50,8 @@ class LibraryFunctions:
         called = (address, c_int64, address, address, c_int64)
         self.copies_call = CFUNCTYPE(c_int64, *called)(("copies_call", slow))
         read = (address, address, c_int64, c_int64, address, c_int64)
+        restored = (address, c_int64, address, c_int64, c_int64, address)
+        self.copies_restore = CFUNCTYPE(c_int64, *restored)(("copies_restore", slow))
         self.copies_read = CFUNCTYPE(None, *read)(("copies_read", slow))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))
         self.attended = PYFUNCTYPE(None, address)(("node_attended", quick))

@@ -39,6 +39,7 @@ __all__ = [
     "Gate",
     "HeardTable",
     "IncomingTable",
+    "Keep",
     "Last",
     "Lookup",
     "MemberTable",
@@ -170,6 +171,15 @@ def _declared(name: str) -> Callable[[type[Structure]], type[Structure]]:
     return complete
 
 
+class _Changed(Structure):
+    """A structure whose fields others change while the library does not use it."""
+
+    def note(self, **changed: float | None) -> None:
+        """Change fields."""
+        for name, value in changed.items():
+            setattr(self, name, value)
+
+
 @_declared("Place")
 class Participant(Structure):
     """Which process this is among those of the memory."""
@@ -181,7 +191,7 @@ class Wish(Structure):
 
 
 @_declared("Gate")
-class Gate(Structure):
+class Gate(_Changed):
     """The rows of one source, for one delay."""
 
 
@@ -261,7 +271,7 @@ class Track(Structure):
     """An input with a value for each own step that the burst takes before `MemberTable.python_at`."""
 
 
-class _WithArrays(Structure):
+class _WithArrays(_Changed):
     def give(self, **arrays: Sequence[Structure]) -> None:
         """Give it arrays, by the names of their fields, and their lengths; it keeps them."""
         kinds: dict[str, Any] = {field: kind for field, kind, *_ in self._fields_}
@@ -274,11 +284,6 @@ class _WithArrays(Structure):
 class EquationsTable(_WithArrays):
     """The equations of a model-exchange FMU, and their solver."""
 
-    def note(self, **changed: float | None) -> None:
-        """Change fields; see `ModelPlace`."""
-        for name, value in changed.items():
-            setattr(self, name, value)
-
 
 @_declared("Member")
 class MemberTable(_WithArrays):
@@ -286,7 +291,7 @@ class MemberTable(_WithArrays):
 
 
 @_declared("Unit")
-class UnitTable(Structure):
+class UnitTable(_Changed):
     """Members that step together."""
 
 
@@ -388,7 +393,7 @@ class StreamsTable(_WithArrays):
 
 
 @_declared("Node")
-class NodeTable(Structure):
+class NodeTable(_Changed):
     """All units of a process."""
 
 
@@ -400,6 +405,11 @@ class CopyTable(Structure):
 @_declared("CopyCall")
 class CopyCall(Structure):
     """A getter or setter of one copy, for one variable."""
+
+
+@_declared("Keep")
+class Keep(Structure):
+    """Memory of a copy, and what it has to be again."""
 
 
 @_declared("CopyOutput")

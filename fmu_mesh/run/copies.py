@@ -91,6 +91,7 @@ class Copies:
         self._accesses: dict[tuple[str, Verb, tuple[str, ...]], Any] = {}
         self._columns: dict[tuple[str, str], Any] = {}
         self._first: dict[int, SavedCopy] = {}
+        self._back: _WaysBack | None = None
         self._threads = ExitStack()
         self._looked_after: ProcessState | None = None
         self._look_at = 0.0
@@ -323,20 +324,30 @@ class Copies:
         Raises:
             FmuError: one cannot be initialized; it has ended then, and so have those after it that were not reset.
         """
-        for number in np.flatnonzero(wanted).tolist():
-            copy = self._copies[number]
-            first = self._first.get(number)
-            if overrides is None and first is not None and number not in self.errors:
-                copy.restore(first)
-                self._back_at(number, 0)
-                continue
+        rest = wanted
+        if overrides is None and self._back is not None:
+            rest = wanted & ~self._back.restore(wanted & ~self._ended)
+            self._back_at(wanted & ~rest, 0)
+        for number in np.flatnonzero(rest).tolist():
+            copy, first = self._copies[number], self._first.pop(number, None)
             if first is not None:
-                copy.free(self._first.pop(number))
+                copy.free(first)
+            if self._back is not None:
+                self._back.forget(number)
             self._ended[number] = True
             copy.close()
             self._begin(number, overrides(number) if overrides is not None else {})
             if overrides is None and self.why_not_saved is None:
-                self._first[number] = copy.save(0)
+                self._note_first(number)
+
+    def _note_first(self, number: int) -> None:
+        """A copy is at its first point, and may come back there."""
+        self._first[number] = first = self._copies[number].save(0)
+        by_calls = self._copies[number].restored_by(first)
+        if by_calls is not None and native.library is not None:
+            calls, keeps = by_calls
+            self._back = self._back or _WaysBack(len(self._copies), len(calls), len(keeps))
+            self._back.note(number, *by_calls)
 
     def _begin(self, number: int, overrides: Overrides) -> None:
         copy = self._copies[number]
@@ -350,12 +361,14 @@ class Copies:
             columns[number] = copy.column(*own)
         self._back_at(number, 0)
 
-    def _back_at(self, number: int, point: int) -> None:
-        self.errors.pop(number, None)
-        self._ended[number] = False
-        self.points[number] = self._goals[number] = point
+    def _back_at(self, which: Truths | int, point: int) -> None:
+        """Copies are at a point, or one is."""
+        for number in [which] if isinstance(which, int) else np.flatnonzero(which).tolist() if self.errors else ():
+            self.errors.pop(number, None)
+        self._ended[which] = False
+        self.points[which] = self._goals[which] = point
         for steps in self._set_at.values():
-            steps[number] = -1
+            steps[which] = -1
 
     def close(self) -> None:
         """Close all instances and free all models. Never raises; may be called twice."""
@@ -379,6 +392,43 @@ class Copies:
     def _opened(self, name: str) -> Instance:
         opening = opening_of(self._plan, name, self._folder, self._log, self._run.showing)
         return open_instance(replace(opening, content=self._run.contents.get(name), kept=self._models))
+
+
+class _WaysBack:
+    """How the library brings copies back to their first point.
+
+    Args:
+        count: how many copies there are.
+        states: how many FMUs a copy has.
+        keeps: how many pieces of memory.
+    """
+
+    def __init__(self, count: int, states: int, keeps: int) -> None:
+        self._count, self._sizes = count, (states, keeps)
+        self._calls = (native.CopyCall * (count * states))()
+        self._keeps = (native.Keep * (count * keeps))()
+        self._known = np.zeros(count, np.bool_)
+
+    def note(self, number: int, calls: list[native.CopyCall], keeps: list[native.Keep]) -> None:
+        """From now on, a copy comes back by these."""
+        states, pieces = self._sizes
+        self._calls[number * states : (number + 1) * states] = calls
+        self._keeps[number * pieces : (number + 1) * pieces] = keeps
+        self._known[number] = True
+
+    def forget(self, number: int) -> None:
+        """A copy is made anew."""
+        self._known[number] = False
+
+    def restore(self, wanted: Truths) -> Truths:
+        """Bring those back that it knows of ``wanted``; which ones are there."""
+        assert native.library is not None
+        back: Truths = wanted & self._known
+        (states, keeps), every = self._sizes, back.view(np.uint8)
+        addresses = ctypes.addressof(self._calls), states, ctypes.addressof(self._keeps), keeps
+        reached = native.library.copies_restore(*addresses, self._count, every.ctypes.data)
+        back[reached:] = False
+        return back
 
 
 def _in_one_node(plan: Plan) -> Plan:

@@ -34,14 +34,15 @@ from ..system.run_metadata import configuration_of
 from ..system.scenario import Scenario
 from ..system.system import ResolvedSystem, build
 from ..text import nearest_file
-from ..variables.model_description import ModelDescription
+from ..variables.model_description import ModelDescription, Variable
+from ..variables.value_conversion import ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue
 from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 
-__all__ = ["KnownModels", "check_reset", "planned", "planned_reset", "without_keys"]
+__all__ = ["KnownModels", "OtherStartValues", "check_reset", "planned", "planned_reset", "without_keys"]
 
 _MOST_KNOWN = 256
 T = TypeVar("T")
@@ -192,6 +193,63 @@ def planned(
     )
     obstacles.raise_any(run)
     return run
+
+
+class OtherStartValues:
+    """Start values of further runs of a plan that change nothing else of it.
+
+    That is so if each is a finite number or a truth value for a scalar variable that is no structural parameter, if it
+    replaces another start value of the plan, and if the plan uses start values for nothing else: no loop is iterated in
+    Initialization Mode, and there is no scenario, no input with a timeout or a key. The files of the models have to be
+    as they were when the run was planned.
+    """
+
+    def __init__(self, run: RunPlan) -> None:
+        plan = run.plan
+        items = [item for node in plan.nodes.values() for item in node.instances]
+        is_fixed = plan.initialization.loops or any(item.scenario or item.timeouts or item.keys_in for item in items)
+        self._variables: dict[str, Variable] = {}
+        for item in items if not is_fixed else ():
+            description = plan.system.instances[item.name].description
+            for name in item.start_values:
+                variable = description.variable(name)
+                if variable is not None and not variable.shape and variable.causality != "structuralParameter":
+                    self._variables[f"{item.name}.{name}"] = variable
+        paths = [Path(item.fmu) for item in items]
+        self._archives = [path for path in paths if path.suffix == ".fmu" and path.is_file()]
+        self._models = [(path, item.section, run.contents[item.name]) for path, item in zip(paths, items, strict=True)]
+        self._versions = [files.version_at(path) for path in self._archives]
+        if not self._are_as_planned(self._models):
+            self._variables.clear()
+        self._models = [own for own in self._models if own[0] not in self._archives]
+
+    def taken(self, start_values: Mapping[str, object]) -> dict[str, dict[str, PlainValue]] | None:
+        """Those of one run, by `instance.variable`, as values by instance and variable.
+
+        Returns:
+            None: the run has to be planned, because a value changes more, or is wrong.
+        """
+        found = dict[str, dict[str, PlainValue]]()
+        for path, value in start_values.items():
+            variable = self._variables.get(path)
+            if variable is None or not isinstance(value, float | int):
+                return None
+            try:
+                plain = to_plain(to_value(value, variable, finite=True))
+            except ValueRefused:
+                return None
+            found.setdefault(path[: -len(variable.name) - 1], {})[variable.name] = plain
+        with suppress(OSError):
+            if [files.version_at(path) for path in self._archives] == self._versions:
+                return found if self._are_as_planned(self._models) else None
+        return None
+
+    @staticmethod
+    def _are_as_planned(models: Sequence[tuple[Path, InstanceSection, str]]) -> bool:
+        try:
+            return all(content(path, section) == known for path, section, known in models)
+        except LoadFailed:
+            return False
 
 
 def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: int, known: KnownModels) -> RunPlan:

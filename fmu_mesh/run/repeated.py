@@ -1,8 +1,9 @@
 """Runs of a mesh in this process, one after another: `launch --local`, sweeps, optimizers and calibration.
 
 The instances of a run are stepped as those of one node, in bursts, and their rows go from the rings to the result files
-as those of a recorder do. So a short run takes milliseconds, and its floats are those of `LocalSystem`. Between two
-runs there are no instances, but the libraries of their models stay loaded (`fmu_mesh.instances.kept_models`).
+as those of a recorder do. So a short run takes less than a millisecond, and its floats are those of `LocalSystem`.
+Between two runs there are no instances, but the libraries of their models stay loaded
+(`fmu_mesh.instances.kept_models`), and so does what the runs of one plan share (`fmu_mesh.run.hosted_system`).
 """
 
 # Threads: that of the runs calls FMUs, and nobody else does (ADR 12). `interrupt` comes from any thread and rings the
@@ -15,11 +16,11 @@ import logging
 import shutil
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from types import MappingProxyType
+from typing import NamedTuple
 
 from msgspec.structs import replace
 
@@ -33,23 +34,20 @@ from ..errors import (
     ProtocolBroken,
     TerminationRequested,
 )
-from ..instances.call_guard import CallWatch, Guarded
+from ..instances.call_guard import CallWatch
 from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..node.burst_engine import make_engine
 from ..node.engine import Engine
-from ..node.initialization import Initialization
-from ..node.inputs import with_times
-from ..node.stepping import Runner, connect
 from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..rings import native
 from ..rings.host_memory import HostMemory
-from ..system.layout import row_bytes
-from ..system.plan import Plan, make_plan
+from ..system.plan import Plan
+from ..variables.value_types import PlainValue
+from .hosted_system import HostedSystem
 from .local_system import opening_of
 from .one_process import OneProcess
 from .outcome import Outcome, outcome_at
@@ -61,10 +59,7 @@ __all__ = ["RepeatedRuns"]
 
 log = logging.getLogger(__name__)
 
-_NODE = "instances"
 _SCRATCH = "scratch"
-# Of rows that are wider, a few are in memory.
-_WIDE_ROW_BYTES = 2**20
 _WRITE_ROWS = 2048
 # After this time without a step, the deadline of a step is looked at.
 _LONGEST_SLEEP_S = 0.5
@@ -95,6 +90,7 @@ class RepeatedRuns:
         on_hang: called on another thread if a model does not return in time. All complete rows are in the result files.
             The thread that is inside the model cannot be stopped, so the caller has to end the process.
         reset: whether instances stay between runs and are reset, where their models can be reset.
+        alone: whether nothing else in this process changes its state between runs; see `HostedSystem`.
         before_close: called with how a run has ended, before its instances are closed. With it, ``on_hang`` is also
             called if a model crashes while it is closed; the thread of the runs never goes on then.
         open_instance: opens an instance by name, instead of the model of the plan; it is closed here.
@@ -108,44 +104,50 @@ class RepeatedRuns:
         progress: Callable[[int], None] = lambda _point: None,
         on_hang: Callable[[FmuError], None] = lambda error: log.error("%s", error),
         reset: bool = False,
+        alone: bool = False,
         before_close: Callable[[Outcome | BaseException], None] | None = None,
         open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
         models = KeptModels(folder, resets=reset)
         self._around = _Surroundings(folder / _SCRATCH, models, log, progress, open_instance, before_close)
-        self._on_hang = on_hang
+        self._on_hang, self._alone = on_hang, alone
         self._threads = LimitedThreads()
         self._process = OneProcess()
         self._watch: CallWatch | None = None
         self._thread = 0
         self._run: _Run | None = None
+        self._system: HostedSystem | None = None
         self._stop: str | None = None
 
-    def run(self, run: RunPlan, open_files: Callable[[], Sequence[ResultFile]]) -> Outcome:
+    def run(
+        self,
+        run: RunPlan,
+        open_files: Callable[[], Sequence[ResultFile]],
+        start_values: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
+    ) -> Outcome:
         """Run a plan from the first to the last point.
 
         Args:
-            run: the plan; its nodes and its window are not used.
+            run: the plan; its nodes and its window are not used. Runs of the same object, one after another, take less
+                time than those of equal ones.
             open_files: opens the first result files of the plan, or all, or none; each is closed here.
+            start_values: by instance and variable, those that are not as in the plan, and change nothing else of it.
 
         Raises:
             FmuMeshError: a model failed, the run was interrupted, or this system cannot run in one process. The rows
                 that were recorded before are kept.
         """
         try:
-            _check_keys(run.plan)
-            if self._around.open_instance is None:
-                self._process.check(run.plan, run.contents)
             with closing(RowWriter(open_files(), GrowthWatch(run.plan))) as writer:
-                self._run = current = _Run(run, writer, self._around)
+                system = self._system_for(run, len(writer.counted))
+                self._run = current = _Run(system, writer, self._around)
                 if self._stop is not None:
                     current.interrupt(self._stop)
-                self._around.scratch.mkdir(mode=0o700, exist_ok=True)
-                return current.run(self._watch_here(), self._threads)
+                return current.run(start_values, self._threads)
         finally:
             self._stop = None
-            if self._around.scratch.is_dir() and any(self._around.scratch.iterdir()):
-                shutil.rmtree(self._around.scratch, ignore_errors=True)
+            if self._system is None or self._system.loads:
+                self._remove_scratch()
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run under way with `Interrupted` within about a millisecond, or after one step.
@@ -182,6 +184,9 @@ class RepeatedRuns:
     def close(self) -> None:
         """Free all models, and remove their files; on the thread of the runs. May be called twice."""
         run = self._run
+        if self._system is not None:
+            self._system.close()
+            self._system = None
         if run is not None:
             watched = self._watch_here().calling(run.names, FmuError, "terminate", run.timeouts.terminate)
             with watched, kept_state():
@@ -189,8 +194,33 @@ class RepeatedRuns:
         if self._watch is not None:
             self._watch.close()
             self._watch = None
-        shutil.rmtree(self._around.scratch, ignore_errors=True)
+        self._remove_scratch()
         self._threads.close()
+
+    def _system_for(self, run: RunPlan, files: int) -> HostedSystem:
+        """That of the run before, if it can begin again with this plan."""
+        watch, system, around = self._watch_here(), self._system, self._around
+        if system is not None and system.fits(run, files, watch):
+            return system
+        if system is not None:
+            system.close()
+        self._system = None
+        _check_keys(run.plan)
+        if around.open_instance is None:
+            self._process.check(run.plan, run.contents)
+
+        def opened(plan: Plan, name: str) -> Instance:
+            if around.open_instance is not None:
+                return around.open_instance(name)
+            around.scratch.mkdir(mode=0o700, exist_ok=True)
+            opening = opening_of(plan, name, around.scratch, around.log, run.showing)
+            return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
+
+        self._system = HostedSystem(run, files, watch, opened, around.log, alone=self._alone)
+        return self._system
+
+    def _remove_scratch(self) -> None:
+        shutil.rmtree(self._around.scratch, ignore_errors=True)
 
     def _watch_here(self) -> CallWatch:
         """What watches the calls of this thread; to start a thread for each run would take longer than to load it."""
@@ -224,25 +254,24 @@ class _Surroundings(NamedTuple):
 
 
 class _Run:
-    """One run: its instances, what steps them, and how it ended.
+    """One run of a system, and how it ended.
 
     Attributes:
         point: the last point that all instances reached.
         writer: writes its rows.
     """
 
-    def __init__(self, run: RunPlan, writer: RowWriter, surroundings: _Surroundings) -> None:
+    def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings) -> None:
         self.point = 0
-        self._run = run
-        self._plan = plan = _in_one_node(run.plan, len(writer.counted))
-        self._node = plan.nodes[_NODE]
-        self._last = plan.grid.last_point
+        self._system, self._plan, self._node = system, system.plan, system.node
+        self._runners = system.runners
+        self._last = self._plan.grid.last_point
         self.writer = writer
         self._around = surroundings
         self._stop: str | None = None
         self._seconds = 0.0
-        self._runners: dict[str, Runner] = {}
         self._engine: Engine | None = None
+        self._end: Outcome | None = None
         self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
 
     @property
@@ -255,22 +284,22 @@ class _Run:
         """The deadlines."""
         return self._node.timeouts
 
-    def run(self, watch: CallWatch, threads: LimitedThreads) -> Outcome:
+    def run(self, start_values: Mapping[str, Mapping[str, PlainValue]], threads: LimitedThreads) -> Outcome:
         """See `RepeatedRuns.run`."""
+        system = self._system
         with ExitStack() as stack:
-            stack.callback(self._forget)
-            memory = HostMemory.private(self._node.memory, _NODE)
+            stack.push(self._leave)
             threads.limit(self._around.models.loads)
-            self._open(memory, watch, stack)
+            system.open()
             stack.push(self._tell_end)
             threads.limit(self._around.models.loads)  # with the libraries that a component has imported
             stack.callback(self.writer.close)  # before the instances are closed
-            engine = self._initialize(memory)
+            self._engine = engine = system.begin(start_values)
             self.writer.begin(self._plan, self._runners)
             stack.callback(self._write_rest, engine)
             started = time.perf_counter()
-            with watch.stepping(self._position, self._node.timeouts.step):
-                self._step_to_the_end(engine, memory)
+            with system.watch.stepping(self._position, self._node.timeouts.step):
+                self._step_to_the_end(engine, system.memory)
             self._seconds = time.perf_counter() - started
             if self._first is not None and isinstance(self._first[1], FmuError):
                 raise self._first[1]
@@ -278,9 +307,18 @@ class _Run:
 
     def _outcome(self) -> Outcome:
         """How a run ended that did not fail."""
+        if self._end is not None:
+            return self._end
         writer, end = self.writer, self._first[1] if self._first is not None else None
         files, warnings = writer.counted, writer.warnings
-        return outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
+        self._end = outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
+        return self._end
+
+    def _leave(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
+        """Keep the system for the next run, if this one has come to its last point."""
+        self._engine = None
+        if error is not None or self._first is not None or not self._system.end():
+            self._system.close()
 
     def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         if isinstance(error, FmuMeshError):
@@ -293,36 +331,6 @@ class _Run:
         self._stop = reason
         if (engine := self._engine) is not None:
             engine.ring_bell()
-
-    def _open(self, memory: HostMemory, watch: CallWatch, stack: ExitStack) -> None:
-        node = self._node
-        places = {place.instance: place for place in node.rings}
-        for item in node.instances:
-            instance = Guarded(item.name, partial(self._instance, item.name), watch, node.timeouts)
-            stack.callback(instance.close)
-            place = places[item.name]
-            ring, counter = memory.ring(place), memory.counter(place.counter)
-            timed = with_times(instance, item, node.grid, self._around.log)
-            self._runners[item.name] = Runner(item, timed, node.grid, ring, counter)
-        connect(node, self._runners, memory, memory)
-
-    def _instance(self, name: str) -> Instance:
-        run, around = self._run, self._around
-        if around.open_instance is not None:
-            return around.open_instance(name)
-        opening = opening_of(self._plan, name, around.scratch, around.log, run.showing)
-        return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
-
-    def _initialize(self, memory: HostMemory) -> Engine:
-        """Initialization Mode, as `Node` does it; then the outputs are those of point 0."""
-        node, runners = self._node, self._runners.values()
-        Initialization(node, _nothing_comes).run(runners)
-        units = [[self._runners[name] for name in names] for names in node.units]
-        engine = make_engine(node, units, memory, spins=False)
-        for runner in runners:
-            runner.begin()
-        self._engine = engine
-        return engine
 
     def _step_to_the_end(self, engine: Engine, memory: HostMemory) -> None:
         """Grant points, step and write rows; rows that are not written yet are never overwritten."""
@@ -399,13 +407,6 @@ class _Run:
             self.writer.close()
         error.with_hint(self.writer.kept())
 
-    def _forget(self) -> None:
-        """The memory of the run is freed now: it is in no cycle of objects any more."""
-        for runner in self._runners.values():
-            runner.follow(native.MemberTable())
-        self._runners.clear()
-        self._engine = None
-
 
 def _check_keys(plan: Plan) -> None:
     """Refuse a run in one process whose inputs get the values of keys: it has no session of Zenoh.
@@ -418,18 +419,3 @@ def _check_keys(plan: Plan) -> None:
         what = f"'{name}.{keys[0].variable}' gets its values by the key '{keys[0].key}'"
         hint = "Run it in processes, or take the values of an earlier run with `keys_from=...`."
         raise ConfigurationError(f"{what}, which needs processes with Zenoh", hint=hint)
-
-
-def _in_one_node(plan: Plan, files: int) -> Plan:
-    """The plan of the same system with all instances in one node and the first ``files`` result files."""
-    system = plan.system
-    rows = [row_bytes(item.outputs) for node in plan.nodes.values() for item in node.instances]
-    window: int | Literal["auto"] = 1 if max(rows, default=0) > _WIDE_ROW_BYTES else "auto"
-    config = replace(system.config, simulation=replace(system.config.simulation, window=window))
-    instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
-    return make_plan(replace(system, config=config, instances=instances, records=system.records[:files]))
-
-
-def _nothing_comes(_left_s: float) -> None:
-    """In the place of a wait for other nodes."""
-    raise ProtocolBroken("an initial value has no source in this process")

@@ -80,7 +80,6 @@ class SystemCopy:
             for runner in self.runners.values():
                 runner.begin()
             memory.grant.raise_to(node.grid.last_point)
-            self._memory = memory
         except BaseException:
             for guarded in guards:
                 guarded.close()
@@ -159,14 +158,7 @@ class SystemCopy:
     def restore(self, saved: SavedCopy) -> None:
         """Bring it back to a point; see `save`."""
         for name, keeper in self._keepers():
-            state = saved.states[name]
-            access = keeper.state_access(state) if isinstance(keeper, AccessedNatively) else None
-            if (
-                access is None
-                or native.library is None
-                or native.library.copies_call(ctypes.byref(access), 1, None, None, 0) < 1
-            ):
-                keeper.set_state(state)
+            keeper.set_state(saved.states[name])
         first = 0
         for address, size in self._spans():
             ctypes.memmove(address, saved.kept[first : first + size], size)
@@ -174,6 +166,22 @@ class SystemCopy:
         parts = (part for runner in self.runners.values() for part in _texts(runner))
         for part, kept in zip(parts, cast("tuple[NDArray[Any], ...]", saved.states[""]), strict=True):
             part[...] = kept
+
+    def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep]] | None:
+        """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept."""
+        calls = []
+        for name, keeper in self._keepers():
+            call = keeper.state_access(saved.states[name]) if isinstance(keeper, AccessedNatively) else None
+            if call is None:
+                return None
+            calls.append(call)
+        if any(len(_texts(runner)) for runner in self.runners.values()):
+            return None
+        keeps, kept = [], ctypes.cast(ctypes.c_char_p(saved.kept), ctypes.c_void_p).value or 0
+        for address, size in self._spans():
+            keeps.append(native.Keep(address, kept, size))
+            kept += size
+        return calls, keeps
 
     def free(self, saved: SavedCopy) -> None:
         """Free what was saved."""
@@ -187,10 +195,11 @@ class SystemCopy:
 
     def _spans(self) -> Iterator[tuple[int, int]]:
         """The memory that says how far this copy is, and its rows."""
-        yield self._memory.address, self._map.size
         yield from self.engine.places
         for runner in self.runners.values():
-            yield runner.inputs.address, runner.inputs.rows * runner.inputs.stride
+            yield runner.counter.address, 8
+            for ring in (runner.outputs, runner.inputs):
+                yield ring.address, ring.rows * ring.stride
             if isinstance(runner.instance, StepsNatively) and (own := runner.instance.native) is not None:
                 yield own.said, ctypes.sizeof(native.Said)
 

@@ -154,9 +154,9 @@ class RowFile:
         if size and os.pread(self._descriptor, 1, size - 1) != b"\n":  # its process was killed within a line
             self._write(b"\n")
 
-    def add(self, row: Row) -> None:
-        """Add a row."""
-        self._write(json.dumps(msgspec.to_builtins(row)).encode() + b"\n")
+    def add(self, rows: Sequence[Row]) -> None:
+        """Add rows."""
+        self._write("".join(f"{json.dumps(msgspec.to_builtins(row))}\n" for row in rows).encode())
 
     def close(self) -> None:
         """Close the file."""

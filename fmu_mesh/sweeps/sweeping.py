@@ -2,11 +2,11 @@
 
 A sweep, in pseudocode::
 
-    for each variant without a row, while few are under way:
-        executor.submit(run_variant, task, ...)            # fmu_mesh.sweeps.variant_run, in a worker
-    as each ends:
-        its worker is lost: submit it once again           # fmu_mesh.sweeps.worker_pool
-        otherwise:          add its row to the folder      # fmu_mesh.sweeps.sweep_folder
+    for the next variants without a row, while few jobs are under way:
+        executor.submit(run_variants, task, ...)           # fmu_mesh.sweeps.variant_run, in a worker
+    as each job ends:
+        its worker is lost: submit them again, each alone  # fmu_mesh.sweeps.worker_pool
+        otherwise:          add its rows to the folder     # fmu_mesh.sweeps.sweep_folder
     at the end: write the table
 
 What schedules is the executor: processes of this host by default, or any `concurrent.futures.Executor`.
@@ -40,8 +40,8 @@ from .planned_sweep import PlannedSweep, planned_sweep
 from .sweep_folder import RowFile
 from .sweep_options import SweepOptions
 from .sweep_result import SweepResult
-from .variant_run import Row, run_variant
-from .worker_pool import WorkerLost, WorkerPool, unguarded_call
+from .variant_run import Row, run_variants
+from .worker_pool import WorkerLost, WorkerPool, prepare_workers, unguarded_call
 
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 
@@ -50,9 +50,11 @@ _TRIES: Final = 2
 _CANCEL_CHECK_S: Final = 0.2
 _JOIN_S: Final = 10.0
 _AHEAD: Final = 2
-"""Variants under way for each worker: one waits, so that the worker never does."""
+"""Jobs under way for each worker: one waits, so that the worker never does."""
+_JOB_S: Final = 0.1
+"""Short variants go to our own workers in jobs that take about so long: so much is lost with a worker or a sweep."""
 _ELSEWHERE: Final = 64
-"""Variants under way on an executor of the user, whose number of workers is not known."""
+"""Jobs of one variant under way on an executor of the user, whose number of workers is not known."""
 _KILLED: Final = "KilledWorker"
 """The class with which Dask says that a job has ended several workers."""
 _GUARD: Final = 'Write `if __name__ == "__main__":` before what your program does.'
@@ -261,7 +263,9 @@ class ExecutorSweep(Sweep):
             workers = len(os.sched_getaffinity(0)) // processes
         self._workers = max(1, min(workers, len(self._waiting), planned.at_once or len(self._waiting)))
         self._tries: Counter[int] = Counter()
-        self._ended: SimpleQueue[Future[Row]] = SimpleQueue()
+        self._alone: set[int] = set()  # variants that were in a job whose worker was lost
+        self._at_once = 1  # how many variants the next job has
+        self._ended: SimpleQueue[Future[list[Row]]] = SimpleQueue()
         self._thread.start()
 
     def _run(self) -> None:
@@ -288,56 +292,69 @@ class ExecutorSweep(Sweep):
 
     def _run_variants(self, executor: Executor, rows: RowFile) -> None:
         """The loop of the module's docstring."""
-        under_way: dict[Future[Row], int] = {}
+        under_way: dict[Future[list[Row]], list[int]] = {}
         most = _ELSEWHERE if self._executor is not None else self._workers * _AHEAD
         most = min(most, self._planned.at_once or most)
         try:
             while (self._waiting or under_way) and not self._cancelled.is_set():
                 while self._waiting and len(under_way) < most:
-                    number = self._waiting.popleft()
-                    under_way[self._submit(executor, number)] = number
+                    numbers = self._next_job()
+                    under_way[self._submit(executor, numbers)] = numbers
                 try:
                     future = self._ended.get(timeout=_CANCEL_CHECK_S)
                 except Empty:
                     continue
-                number = under_way.pop(future)
-                if (row := self._row_of(future, number)) is None:
-                    self._waiting.appendleft(number)
-                    continue
-                rows.add(row)
-                self._take(row)
-                if row.spent and isinstance(executor, WorkerPool):
-                    executor.replace(int(row.worker.rpartition(":")[2]))
+                numbers = under_way.pop(future)
+                found = self._rows_of(future, numbers)
+                self._waiting.extendleft(reversed(numbers[len(found) :]))
+                rows.add(found)
+                for row in found:
+                    self._take(row)
+                if found and self._executor is None:
+                    self._at_once = max(1, int(_JOB_S * len(found) / max(1e-6, sum(row.seconds for row in found))))
+                if found and found[-1].spent and isinstance(executor, WorkerPool):
+                    executor.replace(int(found[-1].worker.rpartition(":")[2]))
         finally:
             for future in under_way:
                 future.cancel()
 
-    def _submit(self, executor: Executor, number: int) -> Future[Row]:
+    def _next_job(self) -> list[int]:
+        """Some of the variants that wait, so that all workers have some at the end."""
+        count = min(self._at_once, -(-len(self._waiting) // (self._workers * _AHEAD)))
+        numbers = [self._waiting.popleft()]
+        while len(numbers) < count and not self._alone & {numbers[0], self._waiting[0]}:
+            numbers.append(self._waiting.popleft())
+        return numbers
+
+    def _submit(self, executor: Executor, numbers: list[int]) -> Future[list[Row]]:
         planned = self._planned
-        identity, parameters = planned.wanted.identities[number], planned.wanted.parameters(number)
+        variants = [(planned.wanted.identities[number], planned.wanted.parameters(number)) for number in numbers]
         try:
-            future = executor.submit(run_variant, planned.task, planned.functions, identity, parameters)
+            future = executor.submit(run_variants, planned.task, planned.functions, variants)
         except RuntimeError as error:  # it is shut down, or broken
             raise self._executor_lost(error) from error
         future.add_done_callback(self._ended.put)
         return future
 
-    def _row_of(self, future: Future[Row], number: int) -> Row | None:
-        """The row of a variant that has ended; None if it runs again, because its worker was lost."""
+    def _rows_of(self, future: Future[list[Row]], numbers: list[int]) -> list[Row]:
+        """The rows of variants that have ended; the others run again, because their worker was lost."""
         try:
             return future.result()
-        except Exception as error:  # noqa: BLE001  `run_variant` itself raises nothing
+        except Exception as error:  # noqa: BLE001  `run_variants` itself raises nothing
             lost = error
         if isinstance(lost, WorkerLost) and not lost.began:
             text = f"the workers do not start: {lost.message} before it was ready"
             hint = f"What it was is on standard error. If the program has a thread for the sweep: {_GUARD}"
             raise MeshLost(text, hint=hint) from lost
-        self._tries[number] += 1
-        if self._tries[number] < _TRIES and not isinstance(lost, BrokenExecutor):
-            return None
+        if len(numbers) > 1 and not isinstance(lost, BrokenExecutor):
+            self._alone.update(numbers)
+            return []
+        self._tries[numbers[0]] += 1
+        if self._tries[numbers[0]] < _TRIES and not isinstance(lost, BrokenExecutor):
+            return []
         if isinstance(lost, WorkerLost) or type(lost).__name__ == _KILLED:
             text = f"{lost.message} in each of {_TRIES} attempts" if isinstance(lost, WorkerLost) else str(lost)
-            return Row(self._planned.wanted.identities[number], MeshLost.exit_code, text, {}, 0.0, "")
+            return [Row(self._planned.wanted.identities[numbers[0]], MeshLost.exit_code, text, {}, 0.0, "")]
         raise self._executor_lost(lost) from lost
 
     def _executor_lost(self, error: BaseException) -> MeshLost:
@@ -380,5 +397,7 @@ def sweep(
     if options.executor is None and (place := unguarded_call()) is not None:
         text = f"each worker of the sweep would come to '{place}', because it imports this program"
         raise CallRefused(text, hint=_GUARD)
+    if options.executor is None:
+        prepare_workers()
     planned = planned_sweep(mesh, vary, **options.given())
     return ExecutorSweep(planned, executor=options.executor, workers=options.workers)

@@ -1,16 +1,17 @@
-"""One variant of a sweep in a worker: from its parameters to its row of the table.
+"""Variants of a sweep in a worker: from their parameters to their rows of the table.
 
 A worker keeps the models of the sweep that it works for loaded, one set for each thread that asks for runs. Each set
 has a thread of its own, because an FMU may not return: then the row says so, and that thread is left.
 """
 
-# Threads of a worker: that of the executor waits for a row, and a thread "variants" runs them, because an FMU may not
-# return: then the row says so, and that thread is left (ADR 59). The queue between them has one job at a time. The
+# Threads of a worker: that of the executor waits for rows, and a thread "variants" runs them, because an FMU may not
+# return: then a row says so, and that thread is left (ADR 59). The queue between them has one job at a time. The
 # watch over calls of FMUs is a third thread, which ends the wait (`_Hung`).
 
 from __future__ import annotations
 
 import base64
+import mmap
 import os
 import socket
 import threading
@@ -18,11 +19,11 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from functools import partial
+from multiprocessing.process import parent_process
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -37,15 +38,21 @@ from ..system.run_metadata import machine
 from .reductions import read_reduction, reduced_value
 from .variants import Parameters
 
-__all__ = ["Common", "Row", "SweepTask", "curves_of", "options_of_variant", "path_of", "run_variant"]
+__all__ = ["Common", "Row", "SweepTask", "curves_of", "options_of_variant", "path_of", "run_variants"]
 
 _GROWTH_BYTES = 256 * 2**20
 
 Cell = float | int | bool | str | None
 """One value of the table."""
 
-_Jobs = SimpleQueue[tuple[dict[str, Any], Future[Result]] | None]
-"""Options of a run, and who waits for its result; None at the end."""
+Variant = tuple[str, Parameters]
+"""The id of a variant, and its parameters."""
+
+_End = Result | BaseException
+"""How a run ended."""
+
+_Jobs = SimpleQueue[tuple[Callable[[RepeatedMesh], _End | None], Future[_End | None]] | None]
+"""What runs variants, and who waits for it; None at the end."""
 
 OwnReductions = Mapping[str, Callable[[Result], object]]
 """Functions of the user by the name of their column."""
@@ -94,30 +101,12 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
     return {**options, **{name: {**options.get(name, {}), **values} for name, values in own.items()}}
 
 
-def run_variant(task: bytes, functions: OwnReductions, identity: str, parameters: Parameters) -> Row:
-    """Run one variant. Called in a worker, by whichever executor; a run that failed has a row, too."""
-    own = _mine.loaded_for(task)
-    started = time.perf_counter()
-    values: dict[str, Cell] = {}
-    error: ErrorReport | None = None
-    warnings: tuple[str, ...] = ()
-    try:
-        result = own.run(identity, parameters)
-        values, warnings = own.values(result, functions), result.warnings
-    except FmuMeshError as failure:
-        error = failure.report()
-    except Exception as failure:  # noqa: BLE001  the other variants go on
-        error = ErrorReport("FmuMeshError", f"{type(failure).__name__}: {failure}", FmuMeshError.exit_code)
-    return Row(
-        id=identity,
-        exit_code=error.exit_code if error is not None else 0,
-        message=_line(error) if error is not None else " ".join(filter(None, (*warnings, own.hung.warning))),
-        values=values,
-        seconds=time.perf_counter() - started,
-        worker=f"{socket.gethostname()}:{os.getpid()}",
-        spent=own.hung.stuck or own.has_grown(),
-        machine=", ".join(machine().values()),
-    )
+def run_variants(task: bytes, functions: OwnReductions, variants: Sequence[Variant]) -> list[Row]:
+    """Run variants one after another, up to one whose row is `Row.spent`; a run that failed has a row, too.
+
+    Called in a worker, by whichever executor.
+    """
+    return _mine.loaded_for(task).rows(variants, functions)
 
 
 class _Mine(threading.local):
@@ -148,34 +137,90 @@ class _Loaded:
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
         self._jobs: _Jobs = SimpleQueue()
         self.hung = _Hung()
+        self._instances = frozenset(self._mesh.instances)
+        self._memory = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+        weakref.finalize(self, os.close, self._memory)
         self._bytes = 0
+        self._started = 0.0
         work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset)
         threading.Thread(target=work, name="variants", daemon=True).start()
         weakref.finalize(self, self._jobs.put, None)
 
-    def has_grown(self) -> bool:
-        """Whether this process has more than twice the memory that it had after its first run."""
-        now = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        self._bytes = self._bytes or now
-        return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
+    def rows(self, variants: Sequence[Variant], functions: OwnReductions) -> list[Row]:
+        """The rows of variants, up to one after which this worker is of no use."""
+        rows: list[Row] = []
+        while len(rows) < len(variants) and not (rows and rows[-1].spent):
+            apart, end = self._task.processes, cast("_End | None", None)
+            if not apart:
+                ended: Future[_End | None] = Future()
+                self._jobs.put((partial(self._run_all, variants[len(rows) :], functions, rows), ended))
+                end = ended.result()
+                apart = isinstance(end, NotInOneProcess)  # a parameter may be the path of a model
+            if apart:
+                end = self._run(lambda *variant: self._mesh.run(**self._options(*variant)), variants[len(rows)])
+            if end is not None:
+                rows.append(self._row(variants[len(rows)], end, functions))
+        return rows
 
-    def run(self, identity: str, parameters: Parameters) -> Result:
+    def _run_all(
+        self, variants: Sequence[Variant], functions: OwnReductions, rows: list[Row], runs: RepeatedMesh
+    ) -> _End | None:
+        """On the thread of the models: add the rows of variants; returns why one cannot run here."""
+        for variant in variants:
+            end = self._run(partial(self._run_here, runs), variant)
+            if self.hung.stuck or isinstance(end, NotInOneProcess):
+                return end
+            rows.append(self._row(variant, end, functions))
+            if rows[-1].spent:
+                break
+        return None
+
+    def _run_here(self, runs: RepeatedMesh, identity: str, parameters: Parameters) -> Result:
+        """A run with the models of this process; without files of their own, runs with equal keys share a plan."""
+        instances = self._instances
+        start = {name: value for name, value in parameters.items() if name.partition(".")[0] in instances}
+        keys = tuple((name, value) for name, value in parameters.items() if name not in start)
+        key = tuple(start), msgspec.json.encode(keys), identity if self._task.folder is not None else None
+        return runs.run_planned(key, start, partial(self._options, identity, parameters))
+
+    def _run(self, run: Callable[[str, Parameters], Result], variant: Variant) -> _End:
+        self._started = time.perf_counter()
+        self.hung.begin()
+        try:
+            return run(*variant)
+        except BaseException as error:  # noqa: BLE001  it becomes a row
+            return error
+
+    def _options(self, identity: str, parameters: Parameters) -> dict[str, Any]:
         task = self._task
         if task.version != __version__:
             raise ConfigurationError(f"this worker has fmu_mesh {__version__}, and the sweep {task.version}")
         options = options_of_variant(task.options, self._mesh.instances, parameters)
         if task.folder is not None:
-            options["output"] = curves_of(task.folder, identity)
-        else:
-            options["record"] = "memory"
-        if not task.processes:
-            ended: Future[Result] = Future()
-            self._jobs.put((options, ended))
-            with suppress(NotInOneProcess):  # a parameter may be the path of a model
-                return ended.result()
-        return self._mesh.run(**options)
+            return {**options, "output": curves_of(task.folder, identity)}
+        return {**options, "record": "memory"}
 
-    def values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
+    def _row(self, variant: Variant, end: _End, functions: OwnReductions) -> Row:
+        values: dict[str, Cell] = {}
+        error, warnings = end if isinstance(end, BaseException) else None, list[str]()
+        if not isinstance(end, BaseException):
+            try:
+                values, warnings = self._values(end, functions), [*end.warnings, self.hung.warning]
+            except Exception as failure:  # noqa: BLE001  the other variants go on
+                error = failure
+        report = _report(error) if error is not None else None
+        return Row(
+            id=variant[0],
+            exit_code=report.exit_code if report is not None else 0,
+            message=_line(report) if report is not None else " ".join(filter(None, warnings)),
+            values=values,
+            seconds=time.perf_counter() - self._started,
+            worker=f"{socket.gethostname()}:{os.getpid()}",
+            spent=self.hung.stuck or self._has_grown(),
+            machine=", ".join(machine().values()),
+        )
+
+    def _values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
         values = {one.text: _cell(reduced_value(one, result)) for one in self._reductions}
         for name, function in functions.items():
             try:
@@ -185,20 +230,31 @@ class _Loaded:
                 raise FmuMeshError(text) from error
         return values
 
+    def _has_grown(self) -> bool:
+        """Whether this process has more than twice the memory that it had after its first run."""
+        now = int(os.pread(self._memory, 100, 0).split()[1]) * mmap.PAGESIZE
+        self._bytes = self._bytes or now
+        return now - self._bytes > max(self._bytes, _GROWTH_BYTES)
+
 
 class _Hung:
-    """Tells whoever waits for a run that an FMU does not return."""
+    """Tells whoever waits for runs that an FMU does not return."""
 
     def __init__(self) -> None:
-        self.ended: Future[Result] = Future()  # the run under way
+        self.ended: Future[_End | None] = Future()  # the job under way
         self.stuck = False  # whether it has not returned
         self.warning = ""  # why, if the run was over before
-        self._end: Result | BaseException | None = None
+        self._end: _End | None = None
 
-    def begin(self, ended: Future[Result]) -> None:
-        self.ended, self._end = ended, None
+    def watch(self, ended: Future[_End | None]) -> None:
+        """Another job begins."""
+        self.ended = ended
 
-    def over(self, end: Result | BaseException) -> None:
+    def begin(self) -> None:
+        """Another run begins."""
+        self._end = None
+
+    def over(self, end: _End) -> None:
         """The run is over, and its instances are closed now."""
         self._end = end
 
@@ -206,25 +262,23 @@ class _Hung:
         """An FMU has not returned in time, or has crashed while it was closed; the row of a complete run stays."""
         self.stuck = True
         end = self._end if self._end is not None else error
-        if isinstance(end, BaseException):
-            self.ended.set_exception(end)
-        else:
+        if not isinstance(end, BaseException):
             self.warning = _line(error.report())
-            self.ended.set_result(end)
+        self.ended.set_result(end)
 
 
 def _work(mesh: Mesh, jobs: _Jobs, hung: _Hung, *, reset: bool) -> None:
     """Run variants in this process, until there is none; on a thread of its own."""
     own = mesh.from_configuration(mesh.configuration, keeps_code=True)
-    with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, before_close=hung.over) as runs:
+    alone = parent_process() is not None  # a thread of a program is not
+    with RepeatedMesh(repr(own), own.plan, reset=reset, on_hang=hung.tell, alone=alone, before_close=hung.over) as runs:
         while (job := jobs.get()) is not None:
-            options, ended = job
-            hung.begin(ended)
-            try:
-                ended.set_result(runs.run(**options))
-            except BaseException as error:  # noqa: BLE001  whoever waits gets it
-                if not hung.stuck:
-                    ended.set_exception(error)
+            run_all, ended = job
+            hung.watch(ended)
+            end = run_all(runs)
+            if not hung.stuck:
+                ended.set_result(end)
+            del job, run_all  # they have the object whose end is the end of this thread
 
 
 def curves_of(folder: Path, identity: str) -> Path:
@@ -248,6 +302,12 @@ def _cell(value: object) -> Cell:
         msg = f"expected a number, a truth value or a text, and got {type(plain).__name__}"
         raise TypeError(msg)
     return plain
+
+
+def _report(error: BaseException) -> ErrorReport:
+    if isinstance(error, FmuMeshError):
+        return error.report()
+    return ErrorReport("FmuMeshError", f"{type(error).__name__}: {error}", FmuMeshError.exit_code)
 
 
 def _line(error: ErrorReport) -> str:

@@ -24,6 +24,7 @@ from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
 from contextlib import suppress
 from functools import partial
 from inspect import currentframe
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess, parent_process
@@ -35,7 +36,7 @@ from ..run.child import how_it_ended
 from ..run.threads import one_thread_from_now_on
 from ..text import short_path
 
-__all__ = ["WorkerLost", "WorkerPool", "unguarded_call"]
+__all__ = ["WorkerLost", "WorkerPool", "prepare_workers", "unguarded_call"]
 
 _ENDS_S = 5.0
 _PRELOADED = "fmu_mesh.sweeps.preloaded"
@@ -84,6 +85,12 @@ class WorkerPool(Executor):
         """End all processes: when they have done their jobs, or at once with ``cancel_futures``."""
         for worker in self._workers:
             worker.shutdown(wait=wait, now=cancel_futures)
+
+
+def prepare_workers() -> None:
+    """Start the fork server, which imports what all workers need, while the program does something else."""
+    _Context()
+    forkserver.ensure_running()
 
 
 def unguarded_call() -> str | None:

@@ -13,6 +13,7 @@ import yaml
 import fmu_mesh
 from fmu_mesh.api.open_system import System
 from fmu_mesh.errors import CallRefused, ConfigurationError, FmuError, StepFailed
+from fmu_mesh.instances.fmi.loaded_fmu import LoadedFmu
 from fmu_mesh.run.run_plan import RunPlan
 from tests.all_systems import SYSTEMS, written_system
 from tests.fmus.helpers import NO_COMPILER, build_test_fmu
@@ -97,7 +98,33 @@ def test_other_start_values_give_floats_of_system_opened_with_them(name: str, tm
         assert rows_of(system) == expected
 
 
+@pytest.mark.parametrize("name", ["pendulum_delay", "damped_pendulum", "balance"])
+def test_no_instance_is_opened_again(name: str, tmp_path: Path) -> None:
+    """FMUs of FMI 2.0, worlds of MuJoCo and models in ONNX stay as they are loaded."""
+    with System(plan_run(written_system(name, tmp_path))) as system:
+        opened, expected = dict(system._guards), rows_of(system, 5)
+
+        system.reset()
+
+        assert rows_of(system, 5) == expected
+        assert all(system._guards[instance] is guard for instance, guard in opened.items())
+
+
 # ---- from every mode
+
+
+def test_an_fmu_that_cannot_be_reset_gets_new_instances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LoadedFmu, "reset", lambda _model: False)
+    with System(plan_of(tmp_path, integrators(), ["first.y -> second.u"])) as system:
+        expected, opened, loaded = rows_of(system), system._guards["first"], system._models.loads
+        for values in (None, {"first.k": 2.0}, None):
+            system.set("first.u", 5.0)
+            system.step(3)
+            system.reset(values)
+            if not values:
+                assert rows_of(system) == expected
+
+        assert (system._guards["first"] is opened, system._models.loads) == (False, loaded)
 
 
 def integrators() -> dict[str, Any]:

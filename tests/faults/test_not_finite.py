@@ -308,7 +308,13 @@ def test_a_stiff_spring_explodes_and_is_told_twice(place: Place) -> None:
 
 EXAMPLES = [
     path
-    for folder in ("configs", "examples/cart_pole", "examples/calibration", "examples/components")
+    for folder in (
+        "configs",
+        "examples/cart_pole",
+        "examples/calibration",
+        "examples/components",
+        "examples/ensemble_filter",
+    )
     for path in sorted((FMUS.parent / folder).glob("*.yaml"))
     if "gazebo" not in path.name
 ]

@@ -498,7 +498,7 @@ NOT_RUN = [
     (
         "examples/cart_pole/README.md",
         "python examples/cart_pole/train.py --output policy.onnx",
-        "it takes 10 s; tests/physics/test_cart_pole.py runs it with less training",
+        "it takes a minute; tests/physics/test_cart_pole.py runs it with less training",
     ),
     (
         "examples/gazebo/README.md",

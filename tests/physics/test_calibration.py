@@ -13,6 +13,7 @@ import pytest
 from matplotlib import image
 from rosbags.highlevel import AnyReader
 
+import fmu_mesh
 from tests.helpers import Place
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "calibration"
@@ -56,6 +57,23 @@ def test_without_noise_the_parameters_are_exact_up_to_the_interpolation(monkeypa
     # Both sides interpolate the same rows in the same way, so the residuals vanish with the parameters; the search ends
     # when a step changes a parameter by less than 1e-8 of it.
     assert np.abs(found.values / TRUE - 1.0).max() < 1e-7
+
+
+def test_the_copies_of_an_iteration_are_runs_with_their_parameters() -> None:
+    mesh = fmu_mesh.load(FOLDER / "pendulum.yaml")
+    times, angles = MEASURE.measured(1)
+    with mesh.batch(FIT.COPIES) as batch:
+        model = FIT.Model(batch, times, angles)
+        row_times, rows = model.run(TRUE)
+        derivatives = model.derivatives(TRUE)
+
+    for offsets, row in zip(FIT.OFFSETS, rows.T, strict=True):
+        start_values = dict(zip(FIT.NAMES, (TRUE + offsets).tolist(), strict=True))
+        result = mesh.run(processes=False, record="memory", start_values=start_values)
+        assert (row_times.tolist(), row.tolist()) == (result.times.tolist(), result["pendulum.a"].tolist())
+    # At an extreme of the free pendulum, more damping means a smaller angle; a longer one is behind.
+    assert derivatives.shape == (len(times), 2)
+    assert np.abs(derivatives).min(axis=0).max() < 1e-9 < np.abs(derivatives).max()
 
 
 def test_both_programs_run_and_show_what_they_found(place: Place) -> None:

@@ -364,7 +364,7 @@ def test_rows_are_kept_on_a_file_system_without_locks(tmp_path: Path, monkeypatc
     row = Row("a", 0, "", {}, 0.5, "n1:1")
 
     with SweepFolder(tmp_path).writing(3) as rows:
-        rows.add(row)
+        rows.add([row])
 
     assert SweepFolder(tmp_path).rows() == {"a": row}
 

@@ -130,7 +130,8 @@ def test_rows_and_progress_are_there_while_the_sweep_goes_on(faulty: Path, tmp_p
         assert running.ran == 1
 
 
-def test_a_failed_run_is_a_row_with_its_exit_code_and_message(faulty: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("curves", [True, False])
+def test_a_failed_run_is_a_row_with_its_exit_code_and_message(faulty: Path, tmp_path: Path, *, curves: bool) -> None:
     config = write_config(
         tmp_path, instances={"f": {"fmu": str(faulty)}}, connections=[], stop_time=0.01, timeouts={"step": 1.0}
     )
@@ -142,7 +143,7 @@ def test_a_failed_run_is_a_row_with_its_exit_code_and_message(faulty: Path, tmp_
         {"f.fail_at": 1e9, "f.hang_at": 1e9, "f.crash_at": "soon"},
     ]
 
-    with fmu_mesh.sweep(config, variants, workers=2) as running:
+    with fmu_mesh.sweep(config, variants, workers=2, curves=curves) as running:
         result = running.wait(DEADLINE_S)
 
     assert [row.exit_code for row in result] == [3, 3, 4, 0, 2]
@@ -156,10 +157,30 @@ def test_a_failed_run_is_a_row_with_its_exit_code_and_message(faulty: Path, tmp_
     assert "'soon' for the Real 'crash_at'" in wrong
     assert fine == ""
     assert result.summary == "5 of 5 runs, 4 failed"
-    with fmu_mesh.sweep(config, variants, workers=2, resume=True) as running:
+    with fmu_mesh.sweep(config, variants, workers=2, resume=True, curves=curves) as running:
         assert [row.exit_code for row in running.wait(DEADLINE_S)] == [3, 3, 4, 0, 2]
     assert running.ran == 2  # what an FMU has failed would fail again
-    assert len(result.curves(0).times) == 5  # what it has recorded is kept
+    if curves:
+        assert len(result.curves(0).times) == 5  # what it has recorded is kept
+
+
+def test_many_short_variants_in_one_job_fail_each_on_its_own(faulty: Path, tmp_path: Path) -> None:
+    config = write_config(
+        tmp_path, instances={"f": {"fmu": str(faulty)}}, connections=[], stop_time=0.01, timeouts={"step": 1.0}
+    )
+    never = {"f.fail_at": 1e9, "f.hang_at": 1e9, "f.crash_at": 1e9, "f.slow": 0.0}
+    variants = [{**never, "f.slow": 1e-9 * number} for number in range(200)]
+    for number, name in ((77, "f.fail_at"), (121, "f.hang_at"), (160, "f.crash_at")):
+        variants[number] = {**never, name: 0.0045}
+
+    with fmu_mesh.sweep(config, variants, workers=1, curves=False) as running:
+        result = running.wait(DEADLINE_S)
+
+    assert {row.variant: row.exit_code for row in result if row.exit_code} == {77: 3, 121: 3, 160: 4}
+    assert result[77].message.startswith("instance f, point 4, t = 0.004 s: fmi2DoStep returned error")
+    assert "the FMU has not returned for 1." in result[121].message
+    assert "was ended by SIGABRT" in result[160].message
+    assert len(result) == 200
 
 
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
@@ -42,6 +42,7 @@ LogSink = Callable[[LogMessage], None]
 T = TypeVar("T")
 
 _DOING: Final[dict[Verb, str]] = {"Set": doing(Stage.SETTING), "Get": doing(Stage.GETTING)}
+_MOST_KNOWN: Final = 64
 _OWN_ROWS: Final = (RowBase.OUTPUT, RowBase.WATCHED)
 
 
@@ -63,6 +64,15 @@ class FmuState(NamedTuple):
 
     handle: Any
     kept: Bookkeeping
+
+
+class _Transfer(NamedTuple):
+    """Variables of one type that are set or read by name, and memory for their values."""
+
+    type: VariableType
+    variables: Sequence[Variable]
+    names: Sequence[str]
+    buffer: Buffer
 
 
 class FmuInstance(ABC):
@@ -98,9 +108,11 @@ class FmuInstance(ABC):
         self._log = log
         self._last_messages: list[str] = []
         self._said = Said(step=-1, quiet_until=math.inf)  # how far the instance is
-        self._state: Literal["instantiated", "initialization", "stepping", "failed", "closed"] = "instantiated"
+        self._state: Literal["instantiated", "initialization", "stepping", "ended", "failed", "closed"] = "instantiated"
         self._live = False
+        self._was_reset = False
         self._keep: list[object] = []
+        self._known_functions: dict[tuple[Verb, VariableType], Callable[..., int]] = {}
         self._describe(description)
         prefix = self._functions.values.prefix
         # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
@@ -122,8 +134,7 @@ class FmuInstance(ABC):
             library = description.library if self._model.calls is None else None
             self.close()
             missing = missing_libraries(path, library, terms) if library else ()
-            text = "; ".join(missing) or str(error)
-            raise LoadFailed(f"'{path}' cannot be instantiated: {text}{self._message()}", instance=name) from error
+            raise self._refused("; ".join(missing) or str(error)) from error
 
     @property
     def changes_process(self) -> bool:
@@ -152,22 +163,19 @@ class FmuInstance(ABC):
     def set_values(self, values: Mapping[str, Value]) -> None:
         """Set variables by name."""
         self._check_live()
-        for type_, names in self._by_type(values).items():
-            variables = [self._variables[name] for name in names]
-            buffer = self._functions.values.buffer(type_, variables)
-            self._load(buffer, [e for v in variables for e in flattened(values[v.name], len(v.shape))], names)
-            self._transfer("Set", type_, variables, buffer)
+        for part in self._transfers(values):
+            elements = [e for v in part.variables for e in flattened(values[v.name], len(v.shape))]
+            self._load(part.buffer, elements, part.names)
+            self._transfer("Set", part.type, part.variables, part.buffer)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name."""
         self._check_live()
         values: dict[str, Value] = {}
-        for type_, members in self._by_type(names).items():
-            variables = [self._variables[name] for name in members]
-            buffer = self._functions.values.buffer(type_, variables)
-            self._transfer("Get", type_, variables, buffer)
-            elements, first = self._elements(buffer, members), 0
-            for variable in variables:
+        for part in self._transfers(names):
+            self._transfer("Get", part.type, part.variables, part.buffer)
+            elements, first = self._elements(part.buffer, part.names), 0
+            for variable in part.variables:
                 values[variable.name] = nested(elements[first : first + variable.size], variable.shape)
                 first += variable.size
         return [values[name] for name in names]
@@ -208,14 +216,11 @@ class FmuInstance(ABC):
         """Terminate if allowed, free the instance and remove its files. Never raises; may be called twice."""
         if self._state == "closed":
             return
-        was_reset = False
         if self._live and self._state == "stepping":
-            kept, only_once = self._kept, self.description.only_once_per_process
-            resets = kept is not None and not kept.is_closed and (kept.resets or only_once)
-            was_reset = self._end_run(resets=resets)
-        elif self._live:
+            self._end_simulation()
+        elif self._live and self._state != "ended":
             self._quietly(self._release)
-        self._leave_model(was_reset=was_reset)
+        self._leave_model()
         unregister(self)
         self._live = False
         self._state = "closed"
@@ -296,6 +301,13 @@ class FmuInstance(ABC):
 
     # --- its life
 
+    def _end_simulation(self) -> None:
+        """End the simulation, and reset the instance if the next run gets this one."""
+        kept, only_once = self._kept, self.description.only_once_per_process
+        resets = kept is not None and not kept.is_closed and (kept.resets or only_once)
+        self._was_reset = self._end_run(resets=resets)
+        self._state = "ended"
+
     def _end_run(self, *, resets: bool) -> bool:
         """End the simulation; with ``resets`` also reset the instance, and return whether that was done."""
         self._quietly(self._terminate)
@@ -312,25 +324,21 @@ class FmuInstance(ABC):
         except OSError:
             return
 
-    def _leave_model(self, *, was_reset: bool) -> None:
-        """Leave the FMU to the next instance of this name; after a failure nothing of it is used again.
+    @property
+    def _is_used_up(self) -> bool:
+        """Whether there can be no other instance: a library that allows one instance is unloaded with it."""
+        return self._model.is_lost or (self.description.only_once_per_process and not self._was_reset)
 
-        A library that allows one instance is unloaded with it.
-        """
+    def _leave_model(self) -> None:
+        """Leave the FMU to the next instance of this name; after a failure nothing of it is used again."""
         model = self._model
-        if (
-            self._kept is None
-            or self._kept.is_closed
-            or not self._live
-            or self._state == "failed"
-            or model.is_lost
-            or (self.description.only_once_per_process and not was_reset)
-        ):
+        kept = self._kept
+        if kept is None or kept.is_closed or not self._live or self._state == "failed" or self._is_used_up:
             model.close()
             return
-        if not was_reset:
+        if not self._was_reset:
             model.free()
-        self._kept.keep(self.name, model)
+        kept.keep(self.name, model)
 
     def _tolerance(self) -> float | None:
         """The tolerance for the FMU (FMI 2.0, 2.1.6; FMI 3.0, 2.3.2)."""
@@ -344,7 +352,10 @@ class FmuInstance(ABC):
         self._state = "stepping"
 
     def _describe(self, description: ModelDescription) -> None:
+        if description is getattr(self, "description", None):
+            return
         self.description = description
+        self._known_transfers: dict[tuple[str, ...], list[_Transfer]] = {}
         self._variables = {variable.name: variable for variable in description.variables}
 
     def _check_functions(self) -> None:
@@ -391,6 +402,9 @@ class FmuInstance(ABC):
 
     def _end_requested(self) -> TerminationRequested:
         return TerminationRequested("the FMU asked to end the simulation", instance=self.name)
+
+    def _refused(self, why: str) -> LoadFailed:
+        return LoadFailed(f"'{self._model.path}' cannot be instantiated: {why}{self._message()}", instance=self.name)
 
     def _message(self) -> str:
         recall()
@@ -484,12 +498,13 @@ class FmuInstance(ABC):
             raise self._transfer_failed(verb, type_, variables, status)
 
     def _call(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> int:
-        count = len(variables)
-        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
+        count, key = len(variables), (verb, type_)
+        references = (ctypes.c_uint * count)(*[variable.value_reference for variable in variables])
         values = [buffer.sizes_address, buffer.address] if isinstance(buffer, BinaryBuffer) else [buffer.address]
         if self._functions.values.sized:
             values.append(sum(variable.size for variable in variables))
-        return self._function(verb, type_)(self._component, ctypes.addressof(references), count, *values)
+        function = self._known_functions.get(key) or self._known_functions.setdefault(key, self._function(verb, type_))
+        return function(self._component, ctypes.addressof(references), count, *values)
 
     def _function_name(self, verb: Verb, type_: VariableType) -> str:
         """The name of a getter or setter, for errors."""
@@ -526,11 +541,22 @@ class FmuInstance(ABC):
             raise self._failed(f"{', '.join(names)} cannot be read: {error}") from error
         return elements.tolist() if hasattr(elements, "tolist") else list(elements)
 
-    def _by_type(self, names: Sequence[str] | Mapping[str, Value]) -> dict[VariableType, list[str]]:
+    def _transfers(self, names: Iterable[str]) -> list[_Transfer]:
+        """Memory for the values of variables, a part for each type; the last ones are known."""
+        key = tuple(names)
+        if (known := self._known_transfers.get(key)) is not None:
+            return known
         groups: dict[VariableType, list[str]] = {}
-        for name in names:
+        for name in key:
             groups.setdefault(self._variables[name].type, []).append(name)
-        return groups
+        found = []
+        for type_, members in groups.items():
+            variables = [self._variables[name] for name in members]
+            found.append(_Transfer(type_, variables, members, self._functions.values.buffer(type_, variables)))
+        if len(self._known_transfers) >= _MOST_KNOWN:
+            self._known_transfers.clear()
+        self._known_transfers[key] = found
+        return found
 
 
 def _is_buffered(part: PartCall) -> bool:

@@ -111,6 +111,7 @@ class LoadedFmu:
 
     def __init__(self, fmu: FmuToLoad, folder: Path | _Files) -> None:
         self.key = fmu.key
+        self.path = fmu.path
         self.calls: Any = None  # FMPy's object, once it is loaded
         self.has_instance = False
         self.is_lost = False  # whether it has returned fatal

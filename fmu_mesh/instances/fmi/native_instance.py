@@ -7,6 +7,7 @@ version of FMI adds how a step is taken and what its statuses mean.
 from __future__ import annotations
 
 import ctypes
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal
@@ -22,6 +23,7 @@ from ...variables.model_description import Variable
 from ...variables.value_types import DTYPES, Value
 from ..instance_wrapper import of_kind
 from .buffers import NumberBuffer
+from .callbacks import unregister
 from .calls import Function, Pointer, address_of, cffi_function, memory, pointer
 from .fmu_instance import FmuInstance, FmuState
 from .fmu_values import WARNING, PartCall, Verb
@@ -39,6 +41,8 @@ class NativeInstance(FmuInstance):
 
     _kind: StepKind
     _do_step: Function  # the function of the FMU, as cffi calls it
+
+    runs_again = False  # see `RunsAgain`
 
     _by_calls = False  # whether the steps have a part that the library does not know
 
@@ -80,6 +84,37 @@ class NativeInstance(FmuInstance):
         self._member = member = self._table(self._native, outputs)
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
         self._in_step = take, pointer(ctypes.addressof(member))
+
+    def end_run(self) -> bool:
+        """See `RunsAgain`."""
+        if self._kept is None or not self._live or self._state != "stepping":
+            return False
+        self._end_simulation()
+        if self._is_used_up:
+            return False
+        if not self._was_reset:
+            self._model.free()
+        unregister(self)
+        return True
+
+    def run_again(self) -> None:
+        """See `RunsAgain`."""
+        self._last_messages, self._was_reset = [], False
+        self._said.note(step=-1, quiet_until=math.inf)
+        self._state = "instantiated"
+        try:
+            self._instantiate()
+        except Exception as error:
+            self._state = "failed"
+            raise self._refused(str(error)) from error
+
+    def bind_again(self) -> None:
+        """See `RunsAgain`: only the address of the instance may be another one."""
+        self._said.note(step=0)
+        if self._native is not None and self._member is not None:
+            self._native = self._native._replace(component=self._component)
+            self._member.note(component=self._component, step=0, stage=Stage.WAITING, outcome=0)
+        self._read_outputs(0)
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """See `FmuInstance` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""

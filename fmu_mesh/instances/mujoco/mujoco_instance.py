@@ -69,10 +69,25 @@ class MujocoInstance(KeepsStateAsBytes):
         # An unstable world is an error; by default, MuJoCo would start it again from the beginning.
         self._model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._timestep = float(self._model.opt.timestep)
-        self._data = data = self._mujoco.MjData(self._model)
+        self._wind = np.array(self._model.opt.wind, dtype=np.float64)
         self._entries = {entry.variable.name: entry for entry in world.entries}
-        self._step = 0
         self._closed = False
+        self._begin()
+        self._set_limits()
+
+    def begin_again(self) -> bool:
+        """See `BeginsAgain`; a film has one beginning."""
+        if self._picture is not None:
+            return False
+        self._model.opt.timestep = self._timestep
+        self._model.opt.wind[:] = self._wind
+        self._begin()
+        return True
+
+    def _begin(self) -> None:
+        """Be in the state of the model."""
+        self._data = data = self._mujoco.MjData(self._model)
+        self._step = 0
         bodies, dofs = self._model.nbody, self._model.nv
         self._own: dict[str, Floats] = {
             "acceleration": np.zeros(dofs),
@@ -81,7 +96,7 @@ class MujocoInstance(KeepsStateAsBytes):
             "effort": np.zeros(dofs),
             "wrench": np.zeros(6 * bodies),
             "control": np.zeros(self._model.nu),
-            "wind": np.array(self._model.opt.wind, dtype=np.float64),
+            "wind": self._wind.copy(),
             **{what: np.zeros(3 * bodies) for what in _OF_VELOCITIES | _SELDOM},
             "state": np.zeros(STATE * bodies),
         }
@@ -101,7 +116,6 @@ class MujocoInstance(KeepsStateAsBytes):
         }
         self._driven: tuple[int, ...] = ()
         self._bound = False
-        self._set_limits()
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]

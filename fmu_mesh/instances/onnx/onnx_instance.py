@@ -54,6 +54,12 @@ class OnnxInstance(KeepsStateAsBytes):
         self._is_initialized = False
         self._is_computed = False
 
+    def begin_again(self) -> bool:
+        """See `BeginsAgain`."""
+        self._values.clear()
+        self._is_initialized = self._is_computed = False
+        return True
+
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]
     ) -> None:

@@ -33,8 +33,14 @@ class Fmi2Instance(NativeInstance, Fmi2):
 
     _kind = StepKind.FMI2
     _functions = FmuFunctions(FMU2Slave, Fmi2.VALUES, "fmi2FreeInstance", (*Fmi2.NEEDED, "fmi2DoStep"), Fmi2.NAMES)
+    runs_again = True
     _bound: tuple[object, ...] = ()  # what it is bound to
     _terminated = False  # whether the FMU has asked to end the simulation with the step that is complete now
+
+    def run_again(self) -> None:
+        """See `RunsAgain`."""
+        self._terminated = False
+        super().run_again()
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""

@@ -1,0 +1,170 @@
+"""One system in this process: its memory, its instances and what steps them; it can begin again at point 0.
+
+Owns what does not depend on a run, so that many runs of one plan share it. Knows no result files and no end of a run:
+`fmu_mesh.run.repeated` steps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Literal
+
+from msgspec.structs import replace
+
+from ..errors import ProtocolBroken
+from ..instances.call_guard import CallWatch, Guarded
+from ..instances.contract import Instance, LogMessage
+from ..instances.process_state import ProcessState
+from ..node.burst_engine import make_engine
+from ..node.engine import Engine
+from ..node.initialization import Initialization
+from ..node.inputs import with_times
+from ..node.stepping import Runner, connect
+from ..rings import native
+from ..rings.host_memory import HostMemory
+from ..system.layout import row_bytes
+from ..system.plan import Plan, make_plan
+from ..variables.value_types import PlainValue
+from .run_plan import RunPlan
+
+__all__ = ["HostedSystem"]
+
+_NODE = "instances"
+# Of rows that are wider, a few are in memory.
+_WIDE_ROW_BYTES = 2**20
+
+
+class HostedSystem:
+    """The instances of a plan in one node of this process, with their rings and the engine that steps them.
+
+    Call sequence, on one thread: `open`, `begin`, steps of the engine; then `end`, and `open` again if that returned
+    True; at last, and after any exception, `close`. Each run has new instances, or those that were reset, as the model
+    of an instance is kept (`fmu_mesh.instances.kept_models`). The first run looks after each call of an FMU; the state
+    of the process is then looked after once in each later run, and the floating-point mode still after each call.
+
+    Args:
+        run: the plan; its nodes and its window are not used.
+        files: how many of its result files are written.
+        watch: watches all calls.
+        open_instance: opens the instance with this name in this plan.
+        log: called with what inputs over time warn of.
+        alone: whether nothing else in this process changes its state between the runs, so that it is looked after as
+            between steps: several times a second, and not once in each run.
+
+    Attributes:
+        plan: the plan of the same system with all instances in one node.
+        runners: the instances, by name.
+        loads: whether the next `open` opens instances, and does not use those that are there.
+    """
+
+    def __init__(  # noqa: PLR0913  what a system needs of its surroundings
+        self,
+        run: RunPlan,
+        files: int,
+        watch: CallWatch,
+        open_instance: Callable[[Plan, str], Instance],
+        log: Callable[[LogMessage], None],
+        *,
+        alone: bool,
+    ) -> None:
+        self.plan = _in_one_node(run.plan, files)
+        self.node = self.plan.nodes[_NODE]
+        self.memory = HostMemory.private(self.node.memory, _NODE)
+        self.runners: dict[str, Runner] = {}
+        self.loads = True
+        self.watch = watch
+        self._made_for = run, files
+        self._open_instance, self._log = open_instance, log
+        self._instances: list[Guarded] = []
+        self._engine: Engine | None = None
+        self._alone = alone
+        self._state: ProcessState | None = None
+        self._begins_again = True
+
+    def fits(self, run: RunPlan, files: int, watch: CallWatch) -> bool:
+        """Whether it can take a run of this plan, which is the same object, with so many result files."""
+        own, own_files = self._made_for
+        return not self.loads and own is run and own_files == files and self.watch is watch
+
+    def open(self) -> None:
+        """Open all instances; after `end`, they begin again.
+
+        Raises:
+            LoadFailed: one cannot be opened.
+        """
+        if not self.loads:
+            self._state = None if self._alone else ProcessState()
+            self.memory.begin_again()
+            for instance in self._instances:
+                instance.run_again()
+            return
+        node = self.node
+        places = {place.instance: place for place in node.rings}
+        for item in node.instances:
+            instance = Guarded(item.name, partial(self._open_instance, self.plan, item.name), self.watch, node.timeouts)
+            self._instances.append(instance)
+            place = places[item.name]
+            ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
+            timed = with_times(instance, item, node.grid, self._log)
+            self._begins_again = self._begins_again and timed is instance and instance.runs_again
+            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter)
+        connect(node, self.runners, self.memory, self.memory)
+
+    def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:
+        """Initialization Mode, as `Node` does it; then the outputs are those of point 0.
+
+        Args:
+            start_values: by instance and variable, those that are not as in the plan.
+
+        Raises:
+            FmuError: an instance cannot be initialized.
+        """
+        node, engine = self.node, self._engine
+        Initialization(node, _nothing_comes).run(self.runners.values(), start_values, again=engine is not None)
+        if engine is None:
+            units = [[self.runners[name] for name in names] for names in node.units]
+            engine = self._engine = make_engine(node, units, self.memory, spins=False)
+        else:
+            engine.begin_again(self._state)
+        for runner in self.runners.values():
+            runner.begin()
+        return engine
+
+    def end(self) -> bool:
+        """After the last point: end the run of all instances, and keep what the next one needs; whether that works."""
+        if not self._begins_again:
+            return False
+        state = self._state or (None if self._alone else ProcessState())
+        with self.watch.surviving(", ".join(self.plan.order)):
+            ended = [instance.end_run() for instance in reversed(self._instances)]
+        self.loads = not all(ended) or (state is not None and state.restore())
+        return not self.loads
+
+    def close(self) -> None:
+        """Close all instances, and free the memory. May be called twice."""
+        self.loads = True
+        if self._engine is not None:
+            self._engine.look_after()
+        for instance in reversed(self._instances):
+            instance.close()
+        self._instances.clear()
+        for runner in self.runners.values():
+            runner.follow(native.MemberTable())  # so it is in no cycle of objects any more
+        self.runners.clear()
+        self._engine = None
+
+
+def _in_one_node(plan: Plan, files: int) -> Plan:
+    """The plan of the same system with all instances in one node and the first ``files`` result files."""
+    system = plan.system
+    rows = [row_bytes(item.outputs) for node in plan.nodes.values() for item in node.instances]
+    window: int | Literal["auto"] = 1 if max(rows, default=0) > _WIDE_ROW_BYTES else "auto"
+    config = replace(system.config, simulation=replace(system.config.simulation, window=window))
+    instances = {name: replace(own, node=_NODE) for name, own in system.instances.items()}
+    return make_plan(replace(system, config=config, instances=instances, records=system.records[:files]))
+
+
+def _nothing_comes(_left_s: float) -> None:
+    """In the place of a wait for other nodes."""
+    raise ProtocolBroken("an initial value has no source in this process")
