@@ -154,6 +154,7 @@ typedef struct { /* the equations of an FMU for model exchange, and their solver
   char *held;
   int64_t row_bytes, is_held;
   int64_t result, terminated; /* terminated: the FMU has asked to end the simulation */
+  double event_time;          /* of the last event that the library has handled */
   void *vector_data;          /* N_VGetArrayPointer of SUNDIALS, where CVode is the solver */
 } Equations;
 

@@ -430,12 +430,9 @@ static int call_mode(Equations *own, int function, void *called) {
   return own->kind == FMI1 ? 0 : checked(own, function, ((int (*)(void *))called)(own->component));
 }
 
-/* Set held inputs that have changed: that is an event (FMI 2.0, 3.1). */
-static int set_held(Equations *own) {
+/* The event iteration, and back to continuous-time mode. */
+static int settle(Equations *own) {
   int again, ends;
-  if (call_mode(own, ENTER_EVENT_MODE, own->enter_event_mode)) return FAILED;
-  for (own->call = 0; own->call < own->n_setters; own->call++)
-    if (set(own, &own->setters[own->call])) return FAILED;
   for (int i = 0; i < UPDATES; i++) {
     if (update(own, &again, &ends)) return FAILED;
     if (ends) return ENDS;
@@ -444,6 +441,20 @@ static int set_held(Equations *own) {
     return equations_restart(own) ? FAILED : AT_STOP;
   }
   return UNSETTLED;
+}
+
+/* Set held inputs that have changed: that is an event (FMI 2.0, 3.1). */
+static int set_held(Equations *own) {
+  if (call_mode(own, ENTER_EVENT_MODE, own->enter_event_mode)) return FAILED;
+  for (own->call = 0; own->call < own->n_setters; own->call++)
+    if (set(own, &own->setters[own->call])) return FAILED;
+  return settle(own);
+}
+
+/* Whether the library handles this event: Python counts those at one time, and changes the solver. */
+static int is_plain(const Equations *own) {
+  return own->result == AT_EVENT && !own->asks_end && own->time != own->event_time &&
+         (own->stiff < STIFF || (own->doubted && !own->leaves));
 }
 
 /* Whether a time is later by more than rounding, as `resolvable` in simtime.py, or a little more. */
@@ -465,9 +476,15 @@ int equations_step(Equations *own, double end) {
     own->is_held = 1;
     if ((own->result = set_held(own)) != AT_STOP) return LOOK;
   }
-  own->result = GO_ON;
-  if (!is_later(end, own->time) || !is_later(own->next_event, end)) return LOOK;
-  own->result = equations_solve(own, end);
+  for (;;) {
+    own->result = GO_ON;
+    if (!is_later(end, own->time) || !is_later(own->next_event, end)) return LOOK;
+    own->result = equations_solve(own, end);
+    if (!is_plain(own)) break;
+    own->event_time = own->time;
+    own->result = call_mode(own, ENTER_EVENT_MODE, own->enter_event_mode) ? FAILED : settle(own);
+    if (own->result != AT_STOP || own->time >= end) break;
+  }
   if (own->result == AT_STOP && own->stiff >= STIFF && !own->doubted) own->result = GO_ON;
   return own->result == AT_STOP ? 0 : LOOK;
 }

@@ -154,7 +154,7 @@ def test_a_state_from_before_the_first_step_is_begun_anew(
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_only_steps_with_events_are_left_to_python(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+def test_steps_with_state_events_are_not_left_to_python(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
     with stepping(event_fmu("Ball", version), tmp_path, 1) as ball:
         burst = Burst(ball.instance, (ball.outputs,), GRID)
         for step in range(STEPS):
@@ -162,9 +162,21 @@ def test_only_steps_with_events_are_left_to_python(version: Version, event_fmu: 
             burst.run(range(step, step + 1))
         bounces = ball.instance.get_values(["bounces"])
 
-    assert [stage for _, stage in burst.finished] == [Stage.STEPPING] * len(burst.finished)
-    assert bounces == [len(burst.finished)]
-    assert len(burst.finished) >= 5
+    assert burst.finished == []
+    assert bounces == [7]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_only_steps_with_time_events_are_left_to_python(version: Version, event_fmu: EventFmu, tmp_path: Path) -> None:
+    with stepping(event_fmu("Stairs", version), tmp_path, 1, {"period": 0.07}) as stairs:
+        burst = Burst(stairs.instance, (stairs.outputs,), GRID)
+        for step in range(STEPS):
+            give(stairs, 0, {"increment": 1})
+            burst.run(range(step, step + 1))
+        counter = stairs.instance.get_values(["counter"])
+
+    assert {stage for _, stage in burst.finished} == {Stage.STEPPING}
+    assert counter == [len(burst.finished)]
 
 
 def test_an_input_that_the_fmu_refuses_ends_the_step(
