@@ -336,8 +336,8 @@ class Copies:
             if self._back is not None:
                 self._back.forget(number)
             self._ended[number] = True
-            is_new = isinstance(self.errors.get(number), FmuError)
-            self._begin(number, overrides(number) if overrides is not None else {}, is_new=is_new)
+            own = overrides(number) if overrides is not None else {}
+            self._begin(number, own, is_new=number in self.errors)
             if overrides is None and self.why_not_saved is None:
                 self._note_first(number)
 
