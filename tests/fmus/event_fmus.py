@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -190,7 +191,12 @@ def build_event_fmu(name: str, version: Version, folder: Path, **changes: str) -
     with zipfile.ZipFile(folder / f"{built.name}.{os.getpid()}.tmp", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("modelDescription.xml", description)
         archive.writestr(f"binaries/{platform}/{name}.so", _compiled(name, model, version, guid))
-    Path(archive.filename or "").replace(built)
+    written = Path(archive.filename or "")
+    with suppress(
+        FileExistsError
+    ):  # another worker was faster, and its file may be in use: archives have times in them
+        built.hardlink_to(written)
+    written.unlink()
     return built
 
 
