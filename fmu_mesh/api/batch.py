@@ -332,26 +332,30 @@ class Batch:
             raise CallRefused(f"it {refused}.", instance=instance, variable=variable.name) from refused
         return variable, rows
 
-    def _rows(self, values: ArrayLike, variable: Variable, *, finite: bool) -> NDArray[Any]:
-        """Values as an array of shape (copies, elements)."""
+    def _rows(
+        self, values: ArrayLike, variable: Variable, *, finite: bool, wanted: NDArray[np.bool_] | None = None
+    ) -> NDArray[Any]:
+        """Values as an array of shape (copies, elements); only those of the ``wanted`` copies are checked."""
         shape, dtype = (self._count, *variable.shape), np.dtype(DTYPES[variable.type])
         given = np.asarray(values)
         if given.shape != shape and given.shape not in {(), variable.shape}:
             expected = f"{shape}, or {variable.shape} for all copies"
             raise ValueRefused(f"cannot be set to values of shape {given.shape}; expected {expected}")
+        every = np.broadcast_to(given, shape)
         if given.dtype.kind in "iuf" and dtype.kind == "f":
-            rows = np.broadcast_to(np.asarray(given, dtype), shape)
-            if finite and not np.isfinite(rows).all():
+            rows = every.astype(dtype)
+            checked = rows if wanted is None else rows[wanted]
+            if finite and not np.isfinite(checked).all():
                 raise ValueRefused("cannot be set to values that are not finite")
             low, high = variable.minimum, variable.maximum
-            if (low is not None and (rows < low).any()) or (high is not None and (rows > high).any()):
+            if (low is not None and (checked < low).any()) or (high is not None and (checked > high).any()):
                 raise ValueRefused(f"cannot be set to a value out of its range: expected {range_of(variable)}")
         else:
-            each = np.empty(shape, dtype)
-            for number, own in enumerate(np.broadcast_to(given, shape)):
+            rows = np.zeros(shape, dtype)
+            for number in range(self._count) if wanted is None else np.flatnonzero(wanted).tolist():
+                own = every[number]
                 plain = own.tolist() if isinstance(own, np.ndarray | np.generic) else own
-                each[number] = checked_value(plain, variable, f"cannot be set: {shown(plain)}", finite=finite)
-            rows = each
+                rows[number] = checked_value(plain, variable, f"cannot be set: {shown(plain)}", finite=finite)
         return np.ascontiguousarray(rows).reshape(self._count, -1)
 
     def _wanted(self, option: str, mask: ArrayLike | None) -> NDArray[np.bool_]:
@@ -371,7 +375,7 @@ class Batch:
         for name, values in start_values.items():
             _, variable = self._variable(name)
             try:
-                rows[name] = self._rows(values, variable, finite=False)
+                rows[name] = self._rows(values, variable, finite=False, wanted=wanted)
             except ValueRefused as refused:
                 raise CallRefused(f"'{name}' {refused}.") from refused
 

@@ -274,7 +274,6 @@ def _spread(name: str, value: ArrayLike, mask: Truths, count: int) -> NDArray[An
             f"the start value of '{name}' has {counted(len(values), 'element')}; expected {count}, one for each copy."
         )
         raise CallRefused(text)
-    spread = np.empty((len(mask), *values.shape[1:]), values.dtype)
-    spread[:] = values[0] if values.ndim else values  # also in the copies that go on: any value in its range
+    spread = np.zeros((len(mask), *values.shape[1:]), values.dtype)
     spread[mask] = values
     return spread

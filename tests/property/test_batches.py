@@ -351,6 +351,14 @@ def test_wrong_values_are_refused_and_none_is_set(gains: fmu_mesh.Batch, name: s
     assert gains.get("gain.y").tolist() == [1.0, 1.0]
 
 
+def test_start_values_of_other_copies_are_ignored(gains: fmu_mesh.Batch) -> None:
+    gains.step(3)
+    gains.reset([False, True], {"gain.k": [np.nan, 4.0]})
+
+    assert gains.get("gain.k").tolist() == [1.0, 4.0]
+    assert gains.point.tolist() == [3, 0]
+
+
 def test_results_go_into_given_arrays(gains: fmu_mesh.Batch) -> None:
     gains.set({"gain.u": [1.0, 2.0]})
     gains.step()
