@@ -430,6 +430,13 @@ JOBS = (
         _CART,
         (
             Entry(_BATCH, STEPPED, 1_024_000, 204_800, {"what": "batch", "copies": "1024"}),
+            Entry(
+                f"{_BATCH}, two threads",
+                STEPPED,
+                1_024_000,
+                204_800,
+                {"what": "batch", "copies": "1024", "threads": "2"},
+            ),
             Entry(_C_LOOP, "c_environment", 1_024_000, 204_800, {"what": "batch", "copies": "1024"}),
             Entry("FMPy loop over 64", "fmpy_environment", 25_600, 12_800, {"what": "batch", "copies": "64"}),
         ),

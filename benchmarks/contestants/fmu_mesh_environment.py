@@ -35,7 +35,7 @@ def run(task: Task) -> Outcome:
 def _batch(mesh: fmu_mesh.Mesh, task: Task) -> Outcome:
     copies = int(task.options["copies"])
     names = [f"cart.{name}" for name in OUTPUTS]
-    with mesh.batch(copies) as batch:
+    with mesh.batch(copies, threads=int(task.options.get("threads", "1"))) as batch:
         found = np.zeros((copies, len(names)))
         started = perf_counter()
         for _ in range(task.points // copies):

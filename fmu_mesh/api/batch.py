@@ -31,6 +31,7 @@ from ..run.preparing import KnownModels, planned_reset
 from ..run.process import interrupts_later
 from ..run.run_plan import RunPlan
 from ..run.system_copy import Overrides, SavedCopy
+from ..run.threaded_copies import ThreadedCopies
 from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
@@ -52,7 +53,8 @@ class Batch:
 
     Copy ``i`` is element ``i`` of each array, and gives the floats of a `System` with its values. Copies are
     independent: each has a point of its own, and one that fails does not end the others. All calls come from the thread
-    that made the batch; Ctrl-C ends `step` with all copies at one point.
+    that made the batch; with several ``threads``, each of those makes the calls of its copies. Ctrl-C ends `step` with
+    all copies at one point.
 
     A call that hangs in an FMU cannot be ended, and an FMU that crashes takes the program with it. Copies of an FMU
     share its library, as the standard allows (FMI 2.0, 2.1.1).
@@ -69,14 +71,17 @@ class Batch:
     Args:
         run: the plan of each copy.
         copies: how many.
+        threads: on how many threads they are stepped; each has its own library of each FMU, and makes all calls of its
+            copies.
 
     Raises:
         NotInOneProcess: copies of an FMU need a process each.
-        CallRefused: there is not enough memory; or ``copies`` is no number above 0.
+        CallRefused: there is not enough memory; ``copies`` is no number above 0; or the models share something that
+            several threads cannot use.
         FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
     """
 
-    def __init__(self, run: RunPlan, copies: int) -> None:
+    def __init__(self, run: RunPlan, copies: int, *, threads: int = 1) -> None:
         if copies < 1:
             raise CallRefused(f"{option_text('copies', copies)}: expected a whole number of 1 or more")
         self._run = run
@@ -88,7 +93,16 @@ class Batch:
         self._saved: weakref.WeakKeyDictionary[BatchState, list[SavedCopy]] = weakref.WeakKeyDictionary()
         self._lost: deque[list[SavedCopy]] = deque()
         folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
-        self._copies = own = Copies(run, self._count, folder, forwarded)
+        own: Copies | ThreadedCopies
+        try:
+            if min(threads, copies) > 1:
+                own = ThreadedCopies(run, copies, folder, forwarded, min(threads, copies))
+            else:
+                own = Copies(run, copies, folder, forwarded)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        self._copies = own
         self._release = weakref.finalize(self, _release, own, folder, self._thread)
         self._before = _resident_bytes()
         try:
@@ -428,7 +442,7 @@ def _resident_bytes() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def _release(copies: Copies, folder: Path, thread: int) -> None:
+def _release(copies: Copies | ThreadedCopies, folder: Path, thread: int) -> None:
     """Free everything. On another thread only the files: an FMU is only called on its own."""
     if threading.get_ident() == thread:
         copies.close()

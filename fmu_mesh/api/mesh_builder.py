@@ -25,7 +25,7 @@ from ..files import write_whole
 from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
-from ..run.options import OpenOptions, PlanOptions, RunOptions, StartOptions
+from ..run.options import BatchOptions, OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.overriding import memory_file, memory_of
 from ..run.preparing import KnownModels, planned, without_keys
 from ..run.run_plan import RunPlan
@@ -644,8 +644,8 @@ class Mesh:
 
         return System(run, plan_again)
 
-    @takes(OpenOptions)
-    def batch(self, copies: int, options: OpenOptions) -> Batch:
+    @takes(BatchOptions)
+    def batch(self, copies: int, options: BatchOptions) -> Batch:
         """Open many copies of all instances in this process, for a program that steps them as arrays (docs/batches.md).
 
         Nothing is recorded into a file, and no other process is started. Inputs with a Zenoh key are free to be set.
@@ -658,22 +658,24 @@ class Mesh:
 
         Args:
             copies: how many, 1 or more.
-            options: see `OpenOptions`.
+            options: see `BatchOptions`.
 
         Raises:
             ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
                 instances need a process of their own each.
-            CallRefused: there is not enough memory.
+            CallRefused: there is not enough memory, or these models cannot be stepped on several threads.
             FmuError: an instance cannot be opened or initialized. Nothing is left behind.
         """
         from .batch import Batch  # noqa: PLC0415  only this needs it
 
-        return Batch(self._opened(options), copies)
+        return Batch(self._opened(options), copies, threads=options.threads)
 
     def _opened(self, options: OpenOptions) -> RunPlan:
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `set`.")
-        return without_keys(self.plan(**options.given()))
+        given = options.given()
+        given.pop("threads", None)
+        return without_keys(self.plan(**given))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:
         """Keep the models loaded for many runs in this process, one after another: optimizers, calibration.

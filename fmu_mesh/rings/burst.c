@@ -733,6 +733,7 @@ PUBLIC int64_t copies_call(const CopyCall *calls, int64_t n, const uint8_t *want
 PUBLIC void copies_read(const Copy *copies, const CopyOutput *outputs, int64_t n, int64_t size, char *to, int64_t stride) {
   for (int64_t i = 0; i < n; i++) {
     const Member *member = outputs[i].member;
+    if (member == NULL) continue; /* it could not begin */
     const Output *own = &member->outputs[0];
     const int64_t row = member->points == 1 ? copies[i].point : copies[i].point / member->points;
     const char *from = own->rows + (row & own->mask) * own->stride + outputs[i].place;

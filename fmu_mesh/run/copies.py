@@ -14,12 +14,11 @@ mistyped: `fmu_mesh.api.batch` checks them.
 from __future__ import annotations
 
 import ctypes
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -27,12 +26,10 @@ from numpy.typing import NDArray
 
 from ..errors import FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
 from ..instances.call_guard import Unwatched
-from ..instances.contract import Instance, LogMessage
+from ..instances.contract import ChangesProcess, Instance, LogMessage
 from ..instances.kept_models import SharedModels
-from ..instances.process_state import ProcessState
 from ..instances.registry import open_instance
 from ..node.burst_engine import BurstEngine
-from ..node.engine import STATE_CHECK_S
 from ..node.inputs import TimedInputs
 from ..rings import native
 from ..rings.native import BurstEnd
@@ -40,7 +37,8 @@ from ..system.memory_map import MemoryMap, RingPlace, map_memory
 from ..system.plan import Plan
 from ..system.process_sharing import SharedProcess
 from ..text import listed
-from ..variables.value_types import DTYPES, is_text
+from ..variables.value_types import is_text
+from .copy_pieces import Pieces
 from .hosted_system import IN_ONE_NODE, HostedSystem, in_one_node
 from .local_system import opening_of
 from .one_process import claims_in
@@ -48,12 +46,7 @@ from .run_plan import RunPlan
 from .system_copy import Overrides, SavedCopy, SystemCopy, Verb
 from .threads import one_thread_meanwhile
 
-__all__ = ["Copies"]
-
-_PIECE_S: Final = 0.05
-"""About how long in s a piece of a call takes: then somebody may interrupt it."""
-
-_MANY_POINTS: Final = 4096
+__all__ = ["Copies", "Truths"]
 
 Truths = NDArray[np.bool_]
 
@@ -78,6 +71,7 @@ class Copies:
         self.errors: dict[int, FmuMeshError] = {}
         self._run = run
         self._plan = plan = in_one_node(run.plan, window=1)
+        self._node = plan.nodes[IN_ONE_NODE]
         self._last = plan.grid.last_point
         self._places = _rings_of(plan)
         self._folder, self._log = folder, log
@@ -89,14 +83,13 @@ class Copies:
         self._ended = np.zeros(count, np.bool_)
         self._set_at = {name: np.full(count, -1) for name in plan.order}
         self._is_set: set[str] = set()
+        self._timed: list[str] = []
         self._accesses: dict[tuple[str, Verb, tuple[str, ...]], Any] = {}
         self._columns: dict[tuple[str, str], Any] = {}
         self._first: dict[int, SavedCopy] = {}
         self._back: _WaysBack | None = None
         self._threads = ExitStack()
-        self._looked_after: ProcessState | None = None
-        self._look_at = 0.0
-        self._piece = 1
+        self._pieces = Pieces()
 
     def start(self, ready: Callable[[int], None] = lambda _count: None) -> None:
         """Open and initialize all copies: then they are at point 0.
@@ -114,6 +107,8 @@ class Copies:
             self._copies.append(SystemCopy(self._system))
             self._begin(number, {}, is_new=False)
             ready(number + 1)
+        runners = self._copies[0].runners
+        self._timed = [name for name, own in runners.items() if isinstance(own.instance, TimedInputs)]
         self._threads.enter_context(one_thread_meanwhile())  # with the libraries that components have imported
 
     @property
@@ -127,26 +122,11 @@ class Copies:
 
         What an FMU raises is in `errors`, and ends its copy at the last point that all its instances have reached.
         """
-        self._looked_after = self._looked_after or ProcessState()
-        try:
-            while points > 0 and not is_asked():
-                piece = min(points, self._piece)
-                began = time.perf_counter()
-                self._step(piece)
-                points -= piece
-                took_s = time.perf_counter() - began
-                if took_s < _PIECE_S / 2 and piece == self._piece:
-                    self._piece = min(2 * piece, _MANY_POINTS)
-                elif took_s > _PIECE_S:
-                    self._piece = max(1, self._piece // 2)
-        finally:
-            if (now := time.perf_counter()) >= self._look_at:
-                self._look_at = now + STATE_CHECK_S
-                if self._looked_after.restore():
-                    for copy in self._copies:
-                        copy.take_care()
+        if self._pieces.step(points, is_asked, self.step_piece):
+            self.take_care()
 
-    def _step(self, points: int) -> None:
+    def step_piece(self, points: int) -> None:
+        """As `step`, for who looks after the state of the process."""
         np.minimum(self.points + points, self._last, out=self._goals)
         if self.errors:
             np.copyto(self._goals, self.points, where=self._ended)
@@ -159,6 +139,17 @@ class Copies:
             for number in np.flatnonzero(self._ends != BurstEnd.DONE).tolist():
                 copy, end = self._copies[number], int(self._ends[number])
                 self._end_of(number, partial(copy.complete, end))
+
+    def take_care(self) -> None:
+        """Steps have changed the state of the process: from now on, each one is looked after."""
+        for copy in self._copies:
+            copy.take_care()
+
+    @property
+    def changes_process(self) -> bool:
+        """Whether a step may change the state of the process."""
+        runners = self._copies[0].runners.values()
+        return any(isinstance(own.instance, ChangesProcess) and own.instance.changes_process for own in runners)
 
     def _end_of(self, number: int, call: Callable[[], object]) -> None:
         """Make a call for a copy; what it raises ends the copy."""
@@ -175,33 +166,25 @@ class Copies:
 
     # --- values
 
-    def dtype(self, instance: str, name: str) -> np.dtype[Any]:
-        """That of the values of a variable."""
-        variable = self._copies[0].runners[instance].instance.description.variable(name)
-        assert variable is not None
-        return np.dtype(DTYPES[variable.type])
-
     def set(self, instance: str, name: str, values: NDArray[Any], wanted: Truths) -> None:
         """Set a variable of the ``wanted`` copies to ``values``, of shape (count, elements) and its dtype.
 
         What an FMU raises is in `errors`, and ends its copy.
         """
         wanted = wanted & ~self._ended
-        points = self._copies[0].runners[instance].plan.step_points
+        points = self._node.instance(instance).step_points
         np.copyto(self._set_at[instance], self.points // points, where=wanted)
         self._is_set.add(instance)
+        variable = self._plan.system.instances[instance].description.variable(name)
+        shape = variable.shape if variable is not None else ()
 
         def by_python(number: int) -> None:
-            variable = self._copies[number].runners[instance].instance.description.variable(name)
-            shape = variable.shape if variable is not None else ()
             row = values[number].reshape(shape).tolist() if shape else values[number, 0]
             value = row.item() if isinstance(row, np.generic) else row
             self._end_of(number, partial(self._copies[number].set, instance, name, value))
 
-        timed = self._copies[0].runners[instance].instance
-        access = None
-        if not isinstance(timed, TimedInputs) or not timed.follows(name):
-            access = self._access(instance, "Set", (name,))
+        over_time = instance in self._timed and variable is not None and variable.causality == "input"
+        access = None if over_time else self._access(instance, "Set", (name,))
         self._call(access, values, wanted, by_python)
 
     def get(self, instance: str, names: Sequence[str], out: NDArray[Any]) -> None:
@@ -209,7 +192,7 @@ class Copies:
 
         Where a failed copy has no value any more, it stays as it is.
         """
-        members = self._copies[0].runners[instance].plan
+        members = self._node.instance(instance)
         wanted = np.ones(len(self._copies), np.bool_)
         if self.errors:
             wanted[[number for number, error in self.errors.items() if isinstance(error, FmuError)]] = False
@@ -281,12 +264,11 @@ class Copies:
     @property
     def why_not_saved(self) -> str | None:
         """Why `save` is not possible, in words; None if it is."""
-        runners = self._copies[0].runners
-        without = [name for name, own in runners.items() if not own.instance.description.can_get_and_set_state]
+        instances = self._plan.system.instances
+        without = [name for name, own in instances.items() if not own.description.can_get_and_set_state]
         if without:
             return f"the model description of {listed(without)} says that it cannot (canGetAndSetFMUstate)"
-        timed = [name for name, own in runners.items() if isinstance(own.instance, TimedInputs)]
-        return f"inputs of {listed(timed)} follow a scenario, or have a timeout" if timed else None
+        return f"inputs of {listed(self._timed)} follow a scenario, or have a timeout" if self._timed else None
 
     def save(self) -> list[SavedCopy]:
         """Save all copies; `free` frees them.
@@ -323,7 +305,7 @@ class Copies:
             overrides: other start values of a copy, by instance and variable; None: those of the plan.
 
         Raises:
-            FmuError: one cannot be initialized; it has ended then, and so have those after it that were not reset.
+            FmuError: one cannot be initialized, and has ended; those after it stay as they were.
         """
         rest = wanted
         if overrides is None and self._back is not None:
@@ -337,7 +319,11 @@ class Copies:
                 self._back.forget(number)
             self._ended[number] = True
             own = overrides(number) if overrides is not None else {}
-            self._begin(number, own, is_new=number in self.errors)
+            try:
+                self._begin(number, own, is_new=number in self.errors)
+            except FmuError as error:
+                self.errors[number] = error
+                raise
             if overrides is None and self.why_not_saved is None:
                 self._note_first(number)
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .events import Event
 
 __all__ = [
+    "BatchOptions",
     "OpenOptions",
     "PlanOptions",
     "RerunOptions",
@@ -60,6 +61,14 @@ class OpenOptions(VariantOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
+
+
+class BatchOptions(OpenOptions, frozen=True):
+    """What `Mesh.batch` takes."""
+
+    threads: Annotated[
+        int, Option("step the copies on so many threads, each with a library of its own of each FMU", least=1)
+    ] = 1
 
 
 class PlanOptions(VariantOptions, frozen=True, kw_only=True):

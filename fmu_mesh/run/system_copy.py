@@ -107,11 +107,15 @@ class SystemCopy:
 
     def access(self, instance: str, verb: Verb, names: tuple[str, ...]) -> native.CopyCall | None:
         """See `AccessedNatively`."""
+        if instance not in self.runners:  # it could not begin
+            return None
         own = self.runners[instance].instance
         return own.access(verb, names) if isinstance(own, AccessedNatively) else None
 
     def column(self, instance: str, name: str) -> native.CopyOutput:
         """Where an output lies in the rows of an instance."""
+        if instance not in self.runners:
+            return native.CopyOutput()
         runner = self.runners[instance]
         place = runner.outputs.layout.place(name)
         at = runner.outputs.place_in_row(place.part, place.first)

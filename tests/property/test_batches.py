@@ -64,12 +64,11 @@ Action = tuple[str, Any]
 
 
 class Pair(NamedTuple):
-    """A batch, and systems that are opened one by one."""
+    """A mesh and a batch of it."""
 
     kind: str
     mesh: fmu_mesh.Mesh
     batch: fmu_mesh.Batch
-    systems: list[fmu_mesh.System]
 
 
 def mesh_of(kind: str, folder: Path, event_fmu: Callable[..., Path]) -> fmu_mesh.Mesh:
@@ -86,14 +85,14 @@ def mesh_of(kind: str, folder: Path, event_fmu: Callable[..., Path]) -> fmu_mesh
     return fmu_mesh.load(config)
 
 
-@pytest.fixture(scope="module", params=["native", "mixed"])
+@pytest.fixture(scope="module", params=[("native", 1), ("mixed", 1), ("native", 2)], ids=["native", "mixed", "threads"])
 def pair(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, event_fmu: Callable[..., Path]
 ) -> Iterator[Pair]:
-    mesh = mesh_of(request.param, tmp_path_factory.mktemp("batches"), event_fmu)
-    with ExitStack() as stack:
-        batch = stack.enter_context(mesh.batch(COPIES))
-        yield Pair(request.param, mesh, batch, [stack.enter_context(mesh.open()) for _ in range(COPIES)])
+    kind, threads = request.param
+    mesh = mesh_of(kind, tmp_path_factory.mktemp("batches"), event_fmu)
+    with mesh.batch(COPIES, threads=threads) as batch:
+        yield Pair(kind, mesh, batch)
 
 
 def actions(kind: str) -> st.SearchStrategy[list[Action]]:
@@ -241,6 +240,10 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
             for name in names:
                 expected = [np.array(own.get(name)).tolist() for own in systems]
                 assert batch.get(name).tolist() == expected, (name, points)
+        with pytest.raises(
+            fmu_mesh.CallRefused, match="cannot be stepped by several threads, where both use"
+        ):
+            mesh.batch(2, threads=2)
         with pytest.raises(fmu_mesh.CallRefused, match=r"follow a scenario, or have a timeout|says that it cannot"):
             batch.save()
         batch.reset(np.array([False, True]))
@@ -251,10 +254,11 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
     assert batch.point.tolist() == [125, 10]
 
 
-def test_ctrl_c_ends_a_call_with_all_copies_at_one_point() -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(threads: int) -> None:
     mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=None)
     mesh.add("cart", fmu=str(FMUS / "CartPole.fmu"))
-    with mesh.batch(3) as batch:
+    with mesh.batch(3, threads=threads) as batch:
         batch.step(10)
         threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
         with pytest.raises(KeyboardInterrupt):
@@ -265,9 +269,10 @@ def test_ctrl_c_ends_a_call_with_all_copies_at_one_point() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize("library", [True, False], ids=["C", "Python"])
+@pytest.mark.parametrize(("library", "threads"), [(True, 1), (False, 1), (True, 3)], ids=["C", "Python", "threads"])
 def test_each_copy_ends_where_a_single_system_ends(
     library: bool,  # noqa: FBT001 a parameter of tests
+    threads: int,
     faulty: Path,
     event_fmu: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
@@ -284,7 +289,7 @@ def test_each_copy_ends_where_a_single_system_ends(
     mesh.connect("faulty.y", "last.u")
     fail_at = [1e300, 0.42, 1e300, 0.55, 0.07]
     end = [1000, 1000, 3, 2, 1000]
-    with mesh.batch(5) as batch:
+    with mesh.batch(5, threads=threads) as batch:
         batch.reset(start_values={"faulty.fail_at": fail_at, "stairs.end": end})
         for points in (1, 6, 13, 30, 60):
             batch.step(points)
