@@ -323,9 +323,11 @@ class _Run:
 
     def _leave(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         """Keep the system for the next run, if this one has come to its last point."""
-        self._engine = None
-        if error is not None or self._first is not None or not self._system.end():
-            self._system.close()
+        try:
+            if error is not None or self._first is not None or not self._system.end():
+                self._system.close()
+        finally:
+            self._engine = None  # not before: an FMU that does not return even now is told with the point
 
     def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         if isinstance(error, FmuMeshError):
