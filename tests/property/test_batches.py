@@ -240,9 +240,7 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
             for name in names:
                 expected = [np.array(own.get(name)).tolist() for own in systems]
                 assert batch.get(name).tolist() == expected, (name, points)
-        with pytest.raises(
-            fmu_mesh.CallRefused, match="cannot be stepped by several threads, where both use"
-        ):
+        with pytest.raises(fmu_mesh.CallRefused, match="cannot be stepped by several threads, where both use"):
             mesh.batch(2, threads=2)
         with pytest.raises(fmu_mesh.CallRefused, match=r"follow a scenario, or have a timeout|says that it cannot"):
             batch.save()
