@@ -260,7 +260,7 @@ def test_a_sender_that_stops_is_told_and_may_come_back(tmp_path: Path) -> None:
         assert f"no value for 'u' since point {points[-1]}" in status.activity
         # What has a past time would be older than the value that it has fallen back to.
         again = run.set("gain.u", 8.0, at=points[-1] * 0.01 + 0.1).point
-        wait_until(lambda: not run.instance_status("gain").timed_out, "a value that is used")
+        # That it is used can be seen for 0.2 s only, which a busy machine may miss: then it is the one that is too old.
         wait_until(lambda: run.instance_status("gain").timed_out == {"u": again}, "the second timeout")
         warned = [line.message for line in run.logs() if line.category == "timeout"]
         run.stop()
