@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .adapter import FMIAdapter
     from .api.attaching import attach, meshes
-    from .api.batch import Batch, BatchState
+    from .api.batch import Batch
     from .api.comparison import Comparison
     from .api.inspection import Inspection, inspect
     from .api.mesh_builder import Mesh, load
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .api.run_handle import Run
     from .api.samples import Sample
     from .api.simulating import simulate
-    from .api.system_state import SystemState
+    from .api.system_state import BatchState, SystemState
     from .errors import (
         CallRefused,
         ConfigurationError,
@@ -110,7 +110,7 @@ __all__ = [
 _NAMES = {
     "adapter": ("FMIAdapter",),
     "api.attaching": ("attach", "meshes"),
-    "api.batch": ("Batch", "BatchState"),
+    "api.batch": ("Batch",),
     "api.comparison": ("Comparison",),
     "api.inspection": ("Inspection", "inspect"),
     "api.mesh_builder": ("Mesh", "load"),
@@ -123,7 +123,7 @@ _NAMES = {
     "api.run_handle": ("Run",),
     "api.samples": ("Sample",),
     "api.simulating": ("simulate",),
-    "api.system_state": ("SystemState",),
+    "api.system_state": ("BatchState", "SystemState"),
     "instances.python.component": ("Component", "component"),
     "instances.python.declarations": ("Input", "Output", "Parameter"),
     "pictures.system_graph": ("SystemGraph",),

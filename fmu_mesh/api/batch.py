@@ -1,4 +1,4 @@
-"""`Batch`: many copies of a mesh as arrays, in this process; `BatchState`: where they can go back to.
+"""`Batch`: many copies of a mesh as arrays, in this process.
 
 Owns names, values and the private folder. What a step does is `fmu_mesh.run.copies`.
 """
@@ -36,9 +36,9 @@ from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
 from ..variables.value_types import DTYPES, is_float, is_text
-from .system_state import SystemState
+from .system_state import BatchState
 
-__all__ = ["Batch", "BatchState"]
+__all__ = ["Batch"]
 
 _LOOKED_AT: Final = 16
 """After so many copies it is known how much memory one takes."""
@@ -287,7 +287,7 @@ class Batch:
         if (why := self._copies.why_not_saved) is not None:
             raise CallRefused(f"the state cannot be saved: {why}.", hint="Use `reset` to go back to the first point.")
         saved = self._copies.save()
-        state = BatchState(0, partial(self._lost.append, saved))
+        state = BatchState(self.point, partial(self._lost.append, saved))
         self._saved[state] = saved
         return state
 
@@ -420,20 +420,6 @@ class Batch:
         """Free the states whose objects are gone, which may have happened on any thread."""
         while self._lost:
             self._copies.free(self._lost.popleft())
-
-
-class BatchState(SystemState):
-    """The state of all copies of a `Batch`, for `Batch.restore`; it belongs to this batch.
-
-    Example:
-        >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2) as batch:
-        ...     batch.step(10)
-        ...     with batch.save() as state:
-        ...         batch.step(10)
-        ...         batch.restore(state)
-        ...         batch.point.tolist()
-        [10, 10]
-    """
 
 
 def _resident_bytes() -> int:

@@ -1,4 +1,4 @@
-"""`SystemState`: where a `System` can go back to.
+"""`SystemState` and `BatchState`: where a `System` or a `Batch` can go back to.
 
 Owns when a state is closed. What it holds, its system knows, which frees it on its own thread.
 """
@@ -9,7 +9,10 @@ import weakref
 from collections.abc import Callable
 from typing import Self
 
-__all__ = ["SystemState"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["BatchState", "SystemState"]
 
 
 class SystemState:
@@ -39,7 +42,7 @@ class SystemState:
         self.close()
 
     def __repr__(self) -> str:
-        return f"<SystemState: point {self.point}{', closed' if self.closed else ''}>"
+        return f"<{type(self).__name__}: point {self.point}{', closed' if self.closed else ''}>"
 
     @property
     def closed(self) -> bool:
@@ -49,3 +52,26 @@ class SystemState:
     def close(self) -> None:
         """Give the memory of the state back; the FMUs free it at the next `save`, `restore` or `System.close`."""
         self._release()
+
+
+class BatchState(SystemState):
+    """The state of all copies of a `Batch`, for `Batch.restore`; it belongs to this batch.
+
+    Example:
+        >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2) as batch:
+        ...     batch.step(10)
+        ...     with batch.save() as state:
+        ...         batch.step(10)
+        ...         batch.restore(state)
+        ...         batch.point.tolist(), state.point.tolist()
+        ([10, 10], [10, 10])
+
+    Attributes:
+        point: the communication point of each copy, shape (copies,).
+    """
+
+    point: NDArray[np.int64]  # type: ignore[assignment]  # one for each copy
+
+    def __init__(self, point: NDArray[np.int64], release: Callable[[], None]) -> None:
+        super().__init__(0, release)
+        self.point = point
