@@ -48,6 +48,8 @@ __all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
 _NAME: Final = "fmu_mesh"
 _TOKEN_BYTES: Final = 16
 _ZERO: Final = bytes(8)
+_LINE: Final = 64
+_PRIVATE: Final = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
 
 ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
 """Whether the process that somebody waits for cannot run meanwhile."""
@@ -75,7 +77,9 @@ class HostMemory:
     Make it with `create`, `opened` or `private`.
     """
 
-    def __init__(self, memory: mmap.mmap, map_: MemoryMap, process: str, descriptor: int | None = None) -> None:
+    def __init__(
+        self, memory: mmap.mmap | memoryview, map_: MemoryMap, process: str, descriptor: int | None = None
+    ) -> None:
         self.map = map_
         self._memory = memory
         self._descriptor = descriptor
@@ -107,12 +111,22 @@ class HostMemory:
         return made
 
     @classmethod
-    def private(cls, map_: MemoryMap, process: str) -> Self:
-        """Make memory for this process alone; pages that nobody touches take no space."""
-        memory = mmap.mmap(-1, map_.size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        made = cls(memory, map_, process)
+    def private(cls, map_: MemoryMap, process: str, room: memoryview | None = None) -> Self:
+        """Make memory for this process alone, in a room of zeros if there is one; untouched pages take no space."""
+        made = cls(mmap.mmap(-1, map_.size, _PRIVATE) if room is None else room, map_, process)
         made._prepare()
         return made
+
+    @staticmethod
+    def rooms(map_: MemoryMap, count: int) -> list[memoryview]:
+        """Rooms for so many memories with one map, side by side.
+
+        With pages of their own, the same counter of all would be in the same few lines of the processor's caches. The
+        distance of two is an odd number of lines, so that they use all of these.
+        """
+        size = (-(-map_.size // _LINE) | 1) * _LINE
+        all_ = memoryview(mmap.mmap(-1, count * size, _PRIVATE))
+        return [all_[first : first + size] for first in range(0, count * size, size)]
 
     @classmethod
     def opened(cls, offer: Offer, map_: MemoryMap, process: str) -> Self | None:

@@ -53,6 +53,7 @@ class HostedSystem:
         alone: whether nothing else in this process changes its state between the runs, so that it is looked after as
             between steps: several times a second, and not once in each run.
         places: where the rings are in memory, if not as in the plan.
+        room: memory of zeros for them; None: memory of its own.
 
     Attributes:
         plan: the plan.
@@ -69,11 +70,12 @@ class HostedSystem:
         *,
         alone: bool,
         places: tuple[MemoryMap, Mapping[str, RingPlace]] | None = None,
+        room: memoryview | None = None,
     ) -> None:
         self.plan = plan
         self.node = node = plan.nodes[IN_ONE_NODE]
         map_, self._places = places or (node.memory, {place.instance: place for place in node.rings})
-        self.memory = HostMemory.private(map_, IN_ONE_NODE)
+        self.memory = HostMemory.private(map_, IN_ONE_NODE, room)
         self.runners: dict[str, Runner] = {}
         self.loads = True
         self._watch = watch
