@@ -231,7 +231,7 @@ class Copies:
         )
 
     def _call(self, accesses: Any, values: NDArray[Any], wanted: Truths, otherwise: Callable[[int], None]) -> None:  # noqa: ANN401  an array of ctypes
-        """Get or set through the library; copies for which it cannot, or fails, one by one: then these are ``wanted``."""
+        """Get or set through the library; copies for which it cannot, or fails, one by one: ``wanted`` are these."""
         if accesses is not None and native.library is not None:
             calls, own, to = ctypes.addressof(accesses), wanted.ctypes.data, values.ctypes.data
             if not self._threads.work(WorkKind.CALL, calls=calls, wanted=own, values=to, stride=values.strides[0]):
