@@ -46,6 +46,7 @@ class LibraryFunctions:
         by_cvode = CFUNCTYPE(ctypes.c_int, c_double, address, address, address)
         self.equations_derivatives = by_cvode(("equations_derivatives", slow))
         self.equations_indicators = by_cvode(("equations_indicators", slow))
+        self.step_copy = CFUNCTYPE(c_int64, address)(("step_copy", slow))
         self.copies_work = CFUNCTYPE(c_int64, address, c_int64)(("copies_work", slow))
         self.copies_serve = CFUNCTYPE(None, address)(("copies_serve", slow))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))

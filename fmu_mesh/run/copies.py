@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from msgspec.structs import replace
@@ -153,14 +153,16 @@ class Copies:
             np.copyto(self._goals, self.points, where=self._ended)
         if native.library is None:
             for number, copy in enumerate(self._copies):
-                self._end_of(number, partial(copy.step_to, int(self._goals[number])))
-                self.points[number] = copy.point
+                self._end_of(number, partial(copy.engine.step_to, int(self._goals[number])))
+                self.points[number] = copy.engine.point
             return
         while self._threads.work(WorkKind.STEP, wanted=None):
             self._threads.each(np.flatnonzero(self._ends != BurstEnd.DONE).tolist(), self._complete)
 
     def _complete(self, number: int) -> None:
-        self._end_of(number, partial(self._copies[number].complete, int(self._ends[number])))
+        self._end_of(
+            number, partial(cast("BurstEngine", self._copies[number].engine).complete, int(self._ends[number]))
+        )
 
     def _end_of(self, number: int, call: Callable[[], object]) -> None:
         """Make a call for a copy; what it raises ends the copy."""
@@ -168,9 +170,7 @@ class Copies:
             call()
         except (FmuError, TerminationRequested) as error:
             point = int(self.points[number])
-            if error.point is None:
-                begun = self._copies[number].begun_at(error) if isinstance(error, FmuError) else point
-                error.at(begun, self._plan.grid.time(begun))
+            self._copies[number].located(error, point)
             self.errors[number] = error
             self._ended[number] = True
             self._goals[number] = point
@@ -347,7 +347,7 @@ class Copies:
         copy = self._copies[number]
         copy.begin(overrides, is_new=is_new)
         if isinstance(copy.engine, BurstEngine):
-            self._table[number] = copy.engine.as_copy()
+            self._table[number] = copy.engine.copy
         for key, accesses in self._accesses.items():
             if accesses is not None and (access := copy.access(*key)) is not None:
                 accesses[number] = access
