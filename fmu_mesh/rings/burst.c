@@ -691,6 +691,7 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 /* Step a copy to its goal. All instances are members of one unit, in the order of the plan: so a copy ends at an event as
  * if each of them had been called in its turn. Returns a BurstEnd. */
 PUBLIC int64_t step_copy(Copy *copy) {
+  if (copy->point >= copy->goal) return DONE; /* it may have ended, and have no node any more */
   Unit *unit = copy->node->units;
   unit->last_tick = unit->burst = copy->goal / unit->tick_points;
   while (unit->tick < unit->last_tick) {
@@ -724,12 +725,16 @@ static inline void read_copy(const Copy *copy, const CopyOutput *output, int64_t
     memcpy(to, from, (size_t)size);
 }
 
-/* Bring a copy back to where it was: each of its FMUs by its state, and memory that was kept. */
+/* Bring a copy back to where it was: each of its FMUs by its state, and memory that was kept. Whether there is that. */
 static inline int restore_copy(const CopyCall *calls, int64_t n_calls, const Keep *pieces, int64_t n_pieces) {
+  if (pieces->kept == NULL) return 0;
   for (int64_t i = 0; i < n_calls; i++)
     if (!call_copy(&calls[i], NULL)) return 0;
-  for (int64_t i = 0; i < n_pieces; i++)
-    for (int64_t j = 0; j < pieces[i].size; j++) pieces[i].memory[j] = pieces[i].kept[j];
+  for (int64_t i = 0; i < n_pieces; i++) {
+    int64_t *restrict to = pieces[i].memory;
+    const int64_t *restrict from = pieces[i].kept;
+    for (int64_t left = pieces[i].size; left > 0; left--) *to++ = *from++;
+  }
   return 1;
 }
 

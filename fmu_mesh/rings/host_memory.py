@@ -13,6 +13,7 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
 
@@ -91,6 +92,7 @@ class HostMemory:
         self.progress = {
             name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)
         }
+        self._beside = self._view[map_.size :]
         self._lock = threading.Condition()
         self._rung = False
 
@@ -118,15 +120,18 @@ class HostMemory:
         return made
 
     @staticmethod
-    def rooms(map_: MemoryMap, count: int) -> list[memoryview]:
-        """Rooms for so many memories with one map, side by side.
+    def rooms(map_: MemoryMap, count: int, beside: int) -> list[memoryview]:
+        """Rooms for so many memories with one map, side by side, with so many bytes for `beside`.
 
-        With pages of their own, the same counter of all would be in the same few lines of the processor's caches. The
-        distance of two is an odd number of lines, so that they use all of these.
+        With pages of their own, the same counter of all would be in the same few lines of the processor's caches, and
+        each in another page. The distance of two is an odd number of lines, so that they use all of these.
         """
-        size = (-(-map_.size // _LINE) | 1) * _LINE
-        all_ = memoryview(mmap.mmap(-1, count * size, _PRIVATE))
-        return [all_[first : first + size] for first in range(0, count * size, size)]
+        size = (-(-(map_.size + beside) // _LINE) | 1) * _LINE
+        memory = mmap.mmap(-1, count * size, _PRIVATE)
+        if hasattr(mmap, "MADV_HUGEPAGE"):
+            with suppress(OSError):  # the kernel has none
+                memory.madvise(mmap.MADV_HUGEPAGE)
+        return [memoryview(memory)[first : first + size] for first in range(0, count * size, size)]
 
     @classmethod
     def opened(cls, offer: Offer, map_: MemoryMap, process: str) -> Self | None:
@@ -171,6 +176,14 @@ class HostMemory:
     def ring(self, place: RingPlace) -> Ring:
         """The ring of an instance; text is beside it, in this process."""
         return Ring(place.layout, place.rows, self._view[place.offset :])
+
+    def beside(self, size: int) -> memoryview:
+        """Zeros for a table or a row that nobody shares: in the room of this memory, while there is some left."""
+        size = -(-size // _LINE) * _LINE
+        if size > len(self._beside):
+            return memoryview(bytearray(size))
+        taken, self._beside = self._beside[:size], self._beside[size:]
+        return taken
 
     def withdraw_grant(self) -> int:
         """Of shared memory: take the grant back, and return a point that no node passes before the next grant."""

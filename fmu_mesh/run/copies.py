@@ -37,8 +37,9 @@ from ..node.inputs import TimedInputs
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import BurstEnd, WorkKind
+from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace, map_memory
-from ..system.plan import Plan
+from ..system.plan import NodePlan, Plan
 from ..system.process_sharing import SharedProcess
 from ..text import listed
 from ..variables.value_types import is_text
@@ -82,7 +83,7 @@ class Copies:
         self._node = plan.nodes[IN_ONE_NODE]
         self._last = plan.grid.last_point
         self._places = _rings_of(plan)
-        self._rooms = HostMemory.rooms(self._places[0], count)
+        self._rooms = HostMemory.rooms(self._places[0], count, _bytes_beside(self._node))
         self._log = log
         self._copies: list[SystemCopy] = []
         self._table = (native.CopyTable * count)()
@@ -174,6 +175,8 @@ class Copies:
             self.errors[number] = error
             self._ended[number] = True
             self._goals[number] = point
+            if self._back is not None:
+                self._back.forget(number)
 
     # --- values
 
@@ -308,10 +311,11 @@ class Copies:
         """
         rest = wanted
         if overrides is None and self._back is not None:
-            back = self._back.restore(wanted & ~self._ended)
-            rest = wanted & ~back
+            rest = self._back.restore(wanted)
             for name in self._is_set:
-                np.copyto(self._set_at[name], -1, where=back)
+                np.copyto(self._set_at[name], -1, where=wanted)
+            if rest is None:
+                return
         self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
 
     def _reset(self, overrides: Callable[[int], Overrides] | None, number: int) -> None:
@@ -345,14 +349,16 @@ class Copies:
 
     def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
         copy = self._copies[number]
-        copy.begin(overrides, is_new=is_new)
+        try:
+            copy.begin(overrides, is_new=is_new)
+        finally:  # without instances, nothing can be read
+            for own, columns in self._columns.items():
+                columns[number] = copy.column(*own)
         if isinstance(copy.engine, BurstEngine):
             self._table[number] = copy.engine.copy
         for key, accesses in self._accesses.items():
             if accesses is not None and (access := copy.access(*key)) is not None:
                 accesses[number] = access
-        for own, columns in self._columns.items():
-            columns[number] = copy.column(*own)
         self._back_at(number, 0)
 
     def _back_at(self, number: int, point: int) -> None:
@@ -419,7 +425,6 @@ class _WaysBack:
         self._sizes = states, 1 + pieces
         self._calls = (native.CopyCall * (len(copies) * states))()
         self._pieces = (native.Keep * (len(copies) * (1 + pieces)))()
-        self._known = np.zeros(len(copies), np.bool_)
         self._zeros = (ctypes.c_int64 * 2)()
 
     def note(self, number: int, calls: list[native.CopyCall], pieces: list[native.Keep]) -> None:
@@ -431,16 +436,14 @@ class _WaysBack:
             native.Keep(point, ctypes.addressof(self._zeros), 2),
             *pieces,
         ]
-        self._known[number] = True
 
     def forget(self, number: int) -> None:
-        """A copy is made anew."""
-        self._known[number] = False
+        """A copy has ended, or is made anew."""
+        self._pieces[number * self._sizes[1]] = native.Keep()
 
-    def restore(self, wanted: Truths) -> Truths:
-        """Bring those back that it knows of ``wanted``; which ones are there."""
-        back: Truths = wanted & self._known
-        left = back.copy()
+    def restore(self, wanted: Truths) -> Truths | None:
+        """Bring those of ``wanted`` back that it knows; which ones are left, if any."""
+        left = wanted.copy()
         (calls, pieces), (calls_each, pieces_each) = (self._calls, self._pieces), self._sizes
         if self._threads.work(
             WorkKind.RESTORE,
@@ -450,8 +453,14 @@ class _WaysBack:
             pieces_each=pieces_each,
             wanted=left.ctypes.data,
         ):
-            back &= ~left
-        return back
+            return left
+        return None
+
+
+def _bytes_beside(node: NodePlan) -> int:
+    """Enough for what the engine of a copy has beside its rings: its tables, and the inputs."""
+    lines = ctypes.sizeof(native.UnitTable) + sum(row_bytes(item.input_row) + 64 for item in node.instances) + 128
+    return lines + len(node.instances) * ctypes.sizeof(native.MemberTable)
 
 
 def _rings_of(plan: Plan) -> tuple[MemoryMap, Mapping[str, RingPlace]]:

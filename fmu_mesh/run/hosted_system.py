@@ -23,6 +23,7 @@ from ..node.inputs import with_times
 from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
+from ..rings.ring import Ring
 from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace
 from ..system.plan import Plan, make_plan
@@ -108,7 +109,8 @@ class HostedSystem:
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
             self._begins_again = self._begins_again and timed is instance and instance.runs_again
-            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter)
+            inputs = Ring(item.input_row, 1, self.memory.beside(row_bytes(item.input_row)))
+            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
         connect(node, self.runners, self.memory, self.memory)
 
     def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:
