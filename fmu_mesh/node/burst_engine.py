@@ -160,10 +160,10 @@ class BurstEngine(Engine):
         return int(self._copy.point)
 
     def _step_to(self, point: int) -> None:
-        copy, step, address = self._copy, self._library.copies_step, ctypes.addressof(self._copy)
+        copy, step, address = self._copy, self._library.step_copy, ctypes.addressof(self._copy)
         copy.goal = point
-        while step(address, 1):
-            self.complete(copy.end)
+        while (end := step(address)) != BurstEnd.DONE:
+            self.complete(end)
 
     def send(self) -> None:
         """See `Engine`."""
