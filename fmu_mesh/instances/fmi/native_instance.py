@@ -162,7 +162,7 @@ class NativeInstance(FmuInstance):
             return None
         count = len(variables)
         references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
-        function = address_of(cffi_function(self._function(verb, type_), functions.declaration))
+        function = address_of(self._function(verb, type_))
         size = sum(variable.size for variable in variables) if functions.sized else -1
         self._accesses = [*self._accesses, references]
         return CopyCall(function, self._component, ctypes.addressof(references), count, size)
@@ -201,7 +201,7 @@ class NativeInstance(FmuInstance):
         if access is None:
             return None
         cell, size = np.zeros(1, DTYPES[variable.type]), (1,) if access.size >= 0 else ()
-        call = cffi_function(self._function(verb, variable.type), self._functions.values.declaration)
+        call = self._function(verb, variable.type)
         return variable, call, (self._self, pointer(access.references), 1, memory(cell), *size), cell.data
 
     def state_access(self, state: object) -> CopyCall | None:
