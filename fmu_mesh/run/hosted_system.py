@@ -83,6 +83,7 @@ class HostedSystem:
         self._alone = alone
         self._state: ProcessState | None = None
         self._begins_again = True
+        self._initialization = Initialization(node)
 
     def open(self) -> None:
         """Open all instances; after `end`, they begin again.
@@ -94,7 +95,7 @@ class HostedSystem:
             self._state = None if self._alone else ProcessState()
             self.memory.begin_again()
             for instance in self._instances:
-                instance.run_again()
+                instance.begin_again()
             return
         node = self.node
         for item in node.instances:
@@ -103,7 +104,7 @@ class HostedSystem:
             place = self._places[item.name]
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
-            self._begins_again = self._begins_again and timed is instance and instance.runs_again
+            self._begins_again = self._begins_again and timed is instance
             self.runners[item.name] = Runner(item, timed, node.grid, ring, counter)
         connect(node, self.runners, self.memory, self.memory)
 
@@ -117,7 +118,7 @@ class HostedSystem:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
-        Initialization(node).run(self.runners.values(), start_values, again=engine is not None)
+        self._initialization.run(self.runners.values(), start_values, again=engine is not None)
         if engine is None:
             units = [[self.runners[name] for name in names] for names in node.units]
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
@@ -129,7 +130,7 @@ class HostedSystem:
 
     def end(self) -> bool:
         """After the last point: end the run of all instances, and keep what the next one needs; whether that works."""
-        if not self._begins_again:
+        if not self._begins_again or not all(instance.runs_again for instance in self._instances):
             return False
         state = self._state or (None if self._alone else ProcessState())
         with self._watch.surviving(", ".join(self.plan.order)):

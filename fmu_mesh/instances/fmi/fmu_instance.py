@@ -84,7 +84,7 @@ class FmuInstance(ABC):
 
     _functions: FmuFunctions  # those of this version of FMI and this kind of FMU
 
-    _component: int  # the address of the instance, for functions called through ctypes; ``_self`` is the same for cffi
+    _component = 0  # the address of the instance, for functions called through ctypes; ``_self`` is the same for cffi
 
     _solver = ""  # what the error of a solver begins with
 
@@ -150,7 +150,8 @@ class FmuInstance(ABC):
         Binary values may be base64 as in a configuration.
         """
         self._check_live()
-        self._describe(self.description.sized(start_values))
+        if self._functions.values.sized:  # FMI 3.0 alone has arrays
+            self._describe(self.description.sized(start_values))
         values = {name: to_value(value, self._variables[name]) for name, value in start_values.items()}
         self._enter_initialization(start_time, stop_time, values)
         self._state = "initialization"
@@ -284,10 +285,15 @@ class FmuInstance(ABC):
 
     def _instantiate(self, **arguments: object) -> None:
         """Make the instance with these arguments for FMPy, unless one was reset; look up what the steps need."""
+        self._make(**arguments)
+
+    def _make(self, **arguments: object) -> None:
+        """Make the instance; without arguments, with those of the last one."""
         register(self.name, self, id(self._model))
         self._model.instantiate(**arguments)
-        self._component = self._fmu.component
-        self._self = pointer(self._component)
+        if self._component != self._model.component:
+            self._component = self._model.component
+            self._self = pointer(self._component)
         if not self._functions.values.sized:  # FMI 3.0 passes no component to its logger
             register_component(self._component, self)
 
