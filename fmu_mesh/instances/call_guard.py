@@ -347,7 +347,10 @@ class Guarded(AroundNativeSteps):
         """See `BeginsAgain`. What was harmless until now is taken for it."""
         assert self._again is not None
         self._trusted = self.is_harmless
-        self._made(LoadFailed, "call", self._again.begin_again)
+        if self._is_watched:
+            self._made(LoadFailed, "call", self._again.begin_again)
+        else:
+            self._forward(self._again.begin_again)
 
     @property
     def is_harmless(self) -> bool:
@@ -395,6 +398,13 @@ class Guarded(AroundNativeSteps):
         return own if isinstance(own, Prepares) and not self._is_watched else None
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
+        if self._trusted and not (self._is_watched or self._careful):  # as `_made`, in half the time
+            was_changed = floating_point_changed()
+            try:
+                return call(*arguments)
+            finally:
+                if not was_changed and floating_point_changed():
+                    restore_floating_point()
         if self._running:
             return self._made(StepFailed, "step", call, *arguments)
         return self._made(InitializationFailed, "call", call, *arguments)

@@ -74,6 +74,8 @@ class Initialization:
         for own in plan.instances:
             for name, level in own.initialization.items():
                 self._outputs.setdefault((own.name, level), []).append(name)
+        steps = {own.step_points for own in plan.instances}
+        self._stop_times = {points: plan.grid.told_stop_time(points) for points in steps}
         self._loops = {loop.first: loop for loop in plan.loops}
         iterated = {level for loop in plan.loops for level in range(loop.first, loop.last + 1)}
         self._sequence = sorted(({level for _, level in self._outputs} - iterated) | self._loops.keys())
@@ -111,11 +113,11 @@ class Initialization:
             FmuError: an FMU refused a value.
             LoopNotConverged: a loop has no consistent values.
         """
-        grid = self._plan.grid
+        start_time = self._plan.grid.start_time
         for runner in runners:
-            stop_time = grid.told_stop_time(runner.plan.step_points)
-            values = {**runner.plan.start_values, **start_values.get(runner.name, {})}
-            runner.instance.enter_initialization(grid.start_time, stop_time, values)
+            own, others = runner.plan.start_values, start_values.get(runner.name)
+            stop_time = self._stop_times[runner.plan.step_points]
+            runner.instance.enter_initialization(start_time, stop_time, {**own, **others} if others else own)
         self._end = self._clock() + self._plan.timeouts.initialize
         for level in self._sequence:
             if level in self._loops:
@@ -126,7 +128,8 @@ class Initialization:
                         self._set_inputs(runner, level)
                         self._send(runner, level, self._get_outputs(runner, names))
         for runner in runners:
-            self._set_inputs(runner, ENDLESS)
+            if self._moves[runner.name]:
+                self._set_inputs(runner, ENDLESS)
         self.out_links.clear()
         for values_of_run in (self._known, self._settled, self._parameters):
             values_of_run.clear()

@@ -108,13 +108,13 @@ class Runner:
     def bind_again(self) -> None:
         """As `bind`, for an instance that has begun another run; see `BeginsAgain`."""
         self.outputs.stamps[: self.step + 1] = 0  # of the rows of the run before
+        instance, table = self.instance, self.table
         if any(column.shape for column in self.inputs.layout.columns):
             self._fill_unconnected()
-        self.instance.bind(self.inputs, (self.outputs,), self.grid, self.plan.step_points)
-        own = self.instance.native if isinstance(self.instance, AroundNativeSteps) else None
-        component = own.component if own is not None else None
-        self.table.note(component=component, step=0, stage=native.Stage.WAITING, outcome=0)
-        for gate in self.table.gates[: self.table.n_gates]:
+        instance.bind(self.inputs, (self.outputs,), self.grid, self.plan.step_points)
+        own = instance.native if isinstance(instance, AroundNativeSteps) else None
+        table.note(component=None if own is None else own.component, step=0, stage=native.Stage.WAITING, outcome=0)
+        for gate in table.gates[: table.n_gates] if self.sources else ():
             gate.note(known=0)
 
     def _fill_unconnected(self) -> None:

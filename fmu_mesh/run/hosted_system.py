@@ -82,7 +82,7 @@ class HostedSystem:
         self._engine: Engine | None = None
         self._alone = alone
         self._state: ProcessState | None = None
-        self._begins_again = True
+        self._begins_again, self._names = True, ", ".join(plan.order)
         self._initialization = Initialization(node)
 
     def open(self) -> None:
@@ -133,7 +133,7 @@ class HostedSystem:
         if not self._begins_again or not all(instance.runs_again for instance in self._instances):
             return False
         state = self._state or (None if self._alone else ProcessState())
-        with self._watch.surviving(", ".join(self.plan.order)):
+        with self._watch.surviving(self._names):
             ended = [instance.end_run() for instance in reversed(self._instances)]
         self.loads = not all(ended) or (state is not None and state.restore())
         return not self.loads
