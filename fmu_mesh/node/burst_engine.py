@@ -75,6 +75,7 @@ class BurstEngine(Engine):
             stride=1,
         )
         self._address = ctypes.addressof(self._node)
+        self._copy = self.copy
         for runner in self.runners:
             runner.refit()
 
@@ -82,6 +83,7 @@ class BurstEngine(Engine):
         """See `Engine`."""
         super().begin_again(looked_after)
         self._node.note(allowed=0, stride=1, patience=0)  # nothing of the grant before is known any more
+        self._copy = self.copy
 
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library
@@ -105,14 +107,26 @@ class BurstEngine(Engine):
         unit, runner = self._node.unit, self.units[self._node.unit][self._node.member]
         if result == BurstEnd.FORGED:
             raise self._forged(runner)
+        if result == BurstEnd.BLOCKED:
+            raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
         began = perf_counter()
         self._complete(unit, runner, result)
         self._units[unit].spent_ns += int((perf_counter() - began) * 1e9)
 
-    def as_copy(self) -> native.CopyTable:
-        """For a system in this process that waits for nobody: all of it is granted."""
-        self._node.allowed = self._last_point
+    @property
+    def copy(self) -> native.CopyTable:
+        """How the library steps it as one of many systems, from point 0 on."""
         return native.CopyTable(node=self._address)
+
+    @property
+    def point(self) -> int:
+        """See `Engine`."""
+        return int(self._copy.point)
+
+    def _step_to(self, point: int) -> None:
+        self._copy.goal = point
+        while self._library.copies_step(ctypes.addressof(self._copy), 1):
+            self.complete(self._copy.end)
 
     def send(self) -> None:
         """See `Engine`."""

@@ -687,20 +687,19 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 /* ---- copies: many systems in this process, each with tables of its own. Nobody else reads their memory, so nothing
  * waits: a unit that lacks a row is a fault of its plan. */
 
-/* Step a copy to its goal, point by point: so it ends at an event as if each instance had been called in its turn. */
+/* Step a copy to its goal. All instances are members of one unit, in the order of the plan: so a copy ends at an event as
+ * if each of them had been called in its turn. */
 static int step_copy(Copy *copy) {
-  Node *node = copy->node;
-  for (; copy->point < copy->goal; copy->point++) {
-    for (int64_t i = 0; i < node->n_units; i++) {
-      Unit *unit = &node->units[i];
-      unit->last_tick = unit->tick_points == 1 ? copy->point + 1 : (copy->point + 1) / unit->tick_points;
-      if (unit->stopped || unit->tick >= unit->last_tick) continue;
-      int64_t ticks;
-      int result = advance(node, unit, &ticks);
-      if (result != SLICE) return result;
-      if (unit->tick < unit->last_tick) return BLOCKED;
-    }
+  Unit *unit = copy->node->units;
+  unit->last_tick = unit->burst = copy->goal / unit->tick_points;
+  while (unit->tick < unit->last_tick) {
+    int64_t ticks;
+    const int result = advance(copy->node, unit, &ticks);
+    copy->point = (unit->tick + 1) * unit->tick_points - 1; /* between two ticks, the outputs hold */
+    if (result != SLICE) return result;
+    if (ticks == 0) return BLOCKED;
   }
+  copy->point = copy->goal;
   return DONE;
 }
 

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from msgspec.structs import replace
@@ -132,13 +132,13 @@ class Copies:
             np.copyto(self._goals, self.points, where=self._ended)
         if native.library is None:
             for number, copy in enumerate(self._copies):
-                self._end_of(number, partial(copy.step_to, int(self._goals[number])))
-                self.points[number] = copy.point
+                self._end_of(number, partial(copy.engine.step_to, int(self._goals[number])))
+                self.points[number] = copy.engine.point
             return
         while native.library.copies_step(ctypes.addressof(self._table), len(self._table)):
             for number in np.flatnonzero(self._ends != BurstEnd.DONE).tolist():
                 copy, end = self._copies[number], int(self._ends[number])
-                self._end_of(number, partial(copy.complete, end))
+                self._end_of(number, partial(cast("BurstEngine", copy.engine).complete, end))
 
     def take_care(self) -> None:
         """Steps have changed the state of the process: from now on, each one is looked after."""
@@ -157,9 +157,7 @@ class Copies:
             call()
         except (FmuError, TerminationRequested) as error:
             point = int(self.points[number])
-            if error.point is None:
-                begun = self._copies[number].begun_at(error) if isinstance(error, FmuError) else point
-                error.at(begun, self._plan.grid.time(begun))
+            self._copies[number].located(error, point)
             self.errors[number] = error
             self._ended[number] = True
             self._goals[number] = point
@@ -340,7 +338,7 @@ class Copies:
         copy = self._copies[number]
         copy.begin(overrides, is_new=is_new)
         if isinstance(copy.engine, BurstEngine):
-            self._table[number] = copy.engine.as_copy()
+            self._table[number] = copy.engine.copy
         for key, accesses in self._accesses.items():
             if accesses is not None and (access := copy.access(*key)) is not None:
                 accesses[number] = access

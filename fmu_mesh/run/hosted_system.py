@@ -12,6 +12,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from ..errors import FmuError, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, Unwatched
 from ..instances.contract import Instance, LogMessage
 from ..instances.process_state import ProcessState
@@ -40,10 +41,11 @@ _WIDE_ROW_BYTES = 2**20
 class HostedSystem:
     """The instances of a plan in one node of this process, with their rings and the engine that steps them.
 
-    Call sequence, on one thread: `open`, `begin`, steps of the engine; then `end`, and `open` again if that returned
-    True; at last, and after any exception, `close`. Each run has new instances, or those that were reset, as the model
-    of an instance is kept (`fmu_mesh.instances.kept_models`). The first run looks after each call of an FMU; the state
-    of the process is then looked after once in each later run, and the floating-point mode still after each call.
+    Call sequence, on one thread: `open`, `begin`, steps of the engine by `Engine.step_to`; then `end`, and `open` again
+    if that returned True; at last, and after any exception, `close`. Each run has new instances, or those that were
+    reset, as the model of an instance is kept (`fmu_mesh.instances.kept_models`). The first run looks after each call
+    of an FMU; the state of the process is then looked after once in each later run, and the floating-point mode still
+    after each call.
 
     Args:
         plan: a plan of `in_one_node`.
@@ -120,13 +122,21 @@ class HostedSystem:
         node, engine = self.node, self._engine
         self._initialization.run(self.runners.values(), start_values, again=engine is not None)
         if engine is None:
-            units = [[self.runners[name] for name in names] for names in node.units]
+            units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
         else:
             engine.begin_again(self._state)
         for runner in self.runners.values():
             runner.begin()
+        self.memory.grant.raise_to(self.plan.grid.last_point)
         return engine
+
+    def located(self, event: FmuError | TerminationRequested, point: int) -> None:
+        """Tell where a step that ended with this began: an instance with a step size of its own, before ``point``."""
+        if event.point is None:
+            runner = self.runners.get(event.instance or "") or (self._engine.current if self._engine else None)
+            begun = runner.point if isinstance(event, FmuError) and runner is not None else point
+            event.at(begun, self.plan.grid.time(begun))
 
     def end(self) -> bool:
         """After the last point: end the run of all instances, and keep what the next one needs; whether that works."""
