@@ -311,11 +311,11 @@ class Copies:
         """
         rest = wanted
         if overrides is None and self._back is not None:
-            rest = self._back.restore(wanted)
             for name in self._is_set:
                 np.copyto(self._set_at[name], -1, where=wanted)
-            if rest is None:
+            if (left := self._back.restore(wanted)) is None:
                 return
+            rest = left
         self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
 
     def _reset(self, overrides: Callable[[int], Overrides] | None, number: int) -> None:
