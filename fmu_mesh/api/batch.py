@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import CallRefused
 from ..run.copies import Copies
 from ..run.local_system import forwarded
-from ..run.preparing import KnownModels, planned_reset
+from ..run.preparing import OtherStartValues
 from ..run.process import interrupts_later
 from ..run.run_plan import RunPlan
 from ..run.system_copy import Overrides, SavedCopy
@@ -86,7 +86,7 @@ class Batch:
         self._run = run
         self._count = copies
         self._thread = threading.get_ident()
-        self._known = KnownModels()
+        self._resets = OtherStartValues(run, loads=False)
         self._variables: dict[str, tuple[str, Variable]] = {}
         self._settable: set[str] = set()
         self._saved: weakref.WeakKeyDictionary[BatchState, list[SavedCopy]] = weakref.WeakKeyDictionary()
@@ -380,25 +380,23 @@ class Batch:
 
     def _overrides(self, wanted: NDArray[np.bool_], start_values: Values) -> Callable[[int], Overrides]:
         """The start values of a copy, by its number."""
-        rows: dict[str, NDArray[Any]] = {}
+        found: list[tuple[str, str, str, list[Any]]] = []
         for name, values in start_values.items():
-            _, variable = self._variable(name)
+            instance, variable = self._variable(name)
             try:
-                rows[name] = self._rows(values, variable, finite=False, wanted=wanted)
+                rows = self._rows(values, variable, finite=False, wanted=wanted)
             except ValueRefused as refused:
                 raise CallRefused(f"'{name}' {refused}.") from refused
+            found.append((name, instance, variable.name, rows.reshape(self._count, *variable.shape).tolist()))
 
         def of_copy(number: int) -> dict[str, dict[str, Any]]:
-            found: dict[str, dict[str, Any]] = {}
-            for name, own in rows.items():
-                instance, variable = self._variables[name]
-                row = own[number].reshape(variable.shape).tolist()
-                found.setdefault(instance, {})[variable.name] = to_plain(row)
-            return found
+            own: dict[str, dict[str, Any]] = {}
+            for _, instance, variable, values in found:
+                own.setdefault(instance, {})[variable] = values[number]
+            return own
 
         for number in np.flatnonzero(wanted)[:1].tolist():  # the names and roles are the same in all copies
-            plain = {f"{name}.{one}": value for name, own in of_copy(number).items() for one, value in own.items()}
-            planned_reset(self._run, plain, 0, self._known)
+            self._resets.of_reset({name: to_plain(values[number]) for name, _, _, values in found})
         return of_copy
 
     def _look_at_memory(self, ready: int) -> None:

@@ -17,7 +17,7 @@ from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_voi
 from enum import IntEnum
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from ..variables.value_types import VariableType
 from .library import LibraryFunctions, load_library
@@ -129,20 +129,10 @@ class WorkKind(IntEnum):
     STEP, CALL, READ, RESTORE, HAND_OVER = range(5)
 
 
-_NUMBERS: Final[Sequence[VariableType]] = (
-    "Float64",
-    "Float32",
-    "Int8",
-    "UInt8",
-    "Int16",
-    "UInt16",
-    "Int32",
-    "UInt32",
-    "Int64",
-    "UInt64",
-    "Boolean",
+_NUMBERS: Final = "Float64 Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 Boolean".split()  # noqa: SIM905  shorter
+NUMBER_TYPES: Final = cast(
+    "dict[VariableType, int]", {name: number for number, name in enumerate(_NUMBERS)} | {"Enumeration": 8}
 )
-NUMBER_TYPES: Final = {type_: number for number, type_ in enumerate(_NUMBERS)} | {"Enumeration": 8}
 """The types of `Move`. An Enumeration is 64 bits in a ring."""
 
 

@@ -1,4 +1,4 @@
-"""How calls for many copies are divided: among threads, each of which has a part of the copies, and into pieces of time.
+"""How calls for many copies are divided: among threads, of which each has a part of the copies, and into pieces.
 
 Owns which thread has which copies, and how a call is given to all of them. What a copy does is `fmu_mesh.run.copies`.
 """

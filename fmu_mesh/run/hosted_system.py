@@ -87,7 +87,8 @@ class HostedSystem:
         self._engine: Engine | None = None
         self._alone = alone
         self._state: ProcessState | None = None
-        self._begins_again = True
+        self._begins_again, self._names = True, ", ".join(plan.order)
+        self._initialization = Initialization(node)
 
     def open(self) -> None:
         """Open all instances; after `end`, they begin again.
@@ -99,7 +100,7 @@ class HostedSystem:
             self._state = None if self._alone else ProcessState()
             self.memory.begin_again()
             for instance in self._instances:
-                instance.run_again()
+                instance.begin_again()
             return
         node = self.node
         for item in node.instances:
@@ -108,7 +109,7 @@ class HostedSystem:
             place = self._places[item.name]
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
-            self._begins_again = self._begins_again and timed is instance and instance.runs_again
+            self._begins_again = self._begins_again and timed is instance
             inputs = Ring(item.input_row, 1, self.memory.beside(row_bytes(item.input_row)))
             self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
         connect(node, self.runners, self.memory, self.memory)
@@ -123,7 +124,7 @@ class HostedSystem:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
-        Initialization(node).run(self.runners.values(), start_values, again=engine is not None)
+        self._initialization.run(self.runners.values(), start_values, again=engine is not None)
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
@@ -143,10 +144,10 @@ class HostedSystem:
 
     def end(self) -> bool:
         """After the last point: end the run of all instances, and keep what the next one needs; whether that works."""
-        if not self._begins_again:
+        if not self._begins_again or not all(instance.runs_again for instance in self._instances):
             return False
         state = self._state or (None if self._alone else ProcessState())
-        with self._watch.surviving(", ".join(self.plan.order)):
+        with self._watch.surviving(self._names):
             ended = [instance.end_run() for instance in reversed(self._instances)]
         self.loads = not all(ended) or (state is not None and state.restore())
         return not self.loads

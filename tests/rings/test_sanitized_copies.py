@@ -52,7 +52,7 @@ def sanitized(folder: Path, sanitizer: str, *lines: tuple[str, str]) -> dict[str
 
 def run(environment: dict[str, str], equations: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(PROGRAM), str(equations)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=550)
 
 
 @pytest.mark.parametrize("sanitizer", RUNTIMES)
@@ -67,17 +67,9 @@ def test_copies_in_threads_have_equal_floats_and_nothing_is_reported(
     assert "runtime error" not in done.stderr
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        ("    await_work(&workers->place, workers[i].done, number);\n", ""),
-        ("own->left = is_handed_over ? 0 : work_on(own->work, own->first,", "own->left = work_on(own->work, 0,"),
-    ],
-    ids=["nobody_waits", "two_have_a_copy"],
-)
-def test_a_race_of_two_threads_would_be_found(
-    line: tuple[str, str], tmp_path: Path, event_fmu: Callable[..., Path]
-) -> None:
+def test_a_call_that_ends_before_its_threads_would_be_found(tmp_path: Path, event_fmu: Callable[..., Path]) -> None:
+    line = ("    await_work(&workers->place, workers[i].done, number);\n", "")
+
     done = run(sanitized(tmp_path, "thread", line), event_fmu("Oscillator", 2))
 
     assert "WARNING: ThreadSanitizer: data race" in done.stderr
