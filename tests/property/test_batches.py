@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -324,6 +326,35 @@ def test_number_of_copies_is_one_or_more(copies: Any, words: str) -> None:  # no
 
     with pytest.raises(fmu_mesh.CallRefused, match=words):
         mesh.batch(copies)
+
+
+@pytest.mark.parametrize("how", ["closed", "dropped_elsewhere"])
+def test_threads_end_with_their_batch(how: str) -> None:
+    before = {*threading.enumerate()}
+    mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
+    mesh.add("gain", fmu=str(FMUS / "Gain.fmu"))
+    batches = [mesh.batch(4, threads=3)]
+    batches[0].step()
+    assert len({*threading.enumerate()} - before) == 2
+
+    if how == "closed":
+        batches.pop().close()
+    else:
+        other = threading.Thread(target=batches.clear)
+        other.start()
+        other.join()
+
+    assert {*threading.enumerate()} <= before
+
+
+def test_a_batch_that_is_left_open_lets_the_interpreter_end() -> None:
+    text = "import fmu_mesh; mesh = fmu_mesh.Mesh('m', step_size=0.1, stop_time=1.0)"
+    text += f"; mesh.add('gain', fmu='{FMUS}/Gain.fmu'); batch = mesh.batch(4, threads=2)"
+    program = f"{text}; batch.step(); print(batch.point.tolist())"
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=100)
+
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[1, 1, 1, 1]\n", "")
 
 
 @pytest.fixture
