@@ -286,13 +286,17 @@ class Copies:
         """Bring the ``wanted`` copies back to what was saved of them.
 
         What an FMU raises is in `errors`, and ends its copy.
+
+        Raises:
+            CallRefused: a copy has other instances since then; those before it are there.
         """
 
         def one(number: int) -> None:
+            self._copies[number].restore(saved[number])
             self._back_at(number, saved[number].point)
-            self._end_of(number, partial(self._copies[number].restore, saved[number]))
 
-        self._threads.each(np.flatnonzero(wanted).tolist(), one)
+        numbers = np.flatnonzero(wanted).tolist()
+        self._threads.each(numbers, lambda number: self._end_of(number, partial(one, number)))
 
     def free(self, saved: Sequence[SavedCopy]) -> None:
         """Free saved copies, in the order of the copies."""

@@ -328,6 +328,23 @@ def test_number_of_copies_is_one_or_more(copies: Any, words: str) -> None:  # no
         mesh.batch(copies)
 
 
+def test_a_state_of_instances_that_have_failed_is_refused(faulty: Path) -> None:
+    mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
+    mesh.add("faulty", fmu=str(faulty))
+    with mesh.batch(2) as batch:
+        batch.reset(start_values={"faulty.fail_at": [0.055, 1e300]})
+        state = batch.save()
+        batch.step(10)
+        batch.reset([True, False], {"faulty.fail_at": 1e300})
+        batch.step(3)
+
+        with pytest.raises(fmu_mesh.CallRefused, match="a state that was saved before belongs to the others"):
+            batch.restore(state, [True, False])
+        batch.restore(state, [False, True])
+        batch.step(20)
+        assert batch.point.tolist() == [23, 20]
+
+
 @pytest.mark.parametrize("how", ["closed", "dropped_elsewhere"])
 def test_threads_end_with_their_batch(how: str) -> None:
     before = {*threading.enumerate()}
