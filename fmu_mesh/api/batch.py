@@ -31,7 +31,6 @@ from ..run.preparing import OtherStartValues
 from ..run.process import interrupts_later
 from ..run.run_plan import RunPlan
 from ..run.system_copy import Overrides, SavedCopy
-from ..run.threaded_copies import ThreadedCopies
 from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
@@ -93,12 +92,8 @@ class Batch:
         self._saved: weakref.WeakKeyDictionary[BatchState, list[SavedCopy]] = weakref.WeakKeyDictionary()
         self._lost: deque[list[SavedCopy]] = deque()
         folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
-        own: Copies | ThreadedCopies
         try:
-            if min(threads, copies) > 1:
-                own = ThreadedCopies(run, copies, folder, forwarded, min(threads, copies))
-            else:
-                own = Copies(run, copies, folder, forwarded)
+            own = Copies(run, copies, folder, forwarded, min(threads, copies))
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -426,8 +421,10 @@ def _resident_bytes() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def _release(copies: Copies | ThreadedCopies, folder: Path, thread: int) -> None:
+def _release(copies: Copies, folder: Path, thread: int) -> None:
     """Free everything. On another thread only the files: an FMU is only called on its own."""
     if threading.get_ident() == thread:
         copies.close()
+    else:
+        copies.end_threads()
     shutil.rmtree(folder, ignore_errors=True)

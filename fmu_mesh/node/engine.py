@@ -18,7 +18,7 @@ from ..errors import FmuMeshError, ProtocolBroken
 from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
 from ..rings.host_memory import Counter, HostMemory
-from ..rings.native import Stage, table
+from ..rings.native import Stage
 from ..system.plan import NodePlan
 from .stepping import Runner
 
@@ -85,8 +85,12 @@ class Engine(ABC):
         self._last_point = plan.grid.last_point
         self._looked_after: ProcessState | None = None
         self._look_at = 0.0
-        members = [(native.MemberTable * len(unit))() for unit in units]
-        self._units = table(native.UnitTable, list(map(self._unit, units, members)))
+        kinds = [native.MemberTable * len(unit) for unit in units]
+        members = [kind.from_buffer(memory.beside(ctypes.sizeof(kind))) for kind in kinds]
+        of_units = native.UnitTable * max(len(units), 1)
+        self._units = of_units.from_buffer(memory.beside(ctypes.sizeof(of_units)))
+        for number, both in enumerate(zip(units, members, strict=True)):
+            self._units[number] = self._unit(*both)
         for unit, tables in zip(units, members, strict=True):
             for runner, member in zip(unit, tables, strict=True):
                 runner.follow(member, self)

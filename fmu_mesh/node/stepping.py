@@ -76,11 +76,20 @@ class Runner:
         table: how far it is, which whoever steps it writes, and for the burst how it is stepped.
     """
 
-    def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter) -> None:
+    def __init__(  # noqa: PLR0913  an instance, and where its values are
+        self,
+        plan: InstancePlan,
+        instance: Instance,
+        grid: TimeGrid,
+        outputs: Ring,
+        counter: Counter,
+        *,
+        inputs: Ring | None = None,
+    ) -> None:
         self.plan = plan
         self.name = plan.name
         self.instance = instance
-        self.inputs = Ring(plan.input_row, 1)
+        self.inputs = inputs or Ring(plan.input_row, 1)
         self.outputs = outputs
         self.counter = counter
         self.sources: list[Source] = []

@@ -23,6 +23,7 @@ from ..node.inputs import with_times
 from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
+from ..rings.ring import Ring
 from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace
 from ..system.plan import Plan, make_plan
@@ -55,6 +56,7 @@ class HostedSystem:
         alone: whether nothing else in this process changes its state between the runs, so that it is looked after as
             between steps: several times a second, and not once in each run.
         places: where the rings are in memory, if not as in the plan.
+        room: memory of zeros for them; None: memory of its own.
 
     Attributes:
         plan: the plan.
@@ -71,11 +73,12 @@ class HostedSystem:
         *,
         alone: bool,
         places: tuple[MemoryMap, Mapping[str, RingPlace]] | None = None,
+        room: memoryview | None = None,
     ) -> None:
         self.plan = plan
         self.node = node = plan.nodes[IN_ONE_NODE]
         map_, self._places = places or (node.memory, {place.instance: place for place in node.rings})
-        self.memory = HostMemory.private(map_, IN_ONE_NODE)
+        self.memory = HostMemory.private(map_, IN_ONE_NODE, room)
         self.runners: dict[str, Runner] = {}
         self.loads = True
         self._watch = watch
@@ -107,7 +110,8 @@ class HostedSystem:
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
             self._begins_again = self._begins_again and timed is instance
-            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter)
+            inputs = Ring(item.input_row, 1, self.memory.beside(row_bytes(item.input_row)))
+            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
         connect(node, self.runners, self.memory, self.memory)
 
     def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:

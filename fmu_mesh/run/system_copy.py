@@ -139,7 +139,10 @@ class SystemCopy:
             part[...] = kept
 
     def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep]] | None:
-        """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept."""
+        """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept.
+
+        It is a state of point 0: of the outputs there is one row, and steps write the others before they are read.
+        """
         calls = []
         for name, keeper in self._keepers():
             call = keeper.state_access(saved.states[name]) if isinstance(keeper, AccessedNatively) else None
@@ -148,9 +151,10 @@ class SystemCopy:
             calls.append(call)
         if any(len(_texts(runner)) for runner in self.runners.values()):
             return None
+        rows = {own.outputs.address: own.outputs.stride for own in self.runners.values()}
         keeps, kept = [], ctypes.cast(ctypes.c_char_p(saved.kept), ctypes.c_void_p).value or 0
         for address, size in self._spans():
-            keeps.append(native.Keep(address, kept, size))
+            keeps.append(native.Keep(address, kept, rows.get(address, size) // 8))
             kept += size
         return calls, keeps
 
