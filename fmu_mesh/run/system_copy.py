@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import CallRefused, FmuError, FmuMeshError, TerminationRequested
 from ..instances.contract import AccessedNatively, KeepsState, StepsNatively
+from ..instances.instance_wrapper import AroundNativeSteps
 from ..node.engine import Engine
 from ..node.inputs import TimedInputs, set_input
 from ..node.stepping import Runner
@@ -97,7 +98,7 @@ class SystemCopy:
         if instance not in self.runners:  # it could not begin
             return None
         own = self.runners[instance].instance
-        return own.access(verb, names) if isinstance(own, AccessedNatively) else None
+        return own.access(verb, names) if isinstance(own, AroundNativeSteps) else None
 
     def column(self, instance: str, name: str) -> native.CopyOutput:
         """Where an output lies in the rows of an instance."""

@@ -18,7 +18,10 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 import fmu_mesh
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
+from fmu_mesh.run import preparing
+from fmu_mesh.run.run_plan import RunPlan
 from tests.helpers import FMUS
 
 H = 0.01
@@ -408,6 +411,30 @@ def test_start_values_of_other_copies_are_ignored(gains: fmu_mesh.Batch) -> None
 
     assert gains.get("gain.k").tolist() == [1.0, 4.0]
     assert gains.point.tolist() == [3, 0]
+
+
+def test_a_batch_is_planned_once_for_the_same_start_values(
+    gains: fmu_mesh.Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned, original = list[object](), preparing.planned
+
+    def counting(*given: Any, **named: Any) -> RunPlan:  # noqa: ANN401  those of the function
+        planned.append(given)
+        return original(*given, **named)
+
+    monkeypatch.setattr(preparing, "planned", counting)
+    for value in (1.0, 2.0, 3.0):
+        gains.reset(start_values={"gain.k": [value, -value]})
+        assert gains.get("gain.k").tolist() == [value, -value]
+    assert len(planned) == 1
+    gains.reset(start_values={"gain.k": 4.0, "gain.u": 5.0})
+    assert len(planned) == 2
+
+    for _ in range(2):  # what is wrong is planned, which says why
+        with pytest.raises(ConfigurationError, match="'NaN' for the Real 'k'; expected a finite number"):
+            gains.reset(start_values={"gain.k": np.nan})
+    assert len(planned) == 4
+    assert gains.get("gain.k").tolist() == [4.0, 4.0]
 
 
 def test_results_go_into_given_arrays(gains: fmu_mesh.Batch) -> None:
