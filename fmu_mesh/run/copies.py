@@ -8,8 +8,9 @@ mistyped: `fmu_mesh.api.batch` checks them.
 # Threads: the one that made the copies calls all FMUs (ADR 12). The library releases the lock of the interpreter while
 # it steps, so other threads of the program go on; they may look at nothing here.
 #
-# A step of an FMU that does not return cannot be ended: the process is the user's. Ctrl-C ends a call between two
-# pieces of it, so all copies are at one point then.
+# In the process of the user, a step of an FMU that does not return cannot be ended. In one of ours, a watch looks at
+# the calls, and asks from its thread which copy is under way (`fmu_mesh.run.copies_role`). Ctrl-C ends a call between
+# two pieces of it, so all copies are at one point then.
 
 from __future__ import annotations
 
@@ -25,12 +26,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
-from ..instances.call_guard import Unwatched
+from ..instances.call_guard import CallWatch, Unwatched
 from ..instances.contract import ChangesProcess, Instance, LogMessage
 from ..instances.kept_models import SharedModels
 from ..instances.registry import open_instance
 from ..node.burst_engine import BurstEngine
 from ..node.inputs import TimedInputs
+from ..node.stepping import Runner
 from ..rings import native
 from ..rings.native import BurstEnd
 from ..system.memory_map import MemoryMap, RingPlace, map_memory
@@ -61,13 +63,21 @@ class Copies:
         count: how many copies.
         folder: an existing private folder; FMUs are extracted below it.
         log: called with every log message of a model.
+        watch: watches the calls of FMUs, if somebody does.
 
     Attributes:
         points: the last point that all instances of a copy have reached, shape (count,).
         errors: how copies have ended before the stop time, by their numbers.
     """
 
-    def __init__(self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None]) -> None:
+    def __init__(
+        self,
+        run: RunPlan,
+        count: int,
+        folder: Path,
+        log: Callable[[LogMessage], None],
+        watch: CallWatch | Unwatched | None = None,
+    ) -> None:
         self.errors: dict[int, FmuMeshError] = {}
         self._run = run
         self._plan = plan = in_one_node(run.plan, window=1)
@@ -75,6 +85,8 @@ class Copies:
         self._last = plan.grid.last_point
         self._places = _rings_of(plan)
         self._folder, self._log = folder, log
+        self._watch = watch or Unwatched()
+        self._by_python: int | None = None
         self._models = SharedModels(folder)
         self._copies: list[SystemCopy] = []
         self._table = (native.CopyTable * count)()
@@ -153,6 +165,7 @@ class Copies:
 
     def _end_of(self, number: int, call: Callable[[], object]) -> None:
         """Make a call for a copy; what it raises ends the copy."""
+        self._by_python = number
         try:
             call()
         except (FmuError, TerminationRequested) as error:
@@ -160,9 +173,25 @@ class Copies:
             if error.point is None:
                 begun = self._copies[number].begun_at(error) if isinstance(error, FmuError) else point
                 error.at(begun, self._plan.grid.time(begun))
-            self.errors[number] = error
-            self._ended[number] = True
-            self._goals[number] = point
+            self.end(number, error)
+        finally:
+            self._by_python = None
+
+    def end(self, number: int, error: FmuMeshError) -> None:
+        """From now on a copy takes no steps, until it is reset."""
+        self.errors[number] = error
+        self._ended[number] = True
+        self._goals[number] = self.points[number]
+
+    @property
+    def under_way(self) -> tuple[int | None, Runner | None]:
+        """From any thread: which copy a call is for, and the instance whose step it is; None if it is not known."""
+        number = self._by_python
+        begun = range(len(self._copies) - 1, -1, -1) if number is None else (number,)
+        for own in begun:  # those before the last one may have a step that Python takes later
+            if not self._ended[own] and (runner := self._copies[own].current) is not None:
+                return own, runner
+        return number, None
 
     # --- values
 
@@ -337,8 +366,9 @@ class Copies:
             self._back.note(number, *by_calls)
 
     def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
-        copy = self._copies[number]
+        copy, self._by_python = self._copies[number], number
         copy.begin(overrides, is_new=is_new)
+        self._by_python = None
         if isinstance(copy.engine, BurstEngine):
             self._table[number] = copy.engine.as_copy()
         for key, accesses in self._accesses.items():
@@ -373,12 +403,12 @@ class Copies:
             for name in self._plan.order:
                 if (why := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:
                     raise NotInOneProcess(
-                        why, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
+                        why, hint="Give each copy a process (`processes` as many as copies), or make one copy."
                     )
 
     def _system(self) -> HostedSystem:
         """The system of one copy; this object looks after the state of the process."""
-        return HostedSystem(self._plan, Unwatched(), self._opened, self._log, alone=True, places=self._places)
+        return HostedSystem(self._plan, self._watch, self._opened, self._log, alone=True, places=self._places)
 
     def _opened(self, name: str) -> Instance:
         opening = opening_of(self._plan, name, self._folder, self._log, self._run.showing)
