@@ -106,7 +106,6 @@ class _CopiesProcess:
         self._told: dict[int, FmuMeshError] = {}
         self._requests = 0
         self._waits = True
-        self._seen = -1
         self._closed = threading.Event()
         self._before = 0
         self._copies: Copies
@@ -219,11 +218,11 @@ class _CopiesProcess:
 
     def _position(self) -> tuple[str, int, str]:
         """See `CallWatch.stepping`: where the main thread is; each request counts as progress."""
-        seen, self._seen = self._seen, int(self._copies.points.sum())
         if self._waits:  # for the memory of the others
             self._requests += 1
-        runner = self._copies.under_way[1] if seen == self._seen else None
-        return str(self._requests), self._seen, runner.doing if runner is not None else "a call"
+        runner = self._copies.under_way[1]
+        doing = runner.doing if runner is not None else "a call"
+        return str(self._requests), int(self._copies.points.sum()), doing
 
     def _failed(self, error: FmuError) -> None:
         """An FMU has not returned, or has crashed: the process has to end."""

@@ -143,9 +143,6 @@ class ProcessCopies:
         for host in hosts:
             host.start(self._server, self._run, self._file, len(self._hosts))
             self._poll.register(host.channel, select.POLLIN)
-        self._gone = self._gone.copy()
-        for host in hosts:
-            self._gone[host.part] = gone[host.part]
         first = self._ask(hosts, lambda host: [Begin(gone[host.part].tobytes())], demands=True)
         taken = sum(answer.taken for answer in first.values())
         ready(sum(min(FIRST_COPIES, host.size) for host in hosts), taken)
@@ -266,6 +263,9 @@ class ProcessCopies:
         lost = [host for host in self._hosts if host.process is None and wanted[host.part].any()]
         if lost:
             self._start(lost, self._gone & ~wanted)
+        for number in np.flatnonzero(wanted & self._gone).tolist():
+            self._errors.pop(number, None)
+        self._gone = self._gone & ~wanted
         hosts = [host for host in self._hosts if wanted[host.part].any() and (host not in lost or overrides)]
 
         def request(host: CopiesHost) -> Request:
