@@ -20,7 +20,7 @@ from ..instances.contract import LogMessage
 from ..simtime import TimeGrid
 from ..wire.runtime import STOPPED, is_stopped
 from .child import how_it_ended
-from .copies_messages import Answer, Channel, Failed, Logged, News, Request, SharedBlock
+from .copies_messages import Answer, Channel, Failed, LoggedByModel, News, Request, SharedBlock
 from .fork_server import Forked, ForkServer
 from .run_plan import RunPlan
 
@@ -69,7 +69,6 @@ class CopiesHost:
     def start(self, server: ForkServer, run: RunPlan, file: Path, processes: int) -> None:
         """Start it."""
         own, theirs = socket.socketpair()
-        own.settimeout(run.loaded.config.timeouts.step)
         self._block.beats[self._number] = 0
         part = f"{self.part.start}:{self.part.stop}/{self._block.points.size}"
         with theirs:
@@ -81,7 +80,7 @@ class CopiesHost:
                 part,
                 descriptors=(theirs.fileno(), self._block.descriptor),
             )
-        self.channel = Channel(own, News)
+        self.channel = Channel(own, News, run.loaded.config.timeouts.step)
         self.starts += 1
         self.failed, self._how = None, ""
 
@@ -91,7 +90,7 @@ class CopiesHost:
             self.channel.send(request)
 
     def news(self, log_message: Callable[[LogMessage], None]) -> tuple[Answer | None, bool]:
-        """What it says: an answer, if there is one, and whether there may be more."""
+        """What it says within a second: an answer, if there is one, and whether there may be more."""
         answer = None
         try:
             messages, more = self.channel.received()
@@ -101,7 +100,7 @@ class CopiesHost:
             match message:
                 case Answer():
                     answer = message
-                case Logged(own):
+                case LoggedByModel(own):
                     log_message(own)
                 case Failed():
                     self.failed = message

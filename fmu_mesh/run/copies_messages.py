@@ -6,7 +6,8 @@ is a message on a pair of sockets. Owns the format of both. Knows neither what a
 
 # Processes: the batch has one end of a pair of sockets for each process, and makes the memory, which has no name and
 # goes with its last user. The batch writes values and then a message; the process answers after it has written values.
-# So no two of them write at a time, and a message orders what lies in the memory.
+# So no two of them write at a time, and a message orders what lies in the memory (ADR 82). Threads: in a process, the
+# main thread sends, and that of the watch where the main thread does not return; a lock keeps a message in one piece.
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ __all__ = [
     "Free",
     "Get",
     "GoOn",
-    "Logged",
+    "LoggedByModel",
     "News",
     "Request",
     "Reset",
@@ -44,7 +45,7 @@ __all__ = [
     "Save",
     "Set",
     "SharedBlock",
-    "Step",
+    "StepCopies",
 ]
 
 FIRST_COPIES: Final = 16
@@ -53,6 +54,7 @@ FIRST_COPIES: Final = 16
 _MOST_BYTES: Final = 1 << 30
 _AT_ONCE: Final = 1 << 20
 _LENGTH: Final = struct.Struct("<I")
+_TIME: Final = struct.Struct("@ll")
 _ALIGNED: Final = 64
 _ROOM: Final = 1 << 20
 _NAME: Final = "fmu_mesh"
@@ -86,7 +88,7 @@ class GoOn(Message, frozen=True):
     """After the answer to the first part of `Begin`: there is enough memory for the others."""
 
 
-class Step(Message, frozen=True):
+class StepCopies(Message, frozen=True):
     """Step all copies that have not ended, then read values."""
 
     points: int
@@ -133,7 +135,7 @@ class Reset(Message, frozen=True):
     overrides: Mapping[int, Mapping[str, Mapping[str, PlainValue]]] | None = None
 
 
-Request = list[Begin | GoOn | Step | Set | Get | Save | Restore | Free | Reset]
+Request = list[Begin | GoOn | StepCopies | Set | Get | Save | Restore | Free | Reset]
 """What a process does before its next answer."""
 
 
@@ -154,7 +156,7 @@ class Answer(Message, frozen=True):
     taken: int = 0
 
 
-class Logged(Message, frozen=True):
+class LoggedByModel(Message, frozen=True):
     """A message of a model."""
 
     message: LogMessage
@@ -167,15 +169,24 @@ class Failed(Message, frozen=True):
     error: ErrorReport
 
 
-News = Answer | Logged | Failed
+News = Answer | LoggedByModel | Failed
 """What a process says."""
 
 
 class Channel:
-    """One end of a pair of sockets: messages, each after its length."""
+    """One end of a pair of sockets: messages, each after its length.
 
-    def __init__(self, end: socket.socket, type_: Any) -> None:  # noqa: ANN401  a union, which is no type
+    Args:
+        end: the socket.
+        type_: what is received.
+        limit_s: how long it may take until the other end has room for a message, in s; None: as long as it takes.
+    """
+
+    def __init__(self, end: socket.socket, type_: Any, limit_s: float | None = None) -> None:  # noqa: ANN401  a union, which is no type
         self._socket = end
+        if limit_s is not None:  # by the system: a timeout of Python would be one more call of the system for each
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIME.pack(max(1, int(limit_s)), 0))
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _TIME.pack(1, 0))
         self._decoder = msgspec.msgpack.Decoder(type_)
         self._encoder = msgspec.msgpack.Encoder()
         self._read = bytearray()
@@ -208,13 +219,15 @@ class Channel:
         return self._next(length)
 
     def received(self) -> tuple[list[Any], bool]:
-        """The messages that are there, and whether there may be more; waits for a part of one.
+        """The messages that are there, and whether there may be more; waits for a part of one, at most a second.
 
         Raises:
             OSError: see `receive`.
             msgspec.DecodeError: see `receive`.
         """
-        more, found = self._take(), []
+        more, found = True, []
+        with suppress(BlockingIOError):  # the second is over
+            more = self._take()
         while (length := self._length()) is not None and len(self._read) >= length:
             found.append(self._next(length))
         return found, more

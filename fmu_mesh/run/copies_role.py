@@ -8,7 +8,7 @@ Owns the copies, and what was saved of them. How they step is `fmu_mesh.run.copi
 # call: after its deadline, or after a crash, it says which copy the call was for and ends the process, while the main
 # thread stays in the FMU. A third thread counts in the shared memory: where a component keeps the lock of the
 # interpreter, or the process is stopped, the watch cannot run, and the batch sees that the count stands. Signals and
-# the end of the parent are looked after as in a node (`fmu_mesh.run.process`), but Ctrl-C is for the program.
+# the end of the parent are looked after as in a node (`fmu_mesh.run.process`), but Ctrl-C is for the program (ADR 82).
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from .copies_messages import (
     Free,
     Get,
     GoOn,
-    Logged,
+    LoggedByModel,
     Request,
     Reset,
     Restore,
     Save,
     Set,
     SharedBlock,
-    Step,
+    StepCopies,
     Values,
 )
 from .limits import resident_bytes
@@ -166,7 +166,7 @@ class _CopiesProcess:
                 return self._begin(np.frombuffer(gone, np.bool_))
             case GoOn():  # a request that was not expected: all copies are there
                 return None
-            case Step(points, reads):
+            case StepCopies(points, reads):
                 copies.step(points)
                 for values in reads:
                     copies.get(values.instance, values.names, self._values(values))
@@ -208,7 +208,7 @@ class _CopiesProcess:
 
     def _log(self, message: LogMessage) -> None:
         with suppress(OSError):  # as above
-            self._channel.send(Logged(message))
+            self._channel.send(LoggedByModel(message))
 
     # --- on other threads
 

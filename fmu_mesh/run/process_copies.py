@@ -4,7 +4,7 @@ Owns the processes: which copies each has, what it was asked, and how it has end
 is `fmu_mesh.run.copies_role`; what a copy does is `fmu_mesh.run.copies`.
 """
 
-# Processes: all are forked from one fork server (ADR 71), with one end of a pair of sockets and the shared memory. A
+# Processes (ADR 82): all are forked from one fork server (ADR 71), with an end of a pair of sockets and the memory. A
 # request goes to all of them, then all answers are waited for; so there is at most one request under way, and one that
 # is interrupted by an error of one process has the answers of all others. The thread that made the batch does all of
 # it, and the server ends with this thread. Ctrl-C reaches no process: each has a session of its own.
@@ -53,7 +53,7 @@ from .copies_messages import (
     Save,
     Set,
     SharedBlock,
-    Step,
+    StepCopies,
     Values,
 )
 from .copy_pieces import Pieces
@@ -66,8 +66,6 @@ __all__ = ["ProcessCopies"]
 
 log = logging.getLogger("fmu_mesh.api.batch")
 
-_LOOK_S: Final = 1.0
-"""How often a process that has not answered is looked at."""
 _EXIT_S: Final = 5.0
 """How long the fork server may take to end after its processes."""
 
@@ -169,7 +167,9 @@ class ProcessCopies:
     def step(self, points: int, is_asked: Callable[[], bool] = lambda: False) -> None:
         """See `Copies`; all processes take a piece before one takes the next."""
         reads, self._read, self._ahead = tuple(self._read), [], []
-        self._pieces.take(points, is_asked, lambda piece: self._ask(self._hosts, lambda _host: [Step(piece, reads)]))
+        self._pieces.take(
+            points, is_asked, lambda piece: self._ask(self._hosts, lambda _host: [StepCopies(piece, reads)])
+        )
         self._ahead = list(reads) if not self._errors else []
 
     # --- values
@@ -284,8 +284,10 @@ class ProcessCopies:
     def _notice(self) -> None:
         """Set what was not set yet, and notice what has ended meanwhile."""
         self._send_settings()
-        if self._poll.poll(0):
-            self._answers(())
+        for descriptor, _ in self._poll.poll(0):
+            host = next(own for own in self._hosts if own.is_at(descriptor))
+            if not host.news(self._log)[1]:
+                self._lose(host)
 
     def _ask(
         self, hosts: Sequence[CopiesHost], request: Callable[[CopiesHost], Request], *, demands: bool = False
@@ -330,24 +332,21 @@ class ProcessCopies:
     def _answers(self, hosts: Sequence[CopiesHost]) -> dict[CopiesHost, Answer]:
         """Wait for the answers of processes; those that are lost give none."""
         answers: dict[CopiesHost, Answer] = {}
-        waiting, clock = set(hosts), AwakeClock()
+        waiting, clock = list(hosts), AwakeClock()
         for host in hosts:
             host.awaited(clock())
-        while True:
-            ready = self._poll.poll(_LOOK_S * 1000 if waiting else 0)
-            for descriptor, _ in ready:
-                host = next(own for own in self._hosts if own.is_at(descriptor))
+        while waiting:
+            for host in [*waiting]:
                 answer, more = host.news(self._log)
                 if answer is not None:
                     answers[host] = answer
-                    waiting.discard(host)
-                if not more:
-                    waiting.discard(host)
+                elif more:
+                    host.look(clock(), self._timeouts)
+                    continue
+                else:
                     self._lose(host)
-            for host in [*waiting] if not ready else ():
-                host.look(clock(), self._timeouts)
-            if not waiting:
-                return answers
+                waiting.remove(host)
+        return answers
 
     def _lose(self, host: CopiesHost) -> None:
         """A process has ended, and so have its copies."""

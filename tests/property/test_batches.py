@@ -85,7 +85,7 @@ def mesh_of(kind: str, folder: Path, event_fmu: Callable[..., Path]) -> fmu_mesh
     return fmu_mesh.load(config)
 
 
-WAYS: dict[str, dict[str, int]] = {"alone": {}, "threads": {"threads": 2}, "processes": {"processes": 2}}
+WAYS: dict[str, dict[str, Any]] = {"alone": {}, "threads": {"threads": 2}, "processes": {"processes": 2}}
 """Where copies are."""
 
 
@@ -289,7 +289,7 @@ def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(way: str) -> None:
 )
 def test_each_copy_ends_where_a_single_system_ends(
     library: bool,  # noqa: FBT001 a parameter of tests
-    way: dict[str, int],
+    way: dict[str, Any],
     faulty: Path,
     event_fmu: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
