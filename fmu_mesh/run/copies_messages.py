@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import ErrorReport
 from ..instances.contract import LogMessage
-from ..variables.value_types import PlainValue, Value
+from ..variables.value_types import Value
 
 __all__ = [
     "FIRST_COPIES",
@@ -132,7 +132,7 @@ class Reset(Message, frozen=True):
     """Bring the wanted copies back to point 0, with start values by copy, instance and variable."""
 
     wanted: bytes
-    overrides: Mapping[int, Mapping[str, Mapping[str, PlainValue]]] | None = None
+    overrides: Mapping[int, Mapping[str, Mapping[str, Any]]] | None = None
 
 
 Request = list[Begin | GoOn | StepCopies | Set | Get | Save | Restore | Free | Reset]

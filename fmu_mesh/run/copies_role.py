@@ -120,7 +120,7 @@ class _CopiesProcess:
         folder = fmu_folder(process.folder)
         folder.mkdir(parents=True, exist_ok=True)
         watch = process.stack.enter_context(closing(CallWatch(self._failed, survives=True)))
-        self._copies = Copies(run, self._count, folder, self._log, watch)
+        self._copies = Copies(run, self._count, folder, self._log, watch=watch)
         with watch.surviving(""):
             process.stack.callback(self._copies.close)
             while (request := self._next()) is not None:
@@ -221,8 +221,8 @@ class _CopiesProcess:
         if self._waits:  # for the memory of the others
             self._requests += 1
         runner = self._copies.under_way[1]
-        doing = runner.doing if runner is not None else "a call"
-        return str(self._requests), int(self._copies.points.sum()), doing
+        doing, at = (runner.doing, runner.point) if runner is not None else ("a call", 0)
+        return str(self._requests), int(self._copies.points.sum()) + at, doing
 
     def _failed(self, error: FmuError) -> None:
         """An FMU has not returned, or has crashed: the process has to end."""
@@ -234,6 +234,8 @@ class _CopiesProcess:
             point = runner.point if runner is not None else int(self._copies.points[copy])
             report = replace(report, point=point, time=self._run.plan.grid.time(point))
         self._tell_points()
+        if copy is not None:
+            self._block.points[self._where][copy] = self._copies.reached(copy)
         with suppress(OSError):  # as above
             self._channel.send(Failed(copy, report))
         self._process.end_now(StepFailed.exit_code)
