@@ -43,8 +43,8 @@ from .system_state import BatchState
 
 __all__ = ["Batch"]
 
-_COPIES_EACH: Final = 256
-"""So many copies at least pay for a process: a round of messages takes as long as a step of some 200 small FMUs."""
+_COPIES_EACH: Final = 512
+"""So many copies at least pay for a process: a round of messages takes as long as a step of some 300 small FMUs."""
 
 _MOST_OF_MEMORY: Final = 0.9
 
@@ -79,7 +79,7 @@ class Batch:
         threads: on how many threads they are stepped; each has its own library of each FMU, and makes all calls of its
             copies.
         processes: in how many processes they are, at most one for each; 1: in this one. None: as many as this process
-            may use processors, where each has 256 copies or more.
+            may use processors, where each has 512 copies or more.
 
     Raises:
         NotInOneProcess: copies of an FMU need a process each.

@@ -21,6 +21,7 @@ is `fmu_mesh.run.copies_role`; what a copy does is `fmu_mesh.run.copies`.
 from __future__ import annotations
 
 import logging
+import os
 import select
 import socket
 import subprocess
@@ -93,6 +94,7 @@ class ProcessCopies:
     def __init__(self, run: RunPlan, count: int, processes: int, log: Callable[[LogMessage], None]) -> None:
         self._run = replace(run, run=run_name())
         self._folder: Path | None = None
+        self._owner = os.getpid()
         self._log = log
         self._timeouts = run.loaded.config.timeouts
         self._server: ForkServer | None = None
@@ -361,14 +363,19 @@ class ProcessCopies:
         self._ahead = []
 
     def close(self) -> None:
-        """See `Copies`; on any thread."""
+        """See `Copies`; on any thread. In a fork of the program it does nothing."""
+        if os.getpid() != self._owner:
+            return
         with interrupts_later():
             for host in self._hosts:
                 if host.process is not None:
                     host.channel.end(socket.SHUT_WR)
-            running = [host for host in self._hosts if host.process is not None]
-            self._answers(running)
+            running, clock = [host for host in self._hosts if host.process is not None], AwakeClock()
             for host in running:
+                host.awaited(clock())
+                while host.news(self._log)[1]:  # it may have an answer that nobody waits for
+                    host.look(clock(), self._timeouts)
+                self._lose(host)
                 if host.failed is not None:
                     log.warning("%s", from_report(host.failed.error))
             self._end_server()
