@@ -17,6 +17,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.wire.runtime import runtime_folder
+from tests.fmus.chatty_fmus import chatty_fmu
 from tests.helpers import FMUS, wait_until
 
 H = 0.01
@@ -210,3 +211,20 @@ def test_the_last_reference_may_go_on_another_thread(faulty: Path) -> None:
     thread = threading.Thread(target=owned.clear)
     thread.start()
     thread.join()
+
+
+@pytest.mark.usefixtures("nothing_is_left")
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("abort();", r"ended its process in fmi2\w+ \(SIGABRT\)"),
+        ("for (volatile int i = 0;; i = 1 - i) {}", r"has not returned for 1\.\d s"),
+    ],
+)
+def test_an_fmu_that_fails_at_start_is_told(tmp_path: Path, what: str, words: str) -> None:
+    once = f'if (strcmp(function, "fmi2EnterInitializationMode") == 0) {{ {what} }}'
+    mesh = fmu_mesh.Mesh("faults", step_size=H, stop_time=1.0)
+    mesh.add("pump", fmu=str(chatty_fmu(2, tmp_path, "co_simulation", once)))
+    with pytest.raises(fmu_mesh.FmuError, match=words) as raised:
+        mesh.batch(2, config_values={"timeouts.call": 1.0}, processes=2)
+    assert raised.value.instance == "pump"
