@@ -11,8 +11,9 @@ mistyped: `fmu_mesh.api.batch` checks them.
 # as a call for `CopyThreads.each` runs on the thread of its copy, while this one waits. The library releases the lock
 # of the interpreter while it steps, so other threads of the program go on; they may look at nothing here.
 #
-# A step of an FMU that does not return cannot be ended: the process is the user's. Ctrl-C ends a call between two
-# pieces of it, so all copies are at one point then.
+# In the process of the user, a step of an FMU that does not return cannot be ended. In one of ours, a watch looks at
+# the calls, and asks from its thread which copy is under way (`fmu_mesh.run.copies_role`). Ctrl-C ends a call between
+# two pieces of it, so all copies are at one point then.
 
 from __future__ import annotations
 
@@ -28,12 +29,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import CallRefused, FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
-from ..instances.call_guard import Unwatched
+from ..instances.call_guard import CallWatch, Unwatched
 from ..instances.contract import ChangesProcess, Instance, LogMessage
 from ..instances.kept_models import SharedModels
 from ..instances.registry import open_instance
 from ..node.burst_engine import BurstEngine
 from ..node.inputs import TimedInputs
+from ..node.stepping import Runner
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import BurstEnd, WorkKind
@@ -68,14 +70,22 @@ class Copies:
         folder: an existing private folder; FMUs are extracted below it.
         log: called with every log message of a model.
         threads: how many threads call the FMUs.
+        watch: watches the calls of FMUs, if somebody does.
 
     Attributes:
         points: the last point that all instances of a copy have reached, shape (count,).
         errors: how copies have ended before the stop time, by their numbers.
     """
 
-    def __init__(
-        self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None], threads: int = 1
+    def __init__(  # noqa: PLR0913  what copies need of their surroundings
+        self,
+        run: RunPlan,
+        count: int,
+        folder: Path,
+        log: Callable[[LogMessage], None],
+        threads: int = 1,
+        *,
+        watch: CallWatch | Unwatched | None = None,
     ) -> None:
         self.errors: dict[int, FmuMeshError] = {}
         self._run = run
@@ -85,6 +95,8 @@ class Copies:
         self._places = _rings_of(plan)
         self._rooms = HostMemory.rooms(self._places[0], count, _bytes_beside(self._node))
         self._log = log
+        self._watch = watch or Unwatched()
+        self._by_python: int | None = None
         self._copies: list[SystemCopy] = []
         self._table = (native.CopyTable * count)()
         self._several = threads > 1
@@ -165,15 +177,36 @@ class Copies:
 
     def _end_of(self, number: int, call: Callable[[], object]) -> None:
         """Make a call for a copy; what it raises ends the copy."""
+        self._by_python = number
         try:
             call()
         except (FmuError, TerminationRequested) as error:
-            point = int(self.points[number])
-            self._copies[number].located(error, point)
-            self.errors[number] = error
-            self._ended[number] = True
-            self._goals[number] = point
-            self._first.leave(number)
+            self._copies[number].located(error, int(self.points[number]))
+            self.end(number, error)
+        finally:
+            self._by_python = None
+
+    def end(self, number: int, error: FmuMeshError) -> None:
+        """From now on a copy takes no steps, until it is reset."""
+        self.errors[number] = error
+        self._ended[number] = True
+        self._goals[number] = self.points[number]
+        self._first.leave(number)
+
+    @property
+    def under_way(self) -> tuple[int | None, Runner | None]:
+        """From any thread: which copy a call is for, and the instance whose step it is; None if it is not known."""
+        number = self._by_python
+        begun = range(len(self._copies) - 1, -1, -1) if number is None else (number,)
+        for own in begun:  # those before the last one may have a step that Python takes later
+            if not self._ended[own] and (runner := self._copies[own].current) is not None:
+                return own, runner
+        return number, None
+
+    def reached(self, number: int) -> int:
+        """From any thread: the last point that all instances of a copy have reached, also within a call."""
+        current = self._copies[number].current
+        return min(self._copies[number].engine.covered, self._last) if current is not None else int(self.points[number])
 
     # --- values
 
@@ -333,10 +366,11 @@ class Copies:
             self._first.note(number)
 
     def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
-        copy = self._copies[number]
+        copy, self._by_python = self._copies[number], number
         try:
             copy.begin(overrides, is_new=is_new)
         finally:  # without instances, nothing can be read
+            self._by_python = None
             for own, columns in self._columns.items():
                 columns[number] = copy.column(*own)
         if isinstance(copy.engine, BurstEngine):
@@ -381,7 +415,7 @@ class Copies:
             for name in self._plan.order:
                 if (refusal := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:
                     raise NotInOneProcess(
-                        refusal, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
+                        refusal, hint="Give each copy a process (`processes` as many as copies), or make one copy."
                     )
 
     def _system(self, number: int) -> HostedSystem:
@@ -389,7 +423,7 @@ class Copies:
         room, opened = self._rooms[number], partial(self._opened, self._threads.part_of(number))
         if number < len(self._copies):  # it had another system
             room[:] = bytes(len(room))
-        return HostedSystem(self._plan, Unwatched(), opened, self._log, alone=True, places=self._places, room=room)
+        return HostedSystem(self._plan, self._watch, opened, self._log, alone=True, places=self._places, room=room)
 
     def _opened(self, thread: int, name: str) -> Instance:
         folder, models = self._models[thread]

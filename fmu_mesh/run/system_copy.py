@@ -56,6 +56,11 @@ class SystemCopy:
         """The instances, by name."""
         return self._system.runners
 
+    @property
+    def current(self) -> Runner | None:
+        """From any thread: the instance whose step is under way, or has failed."""
+        return self.engine.current if hasattr(self, "engine") else None
+
     def begin(self, overrides: Overrides, *, is_new: bool) -> None:
         """Initialize all instances; then they are at point 0. Those that cannot begin again are opened anew.
 

@@ -90,13 +90,27 @@ def mesh_of(kind: str, folder: Path, event_fmu: Callable[..., Path]) -> fmu_mesh
     return fmu_mesh.load(config)
 
 
-@pytest.fixture(scope="module", params=[("native", 1), ("mixed", 1), ("native", 2)], ids=["native", "mixed", "threads"])
+WAYS: dict[str, dict[str, Any]] = {"alone": {}, "threads": {"threads": 2}, "processes": {"processes": 2}}
+"""Where copies are."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("native", "alone"),
+        ("mixed", "alone"),
+        ("native", "threads"),
+        ("native", "processes"),
+        ("mixed", "processes"),
+    ],
+    ids=" ".join,
+)
 def pair(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, event_fmu: Callable[..., Path]
 ) -> Iterator[Pair]:
-    kind, threads = request.param
+    kind, way = request.param
     mesh = mesh_of(kind, tmp_path_factory.mktemp("batches"), event_fmu)
-    with mesh.batch(COPIES, threads=threads) as batch:
+    with mesh.batch(COPIES, **WAYS[way]) as batch:
         yield Pair(kind, mesh, batch)
 
 
@@ -203,9 +217,10 @@ class Turning(fmu_mesh.Component):
 """
 
 
-@pytest.mark.parametrize("library", [True, False], ids=["C", "Python"])
+@pytest.mark.parametrize(("library", "processes"), [(True, 1), (False, 1), (True, 2)], ids=["C", "Python", "processes"])
 def test_components_arrays_texts_and_scenarios_are_the_same(
     library: bool,  # noqa: FBT001 a parameter of tests
+    processes: int,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -232,7 +247,7 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
     mesh = fmu_mesh.load(config)
     names = ["turning.y", "turning.word", "turning.count", "gain.y", "fast.y", "turning.u", "cart.x", "cart.force"]
     inputs = np.arange(6.0).reshape(2, 3)
-    with mesh.batch(2) as batch, mesh.open() as first, mesh.open() as second:
+    with mesh.batch(2, processes=processes) as batch, mesh.open() as first, mesh.open() as second:
         systems = [first, second]
         for points in (1, 9, 30, 50, 25):
             batch.step(points)
@@ -257,11 +272,11 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
     assert batch.point.tolist() == [125, 10]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(threads: int) -> None:
+@pytest.mark.parametrize("way", WAYS)
+def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(way: str) -> None:
     mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=None)
     mesh.add("cart", fmu=str(FMUS / "CartPole.fmu"))
-    with mesh.batch(3, threads=threads) as batch:
+    with mesh.batch(3, **WAYS[way]) as batch:
         batch.step(10)
         threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
         with pytest.raises(KeyboardInterrupt):
@@ -272,10 +287,14 @@ def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(threads: int) -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize(("library", "threads"), [(True, 1), (False, 1), (True, 3)], ids=["C", "Python", "threads"])
+@pytest.mark.parametrize(
+    ("library", "way"),
+    [(True, {}), (False, {}), (True, {"threads": 3}), (True, {"processes": 3})],
+    ids=["C", "Python", "threads", "processes"],
+)
 def test_each_copy_ends_where_a_single_system_ends(
     library: bool,  # noqa: FBT001 a parameter of tests
-    threads: int,
+    way: dict[str, Any],
     faulty: Path,
     event_fmu: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
@@ -292,7 +311,7 @@ def test_each_copy_ends_where_a_single_system_ends(
     mesh.connect("faulty.y", "last.u")
     fail_at = [1e300, 0.42, 1e300, 0.55, 0.07]
     end = [1000, 1000, 3, 2, 1000]
-    with mesh.batch(5, threads=threads) as batch:
+    with mesh.batch(5, **way) as batch:
         batch.reset(start_values={"faulty.fail_at": fail_at, "stairs.end": end})
         for points in (1, 6, 13, 30, 60):
             batch.step(points)
