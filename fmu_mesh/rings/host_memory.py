@@ -13,7 +13,6 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
 
@@ -123,15 +122,12 @@ class HostMemory:
     def rooms(map_: MemoryMap, count: int, beside: int) -> list[memoryview]:
         """Rooms for so many memories with one map, side by side, with so many bytes for `beside`.
 
-        With pages of their own, the same counter of all would be in the same few lines of the processor's caches, and
-        each in another page. The distance of two is an odd number of lines, so that they use all of these.
+        With pages of their own, the same counter of all would be in the same few lines of the processor's caches. The
+        distance of two is an odd number of lines, so that they use all of these.
         """
         size = (-(-(map_.size + beside) // _LINE) | 1) * _LINE
-        memory = mmap.mmap(-1, count * size, _PRIVATE)
-        if hasattr(mmap, "MADV_HUGEPAGE"):
-            with suppress(OSError):  # the kernel has none
-                memory.madvise(mmap.MADV_HUGEPAGE)
-        return [memoryview(memory)[first : first + size] for first in range(0, count * size, size)]
+        memory = memoryview(mmap.mmap(-1, count * size, _PRIVATE))
+        return [memory[first : first + size] for first in range(0, count * size, size)]
 
     @classmethod
     def opened(cls, offer: Offer, map_: MemoryMap, process: str) -> Self | None:

@@ -8,8 +8,8 @@ Owns the states of the first point, and how the library brings copies back to th
 # processor. Therefore the memory of a copy is in one piece where that can be (`HostMemory.rooms`), what is kept is
 # there once for all copies that have the same (as most do), and of the outputs one row is brought back.
 #
-# Tried and given up: to fetch the places of the next copies ahead (no gain), and one call of memcpy for each place (it
-# takes longer than the few words that it copies).
+# Tried and given up, because nothing was gained: to fetch the places of the next copies ahead, to go place by place
+# through all copies, and large pages.
 
 from __future__ import annotations
 

@@ -45,11 +45,8 @@ class SystemCopy:
 
     def __init__(self, made: Callable[[], HostedSystem]) -> None:
         self._made = made
-        self._make()
+        self._system, self._instances = made(), object()
         self.engine: Engine
-
-    def _make(self) -> None:
-        self._system, self._instances = self._made(), object()
 
     @property
     def runners(self) -> dict[str, Runner]:
@@ -73,13 +70,15 @@ class SystemCopy:
         """
         if is_new or (self._system.runners and not self._system.end()):
             self._system.close()
-            self._make()
+            self._system = self._made()
+        if is_new:  # all others are reset, and used again
+            self._instances = object()
         try:
             self._system.open()
             self.engine = self._system.begin(overrides)
         except BaseException:
             self._system.close()
-            self._make()
+            self._system, self._instances = self._made(), object()
             raise
 
     def located(self, event: FmuError | TerminationRequested, point: int) -> None:
