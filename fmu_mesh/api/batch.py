@@ -366,7 +366,8 @@ class Batch:
             copies: which copies, truths of shape (copies,); None: all.
 
         Raises:
-            CallRefused: it is no state of this batch, or is closed; or see `close`.
+            CallRefused: it is no state of this batch, or is closed; the FMU of a copy has failed since then, so that a
+                reset has made new instances; or see `close`.
             FmuError: an FMU failed.
         """
         self._demand("restore")

@@ -45,8 +45,8 @@ from ..system.plan import NodePlan, Plan
 from ..system.process_sharing import SharedProcess
 from ..text import listed
 from ..variables.value_types import is_text
-from .copy_pieces import Pieces
-from .copy_threads import CopyThreads
+from .copy_threads import CopyThreads, Pieces
+from .first_points import FirstPoints
 from .hosted_system import IN_ONE_NODE, HostedSystem, in_one_node
 from .local_system import opening_of
 from .one_process import claims_in
@@ -111,9 +111,7 @@ class Copies:
         self._timed: list[str] = []
         self._accesses: dict[tuple[str, Verb, tuple[str, ...]], Any] = {}
         self._columns: dict[tuple[str, str], Any] = {}
-        self._first: dict[int, SavedCopy] = {}
-        self._first_kept = b""
-        self._back: _WaysBack | None = None
+        self._first = FirstPoints(self._threads, self._copies, self._table)
         self._limits = ExitStack()
         self._pieces = Pieces()
 
@@ -193,8 +191,7 @@ class Copies:
         self.errors[number] = error
         self._ended[number] = True
         self._goals[number] = self.points[number]
-        if self._back is not None:
-            self._back.forget(number)
+        self._first.leave(number)
 
     @property
     def under_way(self) -> tuple[int | None, Runner | None]:
@@ -308,6 +305,8 @@ class Copies:
             FmuError: an FMU cannot, or has failed.
         """
         saved: list[SavedCopy] = []
+        for _, models in self._models:
+            models.reset_from_now_on()
         try:
             every = range(len(self._copies))
             self._threads.each(every, lambda number: saved.append(self._copies[number].save(int(self.points[number]))))
@@ -320,13 +319,17 @@ class Copies:
         """Bring the ``wanted`` copies back to what was saved of them.
 
         What an FMU raises is in `errors`, and ends its copy.
+
+        Raises:
+            CallRefused: a copy has other instances since then; those before it are there.
         """
 
         def one(number: int) -> None:
+            self._copies[number].restore(saved[number])
             self._back_at(number, saved[number].point)
-            self._end_of(number, partial(self._copies[number].restore, saved[number]))
 
-        self._threads.each(np.flatnonzero(wanted).tolist(), one)
+        numbers = np.flatnonzero(wanted).tolist()
+        self._threads.each(numbers, lambda number: self._end_of(number, partial(one, number)))
 
     def free(self, saved: Sequence[SavedCopy]) -> None:
         """Free saved copies, in the order of the copies."""
@@ -342,22 +345,16 @@ class Copies:
         Raises:
             FmuError: one cannot be initialized, and has ended; those after it stay as they were.
         """
-        rest = wanted
-        if overrides is None and self._back is not None:
-            for name in self._is_set:
-                np.copyto(self._set_at[name], -1, where=wanted)
-            if (left := self._back.restore(wanted)) is None:
-                return
-            rest = left
-        self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
+        rest = self._first.restore(wanted) if overrides is None else wanted
+        back = wanted if rest is None else wanted & ~rest
+        for name in self._is_set:
+            np.copyto(self._set_at[name], -1, where=back)
+        if rest is not None:
+            self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
 
     def _reset(self, overrides: Callable[[int], Overrides] | None, number: int) -> None:
         """Make a copy as a new one."""
-        copy, first = self._copies[number], self._first.pop(number, None)
-        if first is not None:
-            copy.free(first)
-        if self._back is not None:
-            self._back.forget(number)
+        self._first.free(number)
         self._ended[number] = True
         own = overrides(number) if overrides is not None else {}
         try:
@@ -366,19 +363,7 @@ class Copies:
             self.errors[number] = error
             raise
         if overrides is None and self.why_not_saved is None:
-            self._note_first(number)
-
-    def _note_first(self, number: int) -> None:
-        """A copy is at its first point, and may come back there."""
-        first = self._copies[number].save(0)
-        if first.kept == self._first_kept:  # as in most copies: then it is once in the processor's caches
-            first = first._replace(kept=self._first_kept)
-        self._first[number], self._first_kept = first, first.kept
-        by_calls = self._copies[number].restored_by(first)
-        if by_calls is not None and native.library is not None:
-            calls, pieces = by_calls
-            self._back = self._back or _WaysBack(self._threads, self._table, len(calls), len(pieces))
-            self._back.note(number, calls, pieces)
+            self._first.note(number)
 
     def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
         copy, self._by_python = self._copies[number], number
@@ -405,15 +390,17 @@ class Copies:
 
     def close(self) -> None:
         """Close all instances and free all models. Never raises; may be called twice."""
-        first, self._first = self._first, {}
-        self._threads.each([*first], lambda number: self._copies[number].free(first[number]))
-        self._threads.each(range(len(self._copies)), lambda number: self._copies[number].close())
+        self._threads.each(range(len(self._copies)), self._close)
         for thread, (_, models) in enumerate(self._models):
             self._threads.on(thread, models.close)
         self._models.clear()
         self._copies.clear()
         self.end_threads()
         self._limits.close()
+
+    def _close(self, number: int) -> None:
+        self._first.free(number)
+        self._copies[number].close()
 
     def end_threads(self) -> None:
         """End the threads that were started here, from any thread; after that, only `close` is allowed."""
@@ -442,53 +429,6 @@ class Copies:
         folder, models = self._models[thread]
         opening = opening_of(self._plan, name, folder, self._log, self._run.showing)
         return open_instance(replace(opening, content=self._run.contents.get(name), kept=models))
-
-
-class _WaysBack:
-    """How the library brings copies back to their first point.
-
-    Args:
-        threads: of the copies.
-        copies: their tables.
-        states: how many FMUs a copy has.
-        pieces: how many pieces of memory.
-    """
-
-    def __init__(self, threads: CopyThreads, copies: Any, states: int, pieces: int) -> None:  # noqa: ANN401  an array of ctypes
-        self._threads, self._copies = threads, copies
-        self._sizes = states, 1 + pieces
-        self._calls = (native.CopyCall * (len(copies) * states))()
-        self._pieces = (native.Keep * (len(copies) * (1 + pieces)))()
-        self._zeros = (ctypes.c_int64 * 2)()
-
-    def note(self, number: int, calls: list[native.CopyCall], pieces: list[native.Keep]) -> None:
-        """From now on, a copy comes back by these."""
-        states, size = self._sizes
-        point = ctypes.addressof(self._copies[number]) + native.CopyTable.point.offset  # and the goal is beside it
-        self._calls[number * states : (number + 1) * states] = calls
-        self._pieces[number * size : (number + 1) * size] = [
-            native.Keep(point, ctypes.addressof(self._zeros), 2),
-            *pieces,
-        ]
-
-    def forget(self, number: int) -> None:
-        """A copy has ended, or is made anew."""
-        self._pieces[number * self._sizes[1]] = native.Keep()
-
-    def restore(self, wanted: Truths) -> Truths | None:
-        """Bring those of ``wanted`` back that it knows; which ones are left, if any."""
-        left = wanted.copy()
-        (calls, pieces), (calls_each, pieces_each) = (self._calls, self._pieces), self._sizes
-        if self._threads.work(
-            WorkKind.RESTORE,
-            calls=ctypes.addressof(calls),
-            calls_each=calls_each,
-            pieces=ctypes.addressof(pieces),
-            pieces_each=pieces_each,
-            wanted=left.ctypes.data,
-        ):
-            return left
-        return None
 
 
 def _bytes_beside(node: NodePlan) -> int:

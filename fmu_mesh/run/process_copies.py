@@ -57,7 +57,7 @@ from .copies_messages import (
     StepCopies,
     Values,
 )
-from .copy_pieces import Pieces
+from .copy_threads import Pieces
 from .fork_server import ForkServer, fork_server
 from .process import interrupts_later
 from .run_plan import RunPlan
@@ -232,7 +232,7 @@ class ProcessCopies:
             self._ask(self._hosts, lambda _host: [Free(state)])
             raise
         return [
-            SavedCopy(int(self._points[number]), {"": (state, host.starts)}, b"")
+            SavedCopy(int(self._points[number]), {"": (state, host.starts)}, b"", None)
             for host in self._hosts
             for number in range(host.part.start, host.part.stop)
         ]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -16,7 +18,10 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 import fmu_mesh
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
+from fmu_mesh.run import preparing
+from fmu_mesh.run.run_plan import RunPlan
 from tests.helpers import FMUS
 
 H = 0.01
@@ -345,6 +350,52 @@ def test_number_of_copies_is_one_or_more(copies: Any, words: str) -> None:  # no
         mesh.batch(copies)
 
 
+def test_a_state_of_instances_that_have_failed_is_refused(faulty: Path) -> None:
+    mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
+    mesh.add("faulty", fmu=str(faulty))
+    with mesh.batch(2) as batch:
+        batch.reset(start_values={"faulty.fail_at": [0.055, 1e300]})
+        state = batch.save()
+        batch.step(10)
+        batch.reset([True, False], {"faulty.fail_at": 1e300})
+        batch.step(3)
+
+        with pytest.raises(fmu_mesh.CallRefused, match="a state that was saved before belongs to the others"):
+            batch.restore(state, [True, False])
+        batch.restore(state, [False, True])
+        batch.step(20)
+        assert batch.point.tolist() == [23, 20]
+
+
+@pytest.mark.parametrize("how", ["closed", "dropped_elsewhere"])
+def test_threads_end_with_their_batch(how: str) -> None:
+    before = {*threading.enumerate()}
+    mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
+    mesh.add("gain", fmu=str(FMUS / "Gain.fmu"))
+    batches = [mesh.batch(4, threads=3)]
+    batches[0].step()
+    assert len({*threading.enumerate()} - before) == 2
+
+    if how == "closed":
+        batches.pop().close()
+    else:
+        other = threading.Thread(target=batches.clear)
+        other.start()
+        other.join()
+
+    assert {*threading.enumerate()} <= before
+
+
+def test_a_batch_that_is_left_open_lets_the_interpreter_end() -> None:
+    text = "import fmu_mesh; mesh = fmu_mesh.Mesh('m', step_size=0.1, stop_time=1.0)"
+    text += f"; mesh.add('gain', fmu='{FMUS}/Gain.fmu'); batch = mesh.batch(4, threads=2)"
+    program = f"{text}; batch.step(); print(batch.point.tolist())"
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=100)
+
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[1, 1, 1, 1]\n", "")
+
+
 @pytest.fixture
 def gains() -> Iterator[fmu_mesh.Batch]:
     mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
@@ -379,6 +430,30 @@ def test_start_values_of_other_copies_are_ignored(gains: fmu_mesh.Batch) -> None
 
     assert gains.get("gain.k").tolist() == [1.0, 4.0]
     assert gains.point.tolist() == [3, 0]
+
+
+def test_a_batch_is_planned_once_for_the_same_start_values(
+    gains: fmu_mesh.Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned, original = list[object](), preparing.planned
+
+    def counting(*given: Any, **named: Any) -> RunPlan:  # noqa: ANN401  those of the function
+        planned.append(given)
+        return original(*given, **named)
+
+    monkeypatch.setattr(preparing, "planned", counting)
+    for value in (1.0, 2.0, 3.0):
+        gains.reset(start_values={"gain.k": [value, -value]})
+        assert gains.get("gain.k").tolist() == [value, -value]
+    assert len(planned) == 1
+    gains.reset(start_values={"gain.k": 4.0, "gain.u": 5.0})
+    assert len(planned) == 2
+
+    for _ in range(2):  # what is wrong is planned, which says why
+        with pytest.raises(ConfigurationError, match="'NaN' for the Real 'k'; expected a finite number"):
+            gains.reset(start_values={"gain.k": np.nan})
+    assert len(planned) == 4
+    assert gains.get("gain.k").tolist() == [4.0, 4.0]
 
 
 def test_results_go_into_given_arrays(gains: fmu_mesh.Batch) -> None:
