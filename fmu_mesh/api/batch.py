@@ -39,6 +39,8 @@ from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
 from ..variables.value_types import DTYPES, is_float, is_text
+from .batch_rows import BatchRows
+from .result import Result
 from .system_state import BatchState
 
 __all__ = ["Batch"]
@@ -80,6 +82,7 @@ class Batch:
             copies.
         processes: in how many processes they are, at most one for each; 1: in this one. None: as many as this process
             may use processors, where each has 512 copies or more.
+        memory_limit: the most bytes that the rows for `result` may take; None: nothing is recorded.
 
     Raises:
         NotInOneProcess: copies of an FMU need a process each.
@@ -89,7 +92,15 @@ class Batch:
         MeshLost: a process has ended before its copies were ready.
     """
 
-    def __init__(self, run: RunPlan, copies: int, *, threads: int = 1, processes: int | None = None) -> None:
+    def __init__(
+        self,
+        run: RunPlan,
+        copies: int,
+        threads: int = 1,
+        processes: int | None = None,
+        *,
+        memory_limit: int | None = None,
+    ) -> None:
         if copies < 1:
             raise CallRefused(f"{option_text('copies', copies)}: expected a whole number of 1 or more")
         count = _processes(copies, threads, processes)
@@ -116,8 +127,10 @@ class Batch:
         self._release = weakref.finalize(self, _release, own, folder, self._thread)
         self._before = resident_bytes()
         self._is_looked_at = False
+        self._recorded = BatchRows(run, copies, memory_limit) if memory_limit is not None else None
         try:
             own.start(self._look_at_memory)
+            self._note(np.ones(copies, np.bool_))
         except BaseException:
             self.close()
             raise
@@ -168,13 +181,21 @@ class Batch:
         `done`, and the others go on.
 
         Raises:
-            CallRefused: see `close`.
+            CallRefused: the rows for `result` would not fit into memory; or see `close`.
         """
         self._demand("step")
         if not hasattr(points, "__index__") or operator.index(points) < 1:
             raise CallRefused(f"{option_text('points', points)}: expected a whole number of 1 or more")
+        points = operator.index(points)
         with interrupts_later() as is_asked:
-            self._copies.step(operator.index(points), is_asked)
+            if self._recorded is None:
+                self._copies.step(points, is_asked)
+                return
+            self._recorded.make_room(min(int(self._copies.points.max()) + points, self._run.plan.grid.last_point))
+            while points > 0 and not is_asked() and not self._copies.ended.all():
+                self._copies.step(1, is_asked)
+                self._recorded.take(self._copies.points, self.get)
+                points -= 1
 
     def get(self, name: str | Sequence[str], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """The current values of a variable, or of several ones of one type.
@@ -281,7 +302,42 @@ class Batch:
         self._demand("reset")
         wanted = self._wanted("mask", mask)
         overrides = self._overrides(wanted, start_values) if start_values else None
-        self._copies.reset(wanted, overrides)
+        try:
+            self._copies.reset(wanted, overrides)
+        finally:
+            self._note(wanted)
+
+    def result(self, copy: int) -> Result:
+        """What a copy has recorded, from its last `reset` or `restore` to its point.
+
+        Example:
+            >>> import fmu_mesh
+            >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2, record=["pendulum.a"]) as batch:
+            ...     batch.step(3)
+            ...     result = batch.result(1)
+            ...     result.names, result.times.tolist(), result["pendulum.a"].shape
+            (['pendulum.a'], [0.0, 0.002, 0.004, 0.006], (4,))
+
+        Returns:
+            As that of a run which ended at the point of the copy; its arrays are copies.
+
+        Raises:
+            CallRefused: there is no such copy, or the batch does not record; or see `close`.
+        """
+        self._demand("result")
+        if self._recorded is None:
+            raise CallRefused(
+                "result needs rows, and this batch records nothing", hint='Make it with `record="memory"`.'
+            )
+        if not hasattr(copy, "__index__") or not 0 <= operator.index(copy) < self._count:
+            raise CallRefused(f"{option_text('copy', copy)}: expected a number from 0 to {self._count - 1}")
+        return self._recorded.result(operator.index(copy), self._copies.errors.get(operator.index(copy)))
+
+    def _note(self, wanted: NDArray[np.bool_]) -> None:
+        """Copies are at a point to which no step has led."""
+        if self._recorded is not None:
+            self._recorded.begin(wanted, self._copies.points)
+            self._recorded.take(self._copies.points, self.get)
 
     def save(self) -> BatchState:
         """Save the state of all copies: every instance, and the values between them (FMI 2.0, 2.1.8).
@@ -319,7 +375,9 @@ class Batch:
         if saved is None:
             raise CallRefused("restore needs a state that this batch has saved, and that is not closed.")
         self._free_lost()
-        self._copies.restore(saved, self._wanted("copies", copies))
+        wanted = self._wanted("copies", copies)
+        self._copies.restore(saved, wanted)
+        self._note(wanted)
 
     def close(self) -> None:
         """Free all FMUs and states, and remove the files. May be called twice.

@@ -648,8 +648,9 @@ class Mesh:
     def batch(self, copies: int, options: BatchOptions) -> Batch:
         """Open many copies of all instances, for a program that steps them as arrays (docs/batches.md).
 
-        Nothing is recorded into a file. Inputs with a Zenoh key are free to be set. Many copies get processes of their
-        own, as many as this program may use processors; `processes` says how many, and 1 that it is this process.
+        No file is written; with `record`, rows stay in memory for `Batch.result`. Inputs with a Zenoh key are free.
+        Many copies get processes of their own, as many as this program may use processors; `processes` says how many,
+        and 1 that it is this process.
 
         Example:
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2, {"pendulum.a": 0.5}) as batch:
@@ -671,13 +672,14 @@ class Mesh:
         """
         from .batch import Batch  # noqa: PLC0415  only this needs it
 
-        return Batch(self._opened(options), copies, threads=options.threads, processes=options.processes)
+        limit = options.memory_limit if options.record is not None else None
+        return Batch(self._opened(options), copies, options.threads, options.processes, memory_limit=limit)
 
     def _opened(self, options: OpenOptions) -> RunPlan:
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `set`.")
         given = options.given()
-        for own in ("threads", "processes"):
+        for own in ("threads", "processes", "memory_limit"):
             given.pop(own, None)
         return without_keys(self.plan(**given))
 

@@ -66,6 +66,13 @@ class CopiesHost:
         first, last = self.part.start, self.part.stop - 1
         return f"copy {first}" if first == last else f"copies {first} to {last}"
 
+    @property
+    def guilty(self) -> int | None:
+        """The copy that has ended it, by its number in the batch; None if it is not known."""
+        if self.failed is None or self.failed.copy is None:
+            return None
+        return int(self.part.start) + self.failed.copy
+
     def start(self, server: ForkServer, run: RunPlan, file: Path, processes: int) -> None:
         """Start it."""
         own, theirs = socket.socketpair()
@@ -133,12 +140,12 @@ class CopiesHost:
     def reason(self, grid: TimeGrid, copy: int | None = None, point: int = 0) -> FmuMeshError:
         """Why a copy has ended with the process; None: the copy that has ended it."""
         failed = self.failed
-        if failed is not None and copy in {None, self.part.start + failed.copy if failed.copy is not None else None}:
+        if failed is not None and copy in {None, self.guilty}:
             return from_report(failed.error)
         if failed is None:
             error = MeshLost(f"the process of {self.copies} {self._how}", hint="`reset` starts another one.")
         else:
-            whose = f"copy {self.part.start + failed.copy}" if failed.copy is not None else "one of them"
+            whose = f"copy {self.guilty}" if self.guilty is not None else "one of them"
             text = f"the process of {self.copies} has ended, because of {whose}: {from_report(failed.error)}"
             error = MeshLost(text)
         return error.at(point, grid.time(point)) if copy is not None else error

@@ -73,6 +73,11 @@ class BatchOptions(OpenOptions, frozen=True):
         int | None,
         Option("have the copies in so many processes; 1: in this one; default: as many as pay", least=1),
     ] = None
+    record: Annotated[
+        Literal["memory"] | Sequence[str] | None,
+        Option('variables to record for `Batch.result`, or "memory" for those of the configuration; None: nothing'),
+    ] = None
+    memory_limit: MemoryLimit = MEMORY_LIMIT
 
 
 class PlanOptions(VariantOptions, frozen=True, kw_only=True):

@@ -355,7 +355,8 @@ class ProcessCopies:
         self._poll.unregister(host.channel)
         host.lose()
         part, grid = host.part, self._run.plan.grid
-        self._points[part] = np.where(self._gone[part], self._points[part], self._block.points[part])
+        if (copy := host.guilty) is not None and not self._gone[copy]:  # the others are where their last answer was
+            self._points[copy] = self._block.points[copy]
         for number in range(part.start, part.stop):
             if number not in self._errors and self._points[number] < grid.last_point:
                 self._errors[number] = host.reason(grid, number, int(self._points[number]))

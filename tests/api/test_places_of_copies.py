@@ -83,3 +83,67 @@ def test_copies_that_do_not_fit_into_memory_are_refused(monkeypatch: pytest.Monk
     with pytest.raises(fmu_mesh.CallRefused, match=r"200 copies take about .* KiB each; 0\.0 GiB are free"):
         gains().batch(200, processes=processes)
     assert places() == []
+
+
+def recorded_mesh() -> fmu_mesh.Mesh:
+    mesh = fmu_mesh.Mesh("recorded", step_size=H, stop_time=0.5)
+    mesh.add("fast", fmu=str(FMUS / "Integrator.fmu"), start_values={"y": 1.0})
+    mesh.add("slow", fmu=str(FMUS / "Integrator.fmu"), start_values={"k": -2.0}, step_size=3 * H)
+    mesh.connect("fast.y", "slow.u")
+    mesh.connect("slow.y", "fast.u")
+    return mesh
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_results_of_copies_are_those_of_runs(processes: int) -> None:
+    mesh, names = recorded_mesh(), ["slow.y", "fast.y", "fast.u"]
+    with mesh.batch(3, record=names, processes=processes) as batch:
+        batch.reset(start_values={"fast.y": [1.0, 2.0, 3.0]})
+        for points in (1, 20, 100):
+            batch.step(points)
+        runs = [mesh.run(processes=False, record=names, start_values={"fast.y": 1.0 + copy}) for copy in range(3)]
+        for copy, run in enumerate(runs):
+            own = batch.result(copy)
+            assert own.names == run.names == names
+            assert own.times.tolist() == run.times.tolist()
+            assert {name: own[name].tolist() for name in names} == {name: run[name].tolist() for name in names}
+            assert own.units == run.units
+            assert own.outcome is not None
+            assert own.outcome.point == 50
+        batch.reset([True, False, False])
+        batch.step(4)
+        assert batch.result(0).times.tolist() == batch.result(1).times.tolist()[:5]
+        with batch.save() as state:
+            batch.step(3)
+            batch.restore(state)
+        batch.step(1)
+        assert batch.result(0).times.tolist() == runs[0].times.tolist()[4:6]
+
+
+def test_a_failed_copy_has_its_rows_and_why(faulty: Path) -> None:
+    mesh = fmu_mesh.Mesh("recorded", step_size=H, stop_time=None)
+    mesh.add("faulty", fmu=str(faulty))
+    for what, processes in (("fail_at", 1), ("crash_at", 2)):
+        with mesh.batch(2, record="memory", processes=processes) as batch:
+            batch.reset(start_values={f"faulty.{what}": [0.05, 1e300]})
+            batch.step(20)
+            result = batch.result(0)
+            assert result.outcome is not None
+            assert result.outcome.error is not None
+            assert len(result.times) == batch.point[0] + 1 == 6
+            assert len(batch.result(1).times) == 21
+
+
+def test_rows_without_room_and_results_without_rows_are_refused() -> None:
+    with gains().batch(10, record=["gain.y"], memory_limit=10 * 8 * 21) as batch:
+        batch.step(20)
+        with pytest.raises(fmu_mesh.CallRefused, match="the rows of 10 copies up to point 21 take 1760 bytes"):
+            batch.step()
+        assert batch.point.tolist() == [20] * 10
+        batch.reset()
+        batch.step(20)
+        for copy in (10, -1, "a"):
+            with pytest.raises(fmu_mesh.CallRefused, match="expected a number from 0 to 9"):
+                batch.result(copy)  # type: ignore[arg-type]  # it is refused
+    with gains().batch(1) as batch, pytest.raises(fmu_mesh.CallRefused, match="records nothing"):
+        batch.result(0)
