@@ -143,6 +143,7 @@ class _Loaded:
         weakref.finalize(self, os.close, self._memory)
         self._bytes = 0
         self._started = 0.0
+        self._worker, self._machine = f"{socket.gethostname()}:{os.getpid()}", ", ".join(machine().values())
         work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset, alone=alone)
         threading.Thread(target=work, name="variants", daemon=True).start()
         weakref.finalize(self, self._jobs.put, None)
@@ -216,9 +217,9 @@ class _Loaded:
             message=_line(report) if report is not None else " ".join(filter(None, warnings)),
             values=values,
             seconds=time.perf_counter() - self._started,
-            worker=f"{socket.gethostname()}:{os.getpid()}",
+            worker=self._worker,
             spent=self.hung.stuck or self._has_grown(),
-            machine=", ".join(machine().values()),
+            machine=self._machine,
         )
 
     def _values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
