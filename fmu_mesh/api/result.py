@@ -304,7 +304,10 @@ class Result(Mapping[str, NDArray[Any]]):
             UnknownName: it was not recorded; suggests the nearest name. Or it means several.
         """
         columns = self._columns.values
-        return columns[name] if isinstance(name, str) and name in columns else columns[self._meant(name)]
+        try:
+            return columns[name]
+        except (KeyError, TypeError):  # no name of a column, or no name at all
+            return columns[self._meant(name)]
 
     @checked
     def _meant(self, name: str) -> str:

@@ -101,12 +101,15 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
     return {**options, **{name: {**options.get(name, {}), **values} for name, values in own.items()}}
 
 
-def run_variants(task: bytes, functions: OwnReductions, variants: Sequence[Variant]) -> list[Row]:
+def run_variants(
+    task: bytes, functions: OwnReductions, variants: Sequence[Variant], *, ours: bool = False
+) -> list[Row]:
     """Run variants one after another, up to one whose row is `Row.spent`; a run that failed has a row, too.
 
-    Called in a worker, by whichever executor.
+    Called in a worker, by whichever executor; ``ours`` says that the process does nothing else.
     """
-    return _mine.loaded_for(task, functions).rows(variants, functions)
+    alone = (ours or parent_process() is not None) and not functions  # those of a user may change what they like
+    return _mine.loaded_for(task, alone=alone).rows(variants, functions)
 
 
 class _Mine(threading.local):
@@ -115,9 +118,8 @@ class _Mine(threading.local):
     def __init__(self) -> None:
         self._loaded: _Loaded | None = None
 
-    def loaded_for(self, task: bytes, functions: OwnReductions) -> _Loaded:
+    def loaded_for(self, task: bytes, *, alone: bool) -> _Loaded:
         if self._loaded is None or self._loaded.task != task or self._loaded.hung.stuck:
-            alone = parent_process() is not None and not functions  # those of a user may change what they like
             self._loaded = _Loaded(task, alone=alone)
         return self._loaded
 
