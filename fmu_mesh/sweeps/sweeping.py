@@ -41,7 +41,8 @@ from .sweep_folder import RowFile
 from .sweep_options import SweepOptions
 from .sweep_result import SweepResult
 from .variant_run import Row, run_variants
-from .worker_pool import WorkerLost, WorkerPool, prepare_workers, unguarded_call
+from .worker_pool import WorkerLost, WorkerPool, unguarded_call
+from .worker_server import prepare_workers
 
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 

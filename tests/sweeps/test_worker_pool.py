@@ -17,7 +17,7 @@ from tests.helpers import DEADLINE_S, wait_until, write_config
 
 PROGRAM = """
 import json, os, signal, sys, threading
-from fmu_mesh.sweeps.worker_pool import WorkerPool, prepare_workers
+from fmu_mesh.sweeps.worker_pool import WorkerPool
 import fmu_mesh, psutil
 
 config, folder, before = sys.argv[1:]
