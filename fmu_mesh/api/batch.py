@@ -27,11 +27,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import CallRefused
 from ..run.copies import Copies
 from ..run.local_system import forwarded
-from ..run.preparing import KnownModels, planned_reset
+from ..run.preparing import OtherStartValues
 from ..run.process import interrupts_later
 from ..run.run_plan import RunPlan
 from ..run.system_copy import Overrides, SavedCopy
-from ..run.threaded_copies import ThreadedCopies
 from ..text import option_text, shown
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, checked_value, range_of, to_plain
@@ -87,18 +86,14 @@ class Batch:
         self._run = run
         self._count = copies
         self._thread = threading.get_ident()
-        self._known = KnownModels()
+        self._resets = OtherStartValues(run, loads=False)
         self._variables: dict[str, tuple[str, Variable]] = {}
         self._settable: set[str] = set()
         self._saved: weakref.WeakKeyDictionary[BatchState, list[SavedCopy]] = weakref.WeakKeyDictionary()
         self._lost: deque[list[SavedCopy]] = deque()
         folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
-        own: Copies | ThreadedCopies
         try:
-            if min(threads, copies) > 1:
-                own = ThreadedCopies(run, copies, folder, forwarded, min(threads, copies))
-            else:
-                own = Copies(run, copies, folder, forwarded)
+            own = Copies(run, copies, folder, forwarded, min(threads, copies))
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -385,25 +380,23 @@ class Batch:
 
     def _overrides(self, wanted: NDArray[np.bool_], start_values: Values) -> Callable[[int], Overrides]:
         """The start values of a copy, by its number."""
-        rows: dict[str, NDArray[Any]] = {}
+        found: list[tuple[str, str, str, list[Any]]] = []
         for name, values in start_values.items():
-            _, variable = self._variable(name)
+            instance, variable = self._variable(name)
             try:
-                rows[name] = self._rows(values, variable, finite=False, wanted=wanted)
+                rows = self._rows(values, variable, finite=False, wanted=wanted)
             except ValueRefused as refused:
                 raise CallRefused(f"'{name}' {refused}.") from refused
+            found.append((name, instance, variable.name, rows.reshape(self._count, *variable.shape).tolist()))
 
         def of_copy(number: int) -> dict[str, dict[str, Any]]:
-            found: dict[str, dict[str, Any]] = {}
-            for name, own in rows.items():
-                instance, variable = self._variables[name]
-                row = own[number].reshape(variable.shape).tolist()
-                found.setdefault(instance, {})[variable.name] = to_plain(row)
-            return found
+            own: dict[str, dict[str, Any]] = {}
+            for _, instance, variable, values in found:
+                own.setdefault(instance, {})[variable] = values[number]
+            return own
 
         for number in np.flatnonzero(wanted)[:1].tolist():  # the names and roles are the same in all copies
-            plain = {f"{name}.{one}": value for name, own in of_copy(number).items() for one, value in own.items()}
-            planned_reset(self._run, plain, 0, self._known)
+            self._resets.of_reset({name: to_plain(values[number]) for name, _, _, values in found})
         return of_copy
 
     def _look_at_memory(self, ready: int) -> None:
@@ -428,8 +421,10 @@ def _resident_bytes() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def _release(copies: Copies | ThreadedCopies, folder: Path, thread: int) -> None:
+def _release(copies: Copies, folder: Path, thread: int) -> None:
     """Free everything. On another thread only the files: an FMU is only called on its own."""
     if threading.get_ident() == thread:
         copies.close()
+    else:
+        copies.end_threads()
     shutil.rmtree(folder, ignore_errors=True)

@@ -28,7 +28,7 @@ from ..instances.registry import open_instance
 from ..run.local_system import LocalSystem, SavedSystem, forwarded, opening_of
 from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
-from ..run.reset_plans import ResetPlans
+from ..run.preparing import OtherStartValues
 from ..run.run_plan import RunPlan
 from ..simtime import ENDLESS
 from ..text import listed, option_text, shown
@@ -77,8 +77,8 @@ class System:
     """
 
     def __init__(self, run: RunPlan, plan_again: Callable[[Mapping[str, Any]], RunPlan] | None = None) -> None:
-        self._plans = plans = ResetPlans(run, plan_again)
-        self._plan = plan = plans.first
+        self._resets = OtherStartValues(run, plan_again, loads=False)
+        self._plan = plan = run.plan
         OneProcess().check(plan, run.contents)
         self._run = run
         self._grid = plan.grid
@@ -394,15 +394,15 @@ class System:
     def _begin_again(self, start_values: Mapping[str, Any] | None) -> None:
         """Initialize all instances again."""
         values = dict(ResetOptions(start_values=start_values).start_values or {})
-        self._plan = plan = self._plans.plan(values)
+        self._plan, others = self._resets.of_reset(values)
         self._getters.clear()
         self._setters.clear()
         self._first = None
         for state in self._saved:
             self._saved[state] = None
         with self._changing():
-            self._local.start(self._opened, plan)
-            instances = plan.system.instances.values()
+            self._local.start(self._opened, self._plan, others)
+            instances = self._plan.system.instances.values()
             if not values and all(own.description.can_get_and_set_state for own in instances):
                 self._first = self._local.save()
         self._ended_by = None

@@ -29,7 +29,6 @@ from ..text import short_path
 from ..variables.model_description import Value
 from .contract import BeginsAgain, ChangesProcess, Instance, Prepares
 from .instance_wrapper import AroundNativeSteps
-from .kept_models import RunsAgain
 from .process_end import surviving
 from .process_state import floating_point_changed, kept_mode, kept_state, restore_floating_point
 
@@ -127,13 +126,21 @@ class CallWatch:
     @contextmanager
     def calling(self, instance: str, kind: type[FmuError], setting: str, limit_s: float) -> Iterator[None]:
         """Around one call of an FMU, of ``limit_s`` at most; ``setting`` is the key of `timeouts` with this limit."""
-        self._call = _Call(instance, kind, setting, limit_s, time.monotonic())
-        if self._asleep:
-            self._notify()
+        self.begin(instance, kind, setting, limit_s)
         try:
             yield
         finally:
-            self._call = None  # the watching thread reads this when it wakes up
+            self.end()
+
+    def begin(self, instance: str, kind: type[FmuError], setting: str, limit_s: float) -> None:
+        """As `calling`, in a place where it would take longer than the call; `end` has to follow."""
+        self._call = _Call(instance, kind, setting, limit_s, time.monotonic())
+        if self._asleep:
+            self._notify()
+
+    def end(self) -> None:
+        """The call of `begin` has returned."""
+        self._call = None  # the watching thread reads this when it wakes up
 
     def surviving(self, instance: str) -> AbstractContextManager[None]:
         """Around the last calls of FMUs: a crash is reported as a call that does not return."""
@@ -222,6 +229,12 @@ class Unwatched:
         """Around one call of an FMU."""
         yield
 
+    def begin(self, _instance: str, _kind: type[FmuError], _setting: str, _limit_s: float) -> None:
+        """Before one call of an FMU."""
+
+    def end(self) -> None:
+        """After it."""
+
     def surviving(self, _instance: str) -> AbstractContextManager[None]:
         """The process goes on after the last call, so a crash is one."""
         return nullcontext()
@@ -302,9 +315,8 @@ class Guarded(AroundNativeSteps):
         self._careful = False
         self._trusted = is_harmless
         self._is_watched = not isinstance(watch, Unwatched)
-        with watch.calling(name, LoadFailed, "call", timeouts.call), self._kept():
-            super().__init__(open_())
-        self.runs_again = isinstance(self._instance, RunsAgain) and self._instance.runs_again
+        super().__init__(self._made(LoadFailed, "call", open_))
+        self._again = self._instance if isinstance(self._instance, BeginsAgain) else None
         if isinstance(self._instance, ChangesProcess) and self._instance.changes_process:
             self._careful = True
 
@@ -318,15 +330,27 @@ class Guarded(AroundNativeSteps):
         """That of the inner instance: `CallWatch.stepping` watches the steps."""
         return self._step if self._careful else self._instance.do_step
 
-    def begin_again(self) -> bool:
-        """See `BeginsAgain`; False if the inner instance is none. What was harmless until now is taken for it."""
-        own = self._instance
-        if not isinstance(own, BeginsAgain):
+    @property
+    def runs_again(self) -> bool:
+        """Whether `end_run` may be called where nobody looks after each call of the later runs."""
+        return self._again is not None and self.is_harmless
+
+    def end_run(self) -> bool:
+        """See `BeginsAgain`; who ends several looks after crashes once for all of them."""
+        if self._again is None:
             return False
-        self._trusted = self.is_harmless
-        is_as_new = self._forward(own.begin_again)
+        ended = self._made(FmuError, "terminate", self._again.end_run)
         self._running = False
-        return is_as_new
+        return ended
+
+    def begin_again(self) -> None:
+        """See `BeginsAgain`. What was harmless until now is taken for it."""
+        assert self._again is not None
+        self._trusted = self.is_harmless
+        if self._is_watched:
+            self._made(LoadFailed, "call", self._again.begin_again)
+        else:
+            self._forward(self._again.begin_again)
 
     @property
     def is_harmless(self) -> bool:
@@ -344,28 +368,7 @@ class Guarded(AroundNativeSteps):
 
     def set_in_step(self, values: Mapping[str, Value]) -> None:
         """As `set_values`, as a part of a step: whoever watches the steps watches this, too, and it takes less time."""
-        with self._kept():
-            self._instance.set_values(values)
-
-    def end_run(self) -> bool:
-        """See `RunsAgain`; who ends several looks after crashes and the state of the process once for all of them."""
-        if self._careful or not self.runs_again:
-            return False
-        watch, name, self._running = self._watch, self._name, False
-        ending = watch.calling(name, FmuError, "terminate", self._timeouts.terminate)
-        with ending, kept_mode():
-            return cast("RunsAgain", self._instance).end_run()
-
-    def run_again(self) -> None:
-        """See `RunsAgain`. What was harmless until now is taken for it."""
-        self._trusted = self.is_harmless
-        with self._watch.calling(self._name, LoadFailed, "call", self._timeouts.call), self._kept():
-            cast("RunsAgain", self._instance).run_again()
-
-    def bind_again(self) -> None:
-        """See `RunsAgain`."""
-        self._forward(cast("RunsAgain", self._instance).bind_again)
-        self._running = True
+        self._made(None, "step", self._instance.set_values, values)
 
     def setter(self, name: str) -> Callable[[Value], None] | None:
         """See `Prepares`; nothing is prepared where calls are watched."""
@@ -383,12 +386,11 @@ class Guarded(AroundNativeSteps):
         """Terminate if allowed, free the instance and remove its files; one deadline for all of it."""
         watch, name = self._watch, self._name
         ending = watch.calling(name, FmuError, "terminate", self._timeouts.terminate)
-        with ending, watch.surviving(name), self._kept() if self._trusted else kept_state():
+        with ending, watch.surviving(name), kept_mode() if self._trusted and not self._careful else kept_state():
             self._instance.close()
 
     def _step(self, step: int) -> None:
-        with self._kept():
-            self._instance.do_step(step)
+        self._made(None, "step", self._instance.do_step, step)
 
     @property
     def _preparing(self) -> Prepares | None:
@@ -396,31 +398,38 @@ class Guarded(AroundNativeSteps):
         return own if isinstance(own, Prepares) and not self._is_watched else None
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
-        if self._careful or self._is_watched or not (self._running or self._trusted):
-            return self._looked_after(call, *arguments)
-        was_changed = floating_point_changed()
-        try:
-            return call(*arguments)
-        finally:
-            if not was_changed and floating_point_changed():
-                restore_floating_point()
-
-    def _looked_after(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 as above
+        if self._trusted and not (self._is_watched or self._careful):  # as `_made`, in half the time
+            was_changed = floating_point_changed()
+            try:
+                return call(*arguments)
+            finally:
+                if not was_changed and floating_point_changed():
+                    restore_floating_point()
         if self._running:
-            watched = self._watch.calling(self._name, StepFailed, "step", self._timeouts.step)
-        else:
-            watched = self._watch.calling(self._name, InitializationFailed, "call", self._timeouts.call)
-        with watched, self._kept():
-            return call(*arguments)
+            return self._made(StepFailed, "step", call, *arguments)
+        return self._made(InitializationFailed, "call", call, *arguments)
 
-    @contextmanager
-    def _kept(self) -> Iterator[None]:
-        """Around one call: restore the state of the process, between steps only where they may change it."""
-        if (self._running or self._trusted) and not self._careful:
-            with kept_mode():
-                yield
-            return
-        with kept_state() as state:
-            yield
-        if state.changed:
-            self._careful = True
+    def _made(self, kind: type[FmuError] | None, setting: str, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 as above
+        """Make a call, and restore the state of the process, between steps only where they may change it.
+
+        That it has missed its deadline is an error of this ``kind``; None: somebody else watches it.
+        """
+        is_watched = self._is_watched and kind is not None
+        if is_watched:
+            self._watch.begin(self._name, cast("type[FmuError]", kind), setting, getattr(self._timeouts, setting))
+        try:
+            if (self._running or self._trusted) and not self._careful:
+                was_changed = floating_point_changed()
+                try:
+                    return call(*arguments)
+                finally:
+                    if not was_changed and floating_point_changed():
+                        restore_floating_point()
+            with kept_state() as state:
+                result = call(*arguments)
+            if state.changed:
+                self._careful = True
+            return result
+        finally:
+            if is_watched:
+                self._watch.end()

@@ -328,10 +328,22 @@ class Prepares(Protocol):
 
 @runtime_checkable
 class BeginsAgain(Protocol):
-    """An instance that can be as a new one, without being opened again."""
+    """An instance whose run can end without `close`, and which then begins another run of the same sizes.
 
-    def begin_again(self) -> bool:
-        """End the simulation; whether `enter_initialization` may follow. Otherwise only `close` may."""
+    Call sequence: `end_run` after the last step; if it returns True, `begin_again`, and all calls of `Instance` from
+    `enter_initialization` on, `bind` included. Otherwise, and at any time, `close`.
+    """
+
+    def end_run(self) -> bool:
+        """End the simulation as `close` does, but keep what does not depend on the run; whether that was possible."""
+        ...
+
+    def begin_again(self) -> None:
+        """Be as a new instance before Initialization Mode.
+
+        Raises:
+            LoadFailed: the model makes no other instance.
+        """
         ...
 
 

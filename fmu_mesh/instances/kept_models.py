@@ -7,39 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from pathlib import Path
-from typing import Protocol, cast, runtime_checkable
+from typing import Protocol, cast
 
-__all__ = ["KeptModel", "KeptModels", "RunsAgain", "SharedModels"]
-
-
-@runtime_checkable
-class RunsAgain(Protocol):
-    """An instance whose run can end without `close`, and which can then begin another run of the same sizes.
-
-    Call sequence: `end_run` after the last step; if it returns True, `run_again`, the calls of Initialization Mode,
-    `bind_again` in the place of `bind`, and steps from 0 on. Otherwise, and at any time, `close`.
-    """
-
-    @property
-    def runs_again(self) -> bool:
-        """Whether `end_run` may be called."""
-        ...
-
-    def end_run(self) -> bool:
-        """End the simulation as `close` does, but keep what does not depend on the run; whether that was possible."""
-        ...
-
-    def run_again(self) -> None:
-        """Be as a new instance before Initialization Mode.
-
-        Raises:
-            LoadFailed: the model makes no other instance.
-        """
-        ...
-
-    def bind_again(self) -> None:
-        """Write the current outputs as row 0 of the rings of the last `bind`."""
-        ...
+__all__ = ["KeptModel", "KeptModels", "SharedModels"]
 
 
 class KeptModel(Protocol):

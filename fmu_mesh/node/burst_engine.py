@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from time import perf_counter
-from typing import cast
+from typing import NamedTuple, cast
 
 from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.contract import StepsNatively
@@ -15,6 +15,7 @@ from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..rings.row_streams import RowStreams
+from ..rings.transfer import Transfer
 from ..system.plan import NodePlan
 from .engine import SLICE_S, STATE_CHECK_S, Engine, PlainEngine, Windows
 from .inputs import TimedInputs
@@ -38,6 +39,19 @@ def make_engine(  # noqa: PLR0913  one node and how it is connected
     return BurstEngine(plan, units, memory, windows, spins=spins, streams=streams)
 
 
+class _ByPython(NamedTuple):
+    """How Python takes a step of a runner.
+
+    Attributes:
+        texts: what moves texts into its inputs.
+        timed: whether its inputs follow times.
+    """
+
+    do_step: Callable[[int], None]
+    texts: Sequence[Transfer]
+    timed: bool
+
+
 class BurstEngine(Engine):
     """Steps with the burst in C."""
 
@@ -57,6 +71,8 @@ class BurstEngine(Engine):
         self._library = native.library
         self._kept: dict[str, list[object]] = {}
         self._tracks: dict[str, list[object]] = {}
+        self._by_python: dict[str, _ByPython] = {}
+        self._spent_s = [0.0] * len(units)  # by Python
         self._peers = table(native.Peer, [native.Peer(counter.address, window) for _, counter, window in self._windows])
         self._node = native.NodeTable(
             place=memory.place,
@@ -75,6 +91,7 @@ class BurstEngine(Engine):
             stride=1,
         )
         self._address = ctypes.addressof(self._node)
+        self._copy = self.copy
         for runner in self.runners:
             runner.refit()
 
@@ -82,6 +99,7 @@ class BurstEngine(Engine):
         """See `Engine`."""
         super().begin_again(looked_after)
         self._node.note(allowed=0, stride=1, patience=0)  # nothing of the grant before is known any more
+        self._copy, self._spent_s = self.copy, [0.0] * len(self.units)
 
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         node, library = self._node, self._library
@@ -102,17 +120,50 @@ class BurstEngine(Engine):
 
     def complete(self, result: int) -> None:
         """Let Python take or complete the step with which a burst has ended, or raise what it has ended with."""
-        unit, runner = self._node.unit, self.units[self._node.unit][self._node.member]
+        node, began = self._node, perf_counter()
+        unit, index = node.unit, node.member
+        runner = self.units[unit][index]
         if result == BurstEnd.FORGED:
             raise self._forged(runner)
-        began = perf_counter()
-        self._complete(unit, runner, result)
-        self._units[unit].spent_ns += int((perf_counter() - began) * 1e9)
+        if result == BurstEnd.BLOCKED:
+            raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
+        member, (do_step, texts, timed) = runner.table, self._by_python[runner.name]
+        try:
+            if result == BurstEnd.PYTHON:
+                step = member.step
+                for transfer in texts:
+                    transfer.step_text(step)
+                do_step(step)
+                if timed:
+                    self.follow_inputs(runner)
+            else:
+                self._complete(runner, result)
+        except FmuMeshError as error:
+            self._units[unit].stopped = 1
+            runner.is_finite.explain(error)
+            if isinstance(error, TerminationRequested):
+                member.stage = Stage.WAITING
+            raise
+        if floating_point_changed():
+            restore_floating_point()
+        member.stage = Stage.STEPPED
+        self._spent_s[unit] += perf_counter() - began
 
-    def as_copy(self) -> native.CopyTable:
-        """For a system in this process that waits for nobody: all of it is granted."""
-        self._node.allowed = self._last_point
+    @property
+    def copy(self) -> native.CopyTable:
+        """How the library steps it as one of many systems, from point 0 on."""
         return native.CopyTable(node=self._address)
+
+    @property
+    def point(self) -> int:
+        """See `Engine`."""
+        return int(self._copy.point)
+
+    def _step_to(self, point: int) -> None:
+        copy, step, address = self._copy, self._library.step_copy, ctypes.addressof(self._copy)
+        copy.goal = point
+        while (end := step(address)) != BurstEnd.DONE:
+            self.complete(end)
 
     def send(self) -> None:
         """See `Engine`."""
@@ -136,6 +187,11 @@ class BurstEngine(Engine):
     def late(self) -> int:
         """How often a sleep ended by its time limit although the value was there: 0 where no wake-up is lost."""
         return int(self._node.late)
+
+    @property
+    def spent_s(self) -> list[float]:
+        """See `Engine`."""
+        return [native_s + own_s for native_s, own_s in zip(super().spent_s, self._spent_s, strict=True)]
 
     @property
     def _ticks(self) -> int:
@@ -176,6 +232,10 @@ class BurstEngine(Engine):
             loads += own.loads
         made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
         self._kept[runner.name] = [made, bases, own]  # what the table points to
+        texts = [source.transfer for source in runner.sources if source.transfer.has_text]
+        self._by_python[runner.name] = _ByPython(
+            runner.instance.do_step, texts, isinstance(runner.instance, TimedInputs)
+        )
         ctypes.pointer(before)[0] = made
         self.follow_inputs(runner)
 
@@ -188,34 +248,18 @@ class BurstEngine(Engine):
                 member.give(tracks=[native.Track(values.ctypes.data, to) for to, values in timed.tracks])
             member.python_at, member.tracks_from = timed.python_at, timed.tracks_from
 
-    def _complete(self, unit: int, runner: Runner, result: int) -> None:
-        """Let Python take a step, or complete one that returned something unusual."""
+    def _complete(self, runner: Runner, result: int) -> None:
+        """Let Python complete a step that returned something unusual."""
         member = runner.table
         step = member.step
-        try:
-            if result == BurstEnd.NOT_FINITE:
-                raise runner.is_finite.error(step + 1, runner.grid)
-            if result == BurstEnd.PYTHON:
-                for source in runner.sources:
-                    source.transfer.step_text(step)
-                runner.instance.do_step(step)
-                self.follow_inputs(runner)
-            else:
-                if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
-                    for source in runner.sources:
-                        source.transfer.check_range(step)
-                if member.kind == StepKind.BY_PYTHON:
-                    raise self._forged(runner)  # it was out of range when the burst has read it
-                cast("StepsNatively", runner.instance).finish(step, member.outcome)
-        except FmuMeshError as error:
-            self._units[unit].stopped = 1
-            runner.is_finite.explain(error)
-            if isinstance(error, TerminationRequested):
-                member.stage = Stage.WAITING
-            raise
-        if floating_point_changed():
-            restore_floating_point()
-        member.stage = Stage.STEPPED
+        if result == BurstEnd.NOT_FINITE:
+            raise runner.is_finite.error(step + 1, runner.grid)
+        if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
+            for source in runner.sources:
+                source.transfer.check_range(step)
+        if member.kind == StepKind.BY_PYTHON:
+            raise self._forged(runner)  # it was out of range when the burst has read it
+        cast("StepsNatively", runner.instance).finish(step, member.outcome)
 
     def _forged(self, runner: Runner) -> ProtocolBroken:
         step, sources = runner.step, runner.sources

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from threading import Lock
 from time import perf_counter
 from typing import Final
@@ -17,7 +18,7 @@ from ..errors import FmuMeshError, ProtocolBroken
 from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
 from ..rings.host_memory import Counter, HostMemory
-from ..rings.native import Stage, table
+from ..rings.native import Stage
 from ..system.plan import NodePlan
 from .stepping import Runner
 
@@ -84,8 +85,12 @@ class Engine(ABC):
         self._last_point = plan.grid.last_point
         self._looked_after: ProcessState | None = None
         self._look_at = 0.0
-        members = [(native.MemberTable * len(unit))() for unit in units]
-        self._units = table(native.UnitTable, list(map(self._unit, units, members)))
+        kinds = [native.MemberTable * len(unit) for unit in units]
+        members = [kind.from_buffer(memory.beside(ctypes.sizeof(kind))) for kind in kinds]
+        of_units = native.UnitTable * max(len(units), 1)
+        self._units = of_units.from_buffer(memory.beside(ctypes.sizeof(of_units)))
+        for number, both in enumerate(zip(units, members, strict=True)):
+            self._units[number] = self._unit(*both)
         for unit, tables in zip(units, members, strict=True):
             for runner, member in zip(unit, tables, strict=True):
                 runner.follow(member, self)
@@ -123,15 +128,29 @@ class Engine(ABC):
 
         The unit of an instance that raised one of them is not stepped any more.
         """
+        self.is_blocked = False
+        with self._looking_after():
+            return self._burst(wait_s, eager=eager, quiet=quiet)
+
+    def step_to(self, point: int) -> None:
+        """Take all steps that end at this point or before, in a process that waits for nobody: point by point.
+
+        So an event ends them as if each instance had been called in its turn; it raises what `run` raises.
+        """
+        with self._looking_after():
+            self._step_to(point)
+
+    @contextmanager
+    def _looking_after(self) -> Iterator[None]:
+        """After some of the steps, and after one that has failed, restore the state of the process."""
         self._looked_after = self._looked_after or ProcessState()
-        looks, self.is_blocked = True, False
+        looks = True
         try:
-            stepped = self._burst(wait_s, eager=eager, quiet=quiet)
+            yield
             looks = perf_counter() >= self._look_at
         finally:
             if looks:
                 self.look_after()
-        return stepped
 
     def look_after(self) -> None:
         """Restore the state of the process, if a model has changed it since the first step."""
@@ -143,6 +162,15 @@ class Engine(ABC):
     @abstractmethod
     def _burst(self, wait_s: float, *, eager: bool, quiet: bool) -> bool:
         """As `run`, which then restores the state of the process."""
+
+    @abstractmethod
+    def _step_to(self, point: int) -> None:
+        """As `step_to`, which then restores the state of the process."""
+
+    @property
+    @abstractmethod
+    def point(self) -> int:
+        """Between calls of `step_to`: the last point that all runners have reached."""
 
     @abstractmethod
     def ring_bell(self) -> None:
@@ -197,12 +225,17 @@ class Engine(ABC):
 class PlainEngine(Engine):
     """Steps in plain Python."""
 
-    def step_to(self, point: int) -> None:
-        """Take all steps that end at this point or before, in a process that waits for nobody."""
+    @property
+    def point(self) -> int:
+        """See `Engine`."""
+        return min(self.covered, self._last_point)
+
+    def _step_to(self, point: int) -> None:
         for unit, place in zip(self.units, self._units, strict=False):
             place.last_tick = point // place.tick_points
-            while place.tick < place.last_tick and not place.stopped:
-                if not self._advance(unit, place, perf_counter()):
+            while (before := place.tick) < place.last_tick and not place.stopped:
+                self._advance(unit, place, perf_counter())
+                if place.tick == before:
                     raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
 
     slice_s = SLICE_S  # every unit has a turn before it is looked at

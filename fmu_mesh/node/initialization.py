@@ -8,7 +8,9 @@ the values of the last one.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
+from typing import NamedTuple
 
 from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, InitializationFailed, ProtocolBroken
@@ -19,7 +21,7 @@ from ..system.algebraic_loop import FixedPoint
 from ..system.feeds import FeedColumn
 from ..system.initialization_plan import Loop
 from ..system.layout import Column
-from ..system.plan import Link, NodePlan
+from ..system.plan import InstancePlan, Link, NodePlan
 from ..variables.value_types import PlainValue, Value, split_element
 from ..wire.frames import initial_values
 from .links import OutLink
@@ -34,6 +36,17 @@ _SWEEP = 1 << 32
 """An INITIAL message has the number `level + sweep * this`."""
 
 Key = tuple[str, str]
+
+
+class _Move(NamedTuple):
+    """How an input gets its initial value: from an output with the column ``column``, or from an element of it."""
+
+    source: str
+    output: str
+    target: str
+    column: Column
+    level: int
+    change: ValueChange
 
 
 class Initialization:
@@ -57,6 +70,16 @@ class Initialization:
             columns = (*own.outputs.columns, *own.initial_outputs.columns)
             self._columns |= {(own.name, column.name): column for column in columns}
             self._levels |= {(own.name, name): level for name, level in own.initialization.items()}
+        self._outputs: dict[tuple[str, int], list[str]] = {}
+        for own in plan.instances:
+            for name, level in own.initialization.items():
+                self._outputs.setdefault((own.name, level), []).append(name)
+        steps = {own.step_points for own in plan.instances}
+        self._stop_times = {points: plan.grid.told_stop_time(points) for points in steps}
+        self._loops = {loop.first: loop for loop in plan.loops}
+        iterated = {level for loop in plan.loops for level in range(loop.first, loop.last + 1)}
+        self._sequence = sorted(({level for _, level in self._outputs} - iterated) | self._loops.keys())
+        self._moves = {own.name: list(map(partial(self._move, own), _columns_of(own))) for own in plan.instances}
         self._known: dict[tuple[str, str, int | None], Value] = {}
         self._settled: set[Key] = set()
         self._parameters: dict[Key, str] = {}
@@ -78,6 +101,8 @@ class Initialization:
     ) -> None:
         """Take all instances through Initialization Mode; afterwards their outputs are those of point 0.
 
+        May be called again for another run, but not after an exception.
+
         Args:
             runners: the instances.
             start_values: by instance and variable, those that are not as in the plan.
@@ -88,26 +113,26 @@ class Initialization:
             FmuError: an FMU refused a value.
             LoopNotConverged: a loop has no consistent values.
         """
-        grid = self._plan.grid
+        start_time = self._plan.grid.start_time
         for runner in runners:
-            stop_time = grid.told_stop_time(runner.plan.step_points)
-            values = {**runner.plan.start_values, **start_values.get(runner.name, {})}
-            runner.instance.enter_initialization(grid.start_time, stop_time, values)
+            own, others = runner.plan.start_values, start_values.get(runner.name)
+            stop_time = self._stop_times[runner.plan.step_points]
+            runner.instance.enter_initialization(start_time, stop_time, {**own, **others} if others else own)
         self._end = self._clock() + self._plan.timeouts.initialize
-        loops = {loop.first: loop for loop in self._plan.loops}
-        iterated = {level for loop in self._plan.loops for level in range(loop.first, loop.last + 1)}
-        plain = {level for runner in runners for level in runner.plan.initialization.values()} - iterated
-        for level in sorted(plain | loops.keys()):
-            if level in loops:
-                self._iterate(loops[level], runners)
+        for level in self._sequence:
+            if level in self._loops:
+                self._iterate(self._loops[level], runners)
             else:
                 for runner in runners:
-                    if names := _outputs_at(runner, level):
+                    if names := self._outputs.get((runner.name, level)):
                         self._set_inputs(runner, level)
                         self._send(runner, level, self._get_outputs(runner, names))
         for runner in runners:
-            self._set_inputs(runner, ENDLESS)
+            if self._moves[runner.name]:
+                self._set_inputs(runner, ENDLESS)
         self.out_links.clear()
+        for values_of_run in (self._known, self._settled, self._parameters):
+            values_of_run.clear()
         for runner in runners:
             runner.instance.exit_initialization()
             runner.bind_again() if again else runner.bind()
@@ -120,7 +145,7 @@ class Initialization:
             (runner, level, names)
             for level in range(loop.first, loop.last + 1)
             for runner in runners
-            if (names := _outputs_at(runner, level))
+            if (names := self._outputs.get((runner.name, level)))
         ]
         consistent = False
         while not consistent:
@@ -152,16 +177,14 @@ class Initialization:
         their values of this sweep.
         """
         values: dict[str, Value] = {}
-        for feed in (*runner.plan.feeds, *runner.plan.parameters):
-            for column in feed.columns:
-                source, target = column.source, column.target
-                level, key = self._levels[feed.source, self._column(feed.source, source).name], (runner.name, target)
-                if point is not None and key in point.assumed:
-                    values[target] = point.assumed[key]
-                elif point is not None and below <= level < within:
-                    values[target] = self._moved(feed.source, column, runner, point.sweeps)
-                elif level < below and key not in self._settled:
-                    values[target] = self._moved(feed.source, column, runner)
+        for move in self._moves[runner.name]:
+            key = runner.name, move.target
+            if point is not None and key in point.assumed:
+                values[move.target] = point.assumed[key]
+            elif point is not None and below <= move.level < within:
+                values[move.target] = self._moved(move, point.sweeps)
+            elif move.level < below and key not in self._settled:
+                values[move.target] = self._moved(move)
         for column in (column for feed in runner.plan.parameters for column in feed.columns):
             if column.target in values and self._has(runner.name, column.target, values[column.target]):
                 del values[column.target]
@@ -174,11 +197,17 @@ class Initialization:
         self._parameters[instance, parameter] = text = repr(value)
         return before == text
 
-    def _moved(self, instance: str, column: FeedColumn, runner: Runner, sweep: int | None = None) -> Value:
-        """The initial value that a connection from ``instance`` gives its input."""
-        input_type = runner.plan.initial_inputs.column(column.target).type
-        change = ValueChange.of_column(instance, runner.name, input_type, column)
-        return change.of(self._element(instance, column.source, sweep), InitializationFailed)
+    def _move(self, own: InstancePlan, source_and_column: tuple[str, FeedColumn]) -> _Move:
+        source, column = source_and_column
+        output = self._column(source, column.source)
+        input_type = own.initial_inputs.column(column.target).type
+        change = ValueChange.of_column(source, own.name, input_type, column)
+        return _Move(source, column.source, column.target, output, self._levels[source, output.name], change)
+
+    def _moved(self, move: _Move, sweep: int | None = None) -> Value:
+        """The initial value that a connection gives its input."""
+        value = element_of(self._value(move.source, move.column.name, sweep), move.column, move.output)
+        return move.change.of(value, InitializationFailed)
 
     def _column(self, instance: str, name: str) -> Column:
         """The column of an output, or of the array that ``name`` is an element of."""
@@ -216,8 +245,9 @@ class Initialization:
                 link.send_initial(level + (sweep or 0) * _SWEEP, values)
 
 
-def _outputs_at(runner: Runner, level: int) -> list[str]:
-    return [name for name, own in runner.plan.initialization.items() if own == level]
+def _columns_of(own: InstancePlan) -> list[tuple[str, FeedColumn]]:
+    """What the inputs and the parameters of an instance are connected to."""
+    return [(feed.source, column) for feed in (*own.feeds, *own.parameters) for column in feed.columns]
 
 
 def _nothing_comes(_left_s: float) -> None:

@@ -13,7 +13,6 @@ from typing import NamedTuple, Protocol, cast
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
 from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
-from ..instances.kept_models import RunsAgain
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -77,11 +76,20 @@ class Runner:
         table: how far it is, which whoever steps it writes, and for the burst how it is stepped.
     """
 
-    def __init__(self, plan: InstancePlan, instance: Instance, grid: TimeGrid, outputs: Ring, counter: Counter) -> None:
+    def __init__(  # noqa: PLR0913  an instance, and where its values are
+        self,
+        plan: InstancePlan,
+        instance: Instance,
+        grid: TimeGrid,
+        outputs: Ring,
+        counter: Counter,
+        *,
+        inputs: Ring | None = None,
+    ) -> None:
         self.plan = plan
         self.name = plan.name
         self.instance = instance
-        self.inputs = Ring(plan.input_row, 1)
+        self.inputs = inputs or Ring(plan.input_row, 1)
         self.outputs = outputs
         self.counter = counter
         self.sources: list[Source] = []
@@ -97,8 +105,7 @@ class Runner:
 
         Between two steps, the row of the last one stays as it is: what was set since then belongs to the next row.
         """
-        connected = [own.target for source in self.sources for own in source.transfer.columns]
-        fill_unconnected(self.inputs, connected, self.instance.get_values)
+        self._fill_unconnected()
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
         slot = self.step & self.outputs.mask
         row = [part[slot].copy() for part in self.outputs.parts] if self.outputs.has_row(self.step) else []
@@ -108,16 +115,20 @@ class Runner:
         self.refit()
 
     def bind_again(self) -> None:
-        """As `bind`, for an instance that has begun another run; see `RunsAgain`."""
+        """As `bind`, for an instance that has begun another run; see `BeginsAgain`."""
         self.outputs.stamps[: self.step + 1] = 0  # of the rows of the run before
+        instance, table = self.instance, self.table
+        if any(column.shape for column in self.inputs.layout.columns):
+            self._fill_unconnected()
+        instance.bind(self.inputs, (self.outputs,), self.grid, self.plan.step_points)
+        own = instance.native if isinstance(instance, AroundNativeSteps) else None
+        table.note(component=None if own is None else own.component, step=0, stage=native.Stage.WAITING, outcome=0)
+        for gate in table.gates[: table.n_gates] if self.sources else ():
+            gate.note(known=0)
+
+    def _fill_unconnected(self) -> None:
         connected = [own.target for source in self.sources for own in source.transfer.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
-        cast("RunsAgain", self.instance).bind_again()
-        own = self.instance.native if isinstance(self.instance, AroundNativeSteps) else None
-        component = own.component if own is not None else None
-        self.table.note(component=component, step=0, stage=native.Stage.WAITING, outcome=0)
-        for gate in self.table.gates[: self.table.n_gates]:
-            gate.note(known=0)
 
     def begin(self) -> None:
         """The outputs after Initialization Mode are complete: row 0.

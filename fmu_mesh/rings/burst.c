@@ -12,7 +12,7 @@
  *   counter_raise                       the one thread that raises this counter
  *   counter_value, bell_seen, sleep_for each participant for itself: one thread that sleeps
  *   grant_withdraw                      the master
- *   copies_*                            the one thread of the copies that they are given
+ *   copies_work, copies_serve           the thread of these copies, which alone calls their FMUs (see Worker)
  *
  * What may go wrong: a peer writes garbage into the memory (a value never comes of it, see Rows), a peer is killed
  * between a value and its bell (a sleeper loses its time limit once), a model changes the floating-point mode (it is
@@ -685,75 +685,115 @@ PUBLIC void node_attend(Node *node) {
 PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 
 /* ---- copies: many systems in this process, each with tables of its own. Nobody else reads their memory, so nothing
- * waits: a unit that lacks a row is a fault of its plan. */
+ * waits: a unit that lacks a row is a fault of its plan. With several threads, each works on a part of the copies; the
+ * first one writes the work, and touches it again when all others are done. */
 
-/* Step a copy to its goal, point by point: so it ends at an event as if each instance had been called in its turn. */
-static int step_copy(Copy *copy) {
-  Node *node = copy->node;
-  for (; copy->point < copy->goal; copy->point++) {
-    for (int64_t i = 0; i < node->n_units; i++) {
-      Unit *unit = &node->units[i];
-      unit->last_tick = unit->tick_points == 1 ? copy->point + 1 : (copy->point + 1) / unit->tick_points;
-      if (unit->stopped || unit->tick >= unit->last_tick) continue;
-      int64_t ticks;
-      int result = advance(node, unit, &ticks);
-      if (result != SLICE) return result;
-      if (unit->tick < unit->last_tick) return BLOCKED;
-    }
+/* Step a copy to its goal. All instances are members of one unit, in the order of the plan: so a copy ends at an event as
+ * if each of them had been called in its turn. Returns a BurstEnd. */
+PUBLIC int64_t step_copy(Copy *copy) {
+  if (copy->point >= copy->goal) return DONE; /* it may have ended, and have no node any more */
+  Unit *unit = copy->node->units;
+  unit->last_tick = unit->burst = copy->goal / unit->tick_points;
+  while (unit->tick < unit->last_tick) {
+    int64_t ticks;
+    const int result = advance(copy->node, unit, &ticks);
+    copy->point = (unit->tick + 1) * unit->tick_points - 1; /* between two ticks, the outputs hold */
+    if (result != SLICE) return result;
+    if (ticks == 0) return BLOCKED;
   }
+  copy->point = copy->goal;
   return DONE;
 }
 
-/* Step copies to their goals; returns how many have ended before. `end` says why, and the node who it is about. */
-PUBLIC int64_t copies_step(Copy *copies, int64_t n) {
+/* Whether a getter, a setter or a function that sets a state could be called. */
+static inline int call_copy(const CopyCall *own, char *values) {
+  int status = own->count < 0 ? ((int (*)(void *, const void *))own->function)(own->component, own->references)
+                              : call_values(own->function, own->component, own->references, own->count, values, own->size);
+  return status <= WARNING && status >= 0;
+}
+
+/* Copy an output from the row at the point of a copy. */
+static inline void read_copy(const Copy *copy, const CopyOutput *output, int64_t size, char *to) {
+  const Member *member = output->member;
+  if (member == NULL) return; /* it could not begin */
+  const Output *own = &member->outputs[0];
+  const int64_t row = member->points == 1 ? copy->point : copy->point / member->points;
+  const char *from = own->rows + (row & own->mask) * own->stride + output->place;
+  if (size == 8)
+    memcpy(to, from, 8);
+  else
+    memcpy(to, from, (size_t)size);
+}
+
+/* Bring a copy back to where it was: each of its FMUs by its state, and memory that was kept. Whether there is that. */
+static inline int restore_copy(const CopyCall *calls, int64_t n_calls, const Keep *pieces, int64_t n_pieces) {
+  if (pieces->kept == NULL) return 0;
+  for (int64_t i = 0; i < n_calls; i++)
+    if (!call_copy(&calls[i], NULL)) return 0;
+  for (int64_t i = 0; i < n_pieces; i++) {
+    int64_t *restrict to = pieces[i].memory;
+    const int64_t *restrict from = pieces[i].kept;
+    for (int64_t left = pieces[i].size; left > 0; left--) *to++ = *from++;
+  }
+  return 1;
+}
+
+/* The copies of one thread. */
+static int64_t work_on(const Work *work, int64_t first, int64_t end) {
   int64_t left = 0;
-  for (int64_t i = 0; i < n; i++) {
-    copies[i].end = step_copy(&copies[i]);
-    left += copies[i].end != DONE;
+  for (int64_t i = first; i < end; i++) {
+    int is_done = 1;
+    if (work->wanted != NULL && !work->wanted[i]) continue;
+    switch (work->kind) {
+      case STEP: is_done = (work->copies[i].end = step_copy(&work->copies[i])) == DONE; break;
+      case CALL: is_done = call_copy(&work->calls[i], work->values + i * work->stride); break;
+      case READ: read_copy(&work->copies[i], &work->reads[i], work->size, work->values + i * work->stride); break;
+      default:
+        is_done = restore_copy(&work->calls[i * work->calls_each], work->calls_each, &work->pieces[i * work->pieces_each],
+                               work->pieces_each);
+    }
+    left += !is_done;
+    if (work->wanted != NULL) work->wanted[i] = !is_done;
   }
   return left;
 }
 
-/* Get or set variables of the copies that `wanted` names (NULL: all), from or to values that are `stride` bytes apart; or
- * set their states. Returns the number of the first copy whose status is above warning; `n` if there is none. */
-PUBLIC int64_t copies_call(const CopyCall *calls, int64_t n, const uint8_t *wanted, char *values,
-                           int64_t stride) {
-  for (int64_t i = 0; i < n; i++) {
-    const CopyCall *own = &calls[i];
-    if (wanted != NULL && !wanted[i]) continue;
-    int status = own->count < 0 ? ((int (*)(void *, const void *))own->function)(own->component, own->references)
-                                : call_values(own->function, own->component, own->references, own->count,
-                                              values + i * stride, own->size);
-    if (status > WARNING || status < 0) return i;
-  }
-  return n;
-}
-
-/* Copy outputs of `size` bytes from the rows at the points of the copies. */
-PUBLIC void copies_read(const Copy *copies, const CopyOutput *outputs, int64_t n, int64_t size, char *to, int64_t stride) {
-  for (int64_t i = 0; i < n; i++) {
-    const Member *member = outputs[i].member;
-    if (member == NULL) continue; /* it could not begin */
-    const Output *own = &member->outputs[0];
-    const int64_t row = member->points == 1 ? copies[i].point : copies[i].point / member->points;
-    const char *from = own->rows + (row & own->mask) * own->stride + outputs[i].place;
-    if (size == 8)
-      memcpy(to + i * stride, from, 8);
-    else
-      memcpy(to + i * stride, from, (size_t)size);
+/* Awake for a while, as another thread is about to raise the counter, and then asleep. */
+static void await_work(const Place *place, Counter *counter, int64_t need) {
+  const int64_t end = now() + YIELD_NS;
+  for (int i = 0; value_of(counter) < need; i++) {
+    if (i < SPINS) {
+      relax();
+    } else if (now() < end) {
+      sched_yield();
+    } else {
+      const uint32_t seen = bell_seen(place);
+      const Wish wish = {counter, need};
+      sleep_on(place, NULL, seen, &wish, 1, 1000000000, NULL);
+    }
   }
 }
 
-/* Bring the `wanted` copies back to where they were: each has some states, one for each FMU, and memory that was kept. Returns
- * the number of the first copy whose FMU refuses its state, or that has none; `n` if there is none. */
-PUBLIC int64_t copies_restore(const CopyCall *states, int64_t n_states, const Keep *keeps, int64_t n_keeps, int64_t n,
-                              const uint8_t *wanted) {
-  for (int64_t i = 0; i < n; i++) {
-    if (!wanted[i]) continue;
-    const CopyCall *own = &states[i * n_states];
-    const Keep *keep = &keeps[i * n_keeps];
-    if (keep->kept == NULL || copies_call(own, n_states, NULL, NULL, 0) < n_states) return i;
-    for (int64_t j = 0; j < n_keeps; j++) memcpy(keep[j].memory, keep[j].kept, (size_t)keep[j].size);
+/* On the first thread: all threads work, and this one waits for the others. Returns how many copies need Python. */
+PUBLIC int64_t copies_work(Worker *workers, int64_t n) {
+  const int64_t number = n > 1 ? value_of(workers->asked) + 1 : 0;
+  int64_t left = 0;
+  if (n > 1) counter_raise(&workers->place, workers->asked, number);
+  if (workers->work->kind != HAND_OVER) left = work_on(workers->work, workers->first, workers->end);
+  for (int64_t i = 1; i < n; i++) {
+    await_work(&workers->place, workers[i].done, number);
+    left += workers[i].left;
   }
-  return n;
+  return left;
+}
+
+/* On each other thread: work, until it is Python's turn there, which then raises `done`. */
+PUBLIC void copies_serve(Worker *own) {
+  for (int64_t number = value_of(own->done);; number++) {
+    counter_raise(&own->place, own->done, number);
+    await_work(&own->place, own->asked, number + 1);
+    const int is_handed_over = own->work->kind == HAND_OVER;
+    if (is_handed_over && own->work->size == own->place.own) return;
+    own->left = is_handed_over ? 0 : work_on(own->work, own->first, own->end);
+  }
 }

@@ -295,11 +295,33 @@ typedef struct { /* an output in the rows of one copy: `place` in bytes */
   int64_t place;
 } CopyOutput;
 
-typedef struct { /* memory of a copy, and what it has to be again */
-  void *memory;
-  const void *kept;
+typedef struct { /* memory of a copy, and what it has to be again; in numbers of eight bytes */
+  int64_t *memory;
+  const int64_t *kept;
   int64_t size;
 } Keep;
+
+enum WorkKind { STEP, CALL, READ, RESTORE, HAND_OVER }; /* Work.kind */
+
+typedef struct { /* what is done with many copies: `wanted` says with which (NULL: all), and then which ones need Python */
+  int64_t kind;
+  Copy *copies;
+  const CopyCall *calls; /* one for each copy; RESTORE: one for each of its FMUs */
+  const CopyOutput *reads;
+  const Keep *pieces; /* RESTORE: so many for each copy */
+  int64_t calls_each, pieces_each; /* of one copy */
+  uint8_t *wanted;
+  char *values;
+  int64_t stride, size; /* from one copy to the next, and of one value; HAND_OVER: `size` is the number of a thread */
+} Work;
+
+typedef struct { /* a thread of copies: it calls the FMUs of those from `first` to `end`, and nobody else does */
+  Place place;
+  Counter *asked, *done; /* works that the first thread has begun, and that this one has done */
+  Work *work;
+  int64_t first, end;
+  int64_t left; /* how many copies of the last one need Python */
+} Worker;
 
 enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* why node_run returns */
 

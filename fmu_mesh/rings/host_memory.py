@@ -13,6 +13,7 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
 
@@ -48,6 +49,8 @@ __all__ = ["ONE_CORE", "Counter", "HostMemory", "Offer", "Wish", "can_share"]
 _NAME: Final = "fmu_mesh"
 _TOKEN_BYTES: Final = 16
 _ZERO: Final = bytes(8)
+_LINE: Final = 64
+_PRIVATE: Final = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
 
 ONE_CORE: Final = not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
 """Whether the process that somebody waits for cannot run meanwhile."""
@@ -75,7 +78,9 @@ class HostMemory:
     Make it with `create`, `opened` or `private`.
     """
 
-    def __init__(self, memory: mmap.mmap, map_: MemoryMap, process: str, descriptor: int | None = None) -> None:
+    def __init__(
+        self, memory: mmap.mmap | memoryview, map_: MemoryMap, process: str, descriptor: int | None = None
+    ) -> None:
         self.map = map_
         self._memory = memory
         self._descriptor = descriptor
@@ -87,6 +92,7 @@ class HostMemory:
         self.progress = {
             name: self.counter(offset) for name, offset in zip(map_.processes, map_.progress, strict=False)
         }
+        self._beside = self._view[map_.size :]
         self._lock = threading.Condition()
         self._rung = False
 
@@ -107,12 +113,25 @@ class HostMemory:
         return made
 
     @classmethod
-    def private(cls, map_: MemoryMap, process: str) -> Self:
-        """Make memory for this process alone; pages that nobody touches take no space."""
-        memory = mmap.mmap(-1, map_.size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        made = cls(memory, map_, process)
+    def private(cls, map_: MemoryMap, process: str, room: memoryview | None = None) -> Self:
+        """Make memory for this process alone, in a room of zeros if there is one; untouched pages take no space."""
+        made = cls(mmap.mmap(-1, map_.size, _PRIVATE) if room is None else room, map_, process)
         made._prepare()
         return made
+
+    @staticmethod
+    def rooms(map_: MemoryMap, count: int, beside: int) -> list[memoryview]:
+        """Rooms for so many memories with one map, side by side, with so many bytes for `beside`.
+
+        With pages of their own, the same counter of all would be in the same few lines of the processor's caches, and
+        each in another page. The distance of two is an odd number of lines, so that they use all of these.
+        """
+        size = (-(-(map_.size + beside) // _LINE) | 1) * _LINE
+        memory = mmap.mmap(-1, count * size, _PRIVATE)
+        if hasattr(mmap, "MADV_HUGEPAGE"):
+            with suppress(OSError):  # the kernel has none
+                memory.madvise(mmap.MADV_HUGEPAGE)
+        return [memoryview(memory)[first : first + size] for first in range(0, count * size, size)]
 
     @classmethod
     def opened(cls, offer: Offer, map_: MemoryMap, process: str) -> Self | None:
@@ -157,6 +176,14 @@ class HostMemory:
     def ring(self, place: RingPlace) -> Ring:
         """The ring of an instance; text is beside it, in this process."""
         return Ring(place.layout, place.rows, self._view[place.offset :])
+
+    def beside(self, size: int) -> memoryview:
+        """Zeros for a table or a row that nobody shares: in the room of this memory, while there is some left."""
+        size = -(-size // _LINE) * _LINE
+        if size > len(self._beside):
+            return memoryview(bytearray(size))
+        taken, self._beside = self._beside[:size], self._beside[size:]
+        return taken
 
     def withdraw_grant(self) -> int:
         """Of shared memory: take the grant back, and return a point that no node passes before the next grant."""

@@ -63,6 +63,9 @@ __all__ = [
     "Track",
     "UnitTable",
     "Wish",
+    "WorkKind",
+    "WorkTable",
+    "WorkerTable",
     "library",
     "table",
 ]
@@ -118,6 +121,12 @@ class BurstEnd(IntEnum):
     """Why `node_run` returned."""
 
     SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE = range(8)
+
+
+class WorkKind(IntEnum):
+    """What is done with many copies."""
+
+    STEP, CALL, READ, RESTORE, HAND_OVER = range(5)
 
 
 NUMBER_TYPES: Final[dict[VariableType, int]] = {
@@ -415,6 +424,16 @@ class Keep(Structure):
 @_declared("CopyOutput")
 class CopyOutput(Structure):
     """An output in the rows of one copy."""
+
+
+@_declared("Work")
+class WorkTable(_Changed):
+    """What is done with many copies."""
+
+
+@_declared("Worker")
+class WorkerTable(Structure):
+    """A thread of copies."""
 
 
 class NativeStep(NamedTuple):

@@ -5,8 +5,11 @@ all of them. Owns how far each copy is, how each has ended, and where their valu
 mistyped: `fmu_mesh.api.batch` checks them.
 """
 
-# Threads: the one that made the copies calls all FMUs (ADR 12). The library releases the lock of the interpreter while
-# it steps, so other threads of the program go on; they may look at nothing here.
+# Threads: all calls come from the one that made the copies. It calls the FMUs (ADR 12), or several threads do, of
+# which each has a part of the copies, and extracts the FMUs for itself, so the variables of a library belong to one
+# thread; what instances share beyond that is a claim on the process, and then there is one thread only. What is below
+# as a call for `CopyThreads.each` runs on the thread of its copy, while this one waits. The library releases the lock
+# of the interpreter while it steps, so other threads of the program go on; they may look at nothing here.
 #
 # A step of an FMU that does not return cannot be ended: the process is the user's. Ctrl-C ends a call between two
 # pieces of it, so all copies are at one point then.
@@ -18,13 +21,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from ..errors import FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
+from ..errors import CallRefused, FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
 from ..instances.call_guard import Unwatched
 from ..instances.contract import ChangesProcess, Instance, LogMessage
 from ..instances.kept_models import SharedModels
@@ -32,13 +35,16 @@ from ..instances.registry import open_instance
 from ..node.burst_engine import BurstEngine
 from ..node.inputs import TimedInputs
 from ..rings import native
-from ..rings.native import BurstEnd
+from ..rings.host_memory import HostMemory
+from ..rings.native import BurstEnd, WorkKind
+from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace, map_memory
-from ..system.plan import Plan
+from ..system.plan import NodePlan, Plan
 from ..system.process_sharing import SharedProcess
 from ..text import listed
 from ..variables.value_types import is_text
 from .copy_pieces import Pieces
+from .copy_threads import CopyThreads
 from .hosted_system import IN_ONE_NODE, HostedSystem, in_one_node
 from .local_system import opening_of
 from .one_process import claims_in
@@ -61,23 +67,30 @@ class Copies:
         count: how many copies.
         folder: an existing private folder; FMUs are extracted below it.
         log: called with every log message of a model.
+        threads: how many threads call the FMUs.
 
     Attributes:
         points: the last point that all instances of a copy have reached, shape (count,).
         errors: how copies have ended before the stop time, by their numbers.
     """
 
-    def __init__(self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None]) -> None:
+    def __init__(
+        self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None], threads: int = 1
+    ) -> None:
         self.errors: dict[int, FmuMeshError] = {}
         self._run = run
         self._plan = plan = in_one_node(run.plan, window=1)
         self._node = plan.nodes[IN_ONE_NODE]
         self._last = plan.grid.last_point
         self._places = _rings_of(plan)
-        self._folder, self._log = folder, log
-        self._models = SharedModels(folder)
+        self._rooms = HostMemory.rooms(self._places[0], count, _bytes_beside(self._node))
+        self._log = log
         self._copies: list[SystemCopy] = []
         self._table = (native.CopyTable * count)()
+        self._several = threads > 1
+        self._threads = CopyThreads(self._table, threads)
+        folders = [folder / f"thread{number}" for number in range(len(self._threads.parts))]
+        self._models = [(own, SharedModels(own)) for own in folders]
         numbers: NDArray[np.int64] = np.frombuffer(memoryview(self._table), np.int64).reshape(count, -1)
         self.points, self._goals, self._ends = numbers[:, 1], numbers[:, 2], numbers[:, 3]
         self._ended = np.zeros(count, np.bool_)
@@ -87,8 +100,9 @@ class Copies:
         self._accesses: dict[tuple[str, Verb, tuple[str, ...]], Any] = {}
         self._columns: dict[tuple[str, str], Any] = {}
         self._first: dict[int, SavedCopy] = {}
+        self._first_kept = b""
         self._back: _WaysBack | None = None
-        self._threads = ExitStack()
+        self._limits = ExitStack()
         self._pieces = Pieces()
 
     def start(self, ready: Callable[[int], None] = lambda _count: None) -> None:
@@ -99,17 +113,25 @@ class Copies:
 
         Raises:
             NotInOneProcess: copies of an instance cannot share a process.
+            CallRefused: the models share something that several threads cannot use.
             FmuError: an instance cannot be opened or initialized.
         """
         self._check_sharing()
-        self._threads.enter_context(one_thread_meanwhile())
+        for folder, _ in self._models:
+            folder.mkdir()
+        self._limits.enter_context(one_thread_meanwhile())
         for number in range(len(self._table)):
-            self._copies.append(SystemCopy(self._system))
-            self._begin(number, {}, is_new=False)
+            self._copies.append(SystemCopy(partial(self._system, number)))
+            self._threads.each([number], partial(self._begin, overrides={}, is_new=False))
             ready(number + 1)
         runners = self._copies[0].runners
+        if self._several and any(
+            isinstance(own.instance, ChangesProcess) and own.instance.changes_process for own in runners.values()
+        ):
+            text = "copies cannot be stepped by several threads, because a step of an FMU may change the process"
+            raise CallRefused(text, hint="Use one thread.")
         self._timed = [name for name, own in runners.items() if isinstance(own.instance, TimedInputs)]
-        self._threads.enter_context(one_thread_meanwhile())  # with the libraries that components have imported
+        self._limits.enter_context(one_thread_meanwhile())  # with the libraries that components have imported
 
     @property
     def ended(self) -> Truths:
@@ -122,34 +144,26 @@ class Copies:
 
         What an FMU raises is in `errors`, and ends its copy at the last point that all its instances have reached.
         """
-        if self._pieces.step(points, is_asked, self.step_piece):
-            self.take_care()
+        if self._pieces.step(points, is_asked, self._step_piece):
+            for copy in self._copies:
+                copy.take_care()
 
-    def step_piece(self, points: int) -> None:
-        """As `step`, for who looks after the state of the process."""
+    def _step_piece(self, points: int) -> None:
         np.minimum(self.points + points, self._last, out=self._goals)
         if self.errors:
             np.copyto(self._goals, self.points, where=self._ended)
         if native.library is None:
             for number, copy in enumerate(self._copies):
-                self._end_of(number, partial(copy.step_to, int(self._goals[number])))
-                self.points[number] = copy.point
+                self._end_of(number, partial(copy.engine.step_to, int(self._goals[number])))
+                self.points[number] = copy.engine.point
             return
-        while native.library.copies_step(ctypes.addressof(self._table), len(self._table)):
-            for number in np.flatnonzero(self._ends != BurstEnd.DONE).tolist():
-                copy, end = self._copies[number], int(self._ends[number])
-                self._end_of(number, partial(copy.complete, end))
+        while self._threads.work(WorkKind.STEP, wanted=None):
+            self._threads.each(np.flatnonzero(self._ends != BurstEnd.DONE).tolist(), self._complete)
 
-    def take_care(self) -> None:
-        """Steps have changed the state of the process: from now on, each one is looked after."""
-        for copy in self._copies:
-            copy.take_care()
-
-    @property
-    def changes_process(self) -> bool:
-        """Whether a step may change the state of the process."""
-        runners = self._copies[0].runners.values()
-        return any(isinstance(own.instance, ChangesProcess) and own.instance.changes_process for own in runners)
+    def _complete(self, number: int) -> None:
+        self._end_of(
+            number, partial(cast("BurstEngine", self._copies[number].engine).complete, int(self._ends[number]))
+        )
 
     def _end_of(self, number: int, call: Callable[[], object]) -> None:
         """Make a call for a copy; what it raises ends the copy."""
@@ -157,12 +171,12 @@ class Copies:
             call()
         except (FmuError, TerminationRequested) as error:
             point = int(self.points[number])
-            if error.point is None:
-                begun = self._copies[number].begun_at(error) if isinstance(error, FmuError) else point
-                error.at(begun, self._plan.grid.time(begun))
+            self._copies[number].located(error, point)
             self.errors[number] = error
             self._ended[number] = True
             self._goals[number] = point
+            if self._back is not None:
+                self._back.forget(number)
 
     # --- values
 
@@ -220,27 +234,12 @@ class Copies:
         )
 
     def _call(self, accesses: Any, values: NDArray[Any], wanted: Truths, otherwise: Callable[[int], None]) -> None:  # noqa: ANN401  an array of ctypes
-        """Get or set through the library; copies for which it cannot, or fails, one by one."""
-        count, number = len(self._copies), 0
-        if accesses is None or native.library is None:
-            for number in np.flatnonzero(wanted).tolist():
-                otherwise(number)
-            return
-        every = np.ascontiguousarray(wanted).view(np.uint8)
-        stride, size = values.strides[0], ctypes.sizeof(native.CopyCall)
-        while True:
-            left = count - number
-            number += native.library.copies_call(
-                ctypes.addressof(accesses) + number * size,
-                left,
-                every[number:].ctypes.data,
-                values.ctypes.data + number * stride,
-                stride,
-            )
-            if number >= count:
+        """Get or set through the library; copies for which it cannot, or fails, one by one: ``wanted`` are these."""
+        if accesses is not None and native.library is not None:
+            calls, own, to = ctypes.addressof(accesses), wanted.ctypes.data, values.ctypes.data
+            if not self._threads.work(WorkKind.CALL, calls=calls, wanted=own, values=to, stride=values.strides[0]):
                 return
-            otherwise(number)
-            number += 1
+        self._threads.each(np.flatnonzero(wanted).tolist(), otherwise)
 
     def _access(self, instance: str, verb: Verb, names: tuple[str, ...]) -> Any:  # noqa: ANN401  an array of ctypes
         """How the library gets or sets variables of all copies; None if it cannot."""
@@ -255,9 +254,8 @@ class Copies:
         if key not in self._columns:
             columns = [copy.column(*key) for copy in self._copies]
             self._columns[key] = native.table(native.CopyOutput, columns)
-        assert native.library is not None
-        table, columns = ctypes.addressof(self._table), self._columns[key]
-        native.library.copies_read(table, columns, len(self._copies), size, out.ctypes.data, out.strides[0])
+        reads, to = ctypes.addressof(self._columns[key]), out.ctypes.data
+        self._threads.work(WorkKind.READ, reads=reads, wanted=None, values=to, stride=out.strides[0], size=size)
 
     # --- states
 
@@ -278,24 +276,28 @@ class Copies:
         """
         saved: list[SavedCopy] = []
         try:
-            for number, copy in enumerate(self._copies):
-                saved.append(copy.save(int(self.points[number])))
+            every = range(len(self._copies))
+            self._threads.each(every, lambda number: saved.append(self._copies[number].save(int(self.points[number]))))
         except BaseException:
             self.free(saved)
             raise
         return saved
 
     def restore(self, saved: Sequence[SavedCopy], wanted: Truths) -> None:
-        """Bring the ``wanted`` copies back to what was saved of them."""
-        numbers = np.flatnonzero(wanted).tolist()
-        for number in numbers:
-            self._end_of(number, partial(self._copies[number].restore, saved[number]))
+        """Bring the ``wanted`` copies back to what was saved of them.
+
+        What an FMU raises is in `errors`, and ends its copy.
+        """
+
+        def one(number: int) -> None:
             self._back_at(number, saved[number].point)
+            self._end_of(number, partial(self._copies[number].restore, saved[number]))
+
+        self._threads.each(np.flatnonzero(wanted).tolist(), one)
 
     def free(self, saved: Sequence[SavedCopy]) -> None:
         """Free saved copies, in the order of the copies."""
-        for copy, own in zip(self._copies, saved, strict=False):
-            copy.free(own)
+        self._threads.each(range(len(saved)), lambda number: self._copies[number].free(saved[number]))
 
     def reset(self, wanted: Truths, overrides: Callable[[int], Overrides] | None = None) -> None:
         """Bring the ``wanted`` copies back to point 0: they are as new ones.
@@ -309,117 +311,156 @@ class Copies:
         """
         rest = wanted
         if overrides is None and self._back is not None:
-            rest = wanted & ~self._back.restore(wanted & ~self._ended)
-            self._back_at(wanted & ~rest, 0)
-        for number in np.flatnonzero(rest).tolist():
-            copy, first = self._copies[number], self._first.pop(number, None)
-            if first is not None:
-                copy.free(first)
-            if self._back is not None:
-                self._back.forget(number)
-            self._ended[number] = True
-            own = overrides(number) if overrides is not None else {}
-            try:
-                self._begin(number, own, is_new=number in self.errors)
-            except FmuError as error:
-                self.errors[number] = error
-                raise
-            if overrides is None and self.why_not_saved is None:
-                self._note_first(number)
+            for name in self._is_set:
+                np.copyto(self._set_at[name], -1, where=wanted)
+            if (left := self._back.restore(wanted)) is None:
+                return
+            rest = left
+        self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
+
+    def _reset(self, overrides: Callable[[int], Overrides] | None, number: int) -> None:
+        """Make a copy as a new one."""
+        copy, first = self._copies[number], self._first.pop(number, None)
+        if first is not None:
+            copy.free(first)
+        if self._back is not None:
+            self._back.forget(number)
+        self._ended[number] = True
+        own = overrides(number) if overrides is not None else {}
+        try:
+            self._begin(number, own, is_new=number in self.errors)
+        except FmuError as error:
+            self.errors[number] = error
+            raise
+        if overrides is None and self.why_not_saved is None:
+            self._note_first(number)
 
     def _note_first(self, number: int) -> None:
         """A copy is at its first point, and may come back there."""
-        self._first[number] = first = self._copies[number].save(0)
+        first = self._copies[number].save(0)
+        if first.kept == self._first_kept:  # as in most copies: then it is once in the processor's caches
+            first = first._replace(kept=self._first_kept)
+        self._first[number], self._first_kept = first, first.kept
         by_calls = self._copies[number].restored_by(first)
         if by_calls is not None and native.library is not None:
-            calls, keeps = by_calls
-            self._back = self._back or _WaysBack(len(self._copies), len(calls), len(keeps))
-            self._back.note(number, *by_calls)
+            calls, pieces = by_calls
+            self._back = self._back or _WaysBack(self._threads, self._table, len(calls), len(pieces))
+            self._back.note(number, calls, pieces)
 
     def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
         copy = self._copies[number]
-        copy.begin(overrides, is_new=is_new)
+        try:
+            copy.begin(overrides, is_new=is_new)
+        finally:  # without instances, nothing can be read
+            for own, columns in self._columns.items():
+                columns[number] = copy.column(*own)
         if isinstance(copy.engine, BurstEngine):
-            self._table[number] = copy.engine.as_copy()
+            self._table[number] = copy.engine.copy
         for key, accesses in self._accesses.items():
             if accesses is not None and (access := copy.access(*key)) is not None:
                 accesses[number] = access
-        for own, columns in self._columns.items():
-            columns[number] = copy.column(*own)
         self._back_at(number, 0)
 
-    def _back_at(self, which: Truths | int, point: int) -> None:
-        """Copies are at a point, or one is."""
-        for number in [which] if isinstance(which, int) else np.flatnonzero(which).tolist() if self.errors else ():
-            self.errors.pop(number, None)
-        self._ended[which] = False
-        self.points[which] = self._goals[which] = point
+    def _back_at(self, number: int, point: int) -> None:
+        """A copy is at a point, and has not ended."""
+        self.errors.pop(number, None)
+        self._ended[number] = False
+        self.points[number] = self._goals[number] = point
         for steps in self._set_at.values():
-            steps[which] = -1
+            steps[number] = -1
 
     def close(self) -> None:
         """Close all instances and free all models. Never raises; may be called twice."""
-        for number, own in self._first.items():
-            self._copies[number].free(own)
-        self._first.clear()
-        for copy in self._copies:
-            copy.close()
-        self._models.close()
+        first, self._first = self._first, {}
+        self._threads.each([*first], lambda number: self._copies[number].free(first[number]))
+        self._threads.each(range(len(self._copies)), lambda number: self._copies[number].close())
+        for thread, (_, models) in enumerate(self._models):
+            self._threads.on(thread, models.close)
+        self._models.clear()
+        self._copies.clear()
+        self.end_threads()
+        self._limits.close()
+
+    def end_threads(self) -> None:
+        """End the threads that were started here, from any thread; after that, only `close` is allowed."""
         self._threads.close()
 
     def _check_sharing(self) -> None:
         process, claims_of = SharedProcess(), claims_in(self._plan)
+        why = [reason for name in self._plan.order for reason in claims_of(name)] if self._several else []
+        if why:
+            raise CallRefused(f"copies cannot be stepped by several threads, where {why[0]}", hint="Use one thread.")
         for copy in ("", " of another copy")[: len(self._table)]:
             for name in self._plan.order:
-                if (why := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:
+                if (refusal := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:
                     raise NotInOneProcess(
-                        why, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
+                        refusal, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
                     )
 
-    def _system(self) -> HostedSystem:
+    def _system(self, number: int) -> HostedSystem:
         """The system of one copy; this object looks after the state of the process."""
-        return HostedSystem(self._plan, Unwatched(), self._opened, self._log, alone=True, places=self._places)
+        room, opened = self._rooms[number], partial(self._opened, self._threads.part_of(number))
+        if number < len(self._copies):  # it had another system
+            room[:] = bytes(len(room))
+        return HostedSystem(self._plan, Unwatched(), opened, self._log, alone=True, places=self._places, room=room)
 
-    def _opened(self, name: str) -> Instance:
-        opening = opening_of(self._plan, name, self._folder, self._log, self._run.showing)
-        return open_instance(replace(opening, content=self._run.contents.get(name), kept=self._models))
+    def _opened(self, thread: int, name: str) -> Instance:
+        folder, models = self._models[thread]
+        opening = opening_of(self._plan, name, folder, self._log, self._run.showing)
+        return open_instance(replace(opening, content=self._run.contents.get(name), kept=models))
 
 
 class _WaysBack:
     """How the library brings copies back to their first point.
 
     Args:
-        count: how many copies there are.
+        threads: of the copies.
+        copies: their tables.
         states: how many FMUs a copy has.
-        keeps: how many pieces of memory.
+        pieces: how many pieces of memory.
     """
 
-    def __init__(self, count: int, states: int, keeps: int) -> None:
-        self._count, self._sizes = count, (states, keeps)
-        self._calls = (native.CopyCall * (count * states))()
-        self._keeps = (native.Keep * (count * keeps))()
-        self._known = np.zeros(count, np.bool_)
+    def __init__(self, threads: CopyThreads, copies: Any, states: int, pieces: int) -> None:  # noqa: ANN401  an array of ctypes
+        self._threads, self._copies = threads, copies
+        self._sizes = states, 1 + pieces
+        self._calls = (native.CopyCall * (len(copies) * states))()
+        self._pieces = (native.Keep * (len(copies) * (1 + pieces)))()
+        self._zeros = (ctypes.c_int64 * 2)()
 
-    def note(self, number: int, calls: list[native.CopyCall], keeps: list[native.Keep]) -> None:
+    def note(self, number: int, calls: list[native.CopyCall], pieces: list[native.Keep]) -> None:
         """From now on, a copy comes back by these."""
-        states, pieces = self._sizes
+        states, size = self._sizes
+        point = ctypes.addressof(self._copies[number]) + native.CopyTable.point.offset  # and the goal is beside it
         self._calls[number * states : (number + 1) * states] = calls
-        self._keeps[number * pieces : (number + 1) * pieces] = keeps
-        self._known[number] = True
+        self._pieces[number * size : (number + 1) * size] = [
+            native.Keep(point, ctypes.addressof(self._zeros), 2),
+            *pieces,
+        ]
 
     def forget(self, number: int) -> None:
-        """A copy is made anew."""
-        self._known[number] = False
+        """A copy has ended, or is made anew."""
+        self._pieces[number * self._sizes[1]] = native.Keep()
 
-    def restore(self, wanted: Truths) -> Truths:
-        """Bring those back that it knows of ``wanted``; which ones are there."""
-        assert native.library is not None
-        back: Truths = wanted & self._known
-        (states, keeps), every = self._sizes, back.view(np.uint8)
-        addresses = ctypes.addressof(self._calls), states, ctypes.addressof(self._keeps), keeps
-        reached = native.library.copies_restore(*addresses, self._count, every.ctypes.data)
-        back[reached:] = False
-        return back
+    def restore(self, wanted: Truths) -> Truths | None:
+        """Bring those of ``wanted`` back that it knows; which ones are left, if any."""
+        left = wanted.copy()
+        (calls, pieces), (calls_each, pieces_each) = (self._calls, self._pieces), self._sizes
+        if self._threads.work(
+            WorkKind.RESTORE,
+            calls=ctypes.addressof(calls),
+            calls_each=calls_each,
+            pieces=ctypes.addressof(pieces),
+            pieces_each=pieces_each,
+            wanted=left.ctypes.data,
+        ):
+            return left
+        return None
+
+
+def _bytes_beside(node: NodePlan) -> int:
+    """Enough for what the engine of a copy has beside its rings: its tables, and the inputs."""
+    lines = ctypes.sizeof(native.UnitTable) + sum(row_bytes(item.input_row) + 64 for item in node.instances) + 128
+    return lines + len(node.instances) * ctypes.sizeof(native.MemberTable)
 
 
 def _rings_of(plan: Plan) -> tuple[MemoryMap, Mapping[str, RingPlace]]:

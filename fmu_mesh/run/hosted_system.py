@@ -12,6 +12,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from ..errors import FmuError, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, Unwatched
 from ..instances.contract import Instance, LogMessage
 from ..instances.process_state import ProcessState
@@ -22,6 +23,7 @@ from ..node.inputs import with_times
 from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
+from ..rings.ring import Ring
 from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace
 from ..system.plan import Plan, make_plan
@@ -40,10 +42,11 @@ _WIDE_ROW_BYTES = 2**20
 class HostedSystem:
     """The instances of a plan in one node of this process, with their rings and the engine that steps them.
 
-    Call sequence, on one thread: `open`, `begin`, steps of the engine; then `end`, and `open` again if that returned
-    True; at last, and after any exception, `close`. Each run has new instances, or those that were reset, as the model
-    of an instance is kept (`fmu_mesh.instances.kept_models`). The first run looks after each call of an FMU; the state
-    of the process is then looked after once in each later run, and the floating-point mode still after each call.
+    Call sequence, on one thread: `open`, `begin`, steps of the engine by `Engine.step_to`; then `end`, and `open` again
+    if that returned True; at last, and after any exception, `close`. Each run has new instances, or those that were
+    reset, as the model of an instance is kept (`fmu_mesh.instances.kept_models`). The first run looks after each call
+    of an FMU; the state of the process is then looked after once in each later run, and the floating-point mode still
+    after each call.
 
     Args:
         plan: a plan of `in_one_node`.
@@ -53,6 +56,7 @@ class HostedSystem:
         alone: whether nothing else in this process changes its state between the runs, so that it is looked after as
             between steps: several times a second, and not once in each run.
         places: where the rings are in memory, if not as in the plan.
+        room: memory of zeros for them; None: memory of its own.
 
     Attributes:
         plan: the plan.
@@ -69,11 +73,12 @@ class HostedSystem:
         *,
         alone: bool,
         places: tuple[MemoryMap, Mapping[str, RingPlace]] | None = None,
+        room: memoryview | None = None,
     ) -> None:
         self.plan = plan
         self.node = node = plan.nodes[IN_ONE_NODE]
         map_, self._places = places or (node.memory, {place.instance: place for place in node.rings})
-        self.memory = HostMemory.private(map_, IN_ONE_NODE)
+        self.memory = HostMemory.private(map_, IN_ONE_NODE, room)
         self.runners: dict[str, Runner] = {}
         self.loads = True
         self._watch = watch
@@ -82,7 +87,8 @@ class HostedSystem:
         self._engine: Engine | None = None
         self._alone = alone
         self._state: ProcessState | None = None
-        self._begins_again = True
+        self._begins_again, self._names = True, ", ".join(plan.order)
+        self._initialization = Initialization(node)
 
     def open(self) -> None:
         """Open all instances; after `end`, they begin again.
@@ -94,7 +100,7 @@ class HostedSystem:
             self._state = None if self._alone else ProcessState()
             self.memory.begin_again()
             for instance in self._instances:
-                instance.run_again()
+                instance.begin_again()
             return
         node = self.node
         for item in node.instances:
@@ -103,8 +109,9 @@ class HostedSystem:
             place = self._places[item.name]
             ring, counter = self.memory.ring(place), self.memory.counter(place.counter)
             timed = with_times(instance, item, node.grid, self._log)
-            self._begins_again = self._begins_again and timed is instance and instance.runs_again
-            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter)
+            self._begins_again = self._begins_again and timed is instance
+            inputs = Ring(item.input_row, 1, self.memory.beside(row_bytes(item.input_row)))
+            self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
         connect(node, self.runners, self.memory, self.memory)
 
     def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:
@@ -117,22 +124,30 @@ class HostedSystem:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
-        Initialization(node).run(self.runners.values(), start_values, again=engine is not None)
+        self._initialization.run(self.runners.values(), start_values, again=engine is not None)
         if engine is None:
-            units = [[self.runners[name] for name in names] for names in node.units]
+            units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
         else:
             engine.begin_again(self._state)
         for runner in self.runners.values():
             runner.begin()
+        self.memory.grant.raise_to(self.plan.grid.last_point)
         return engine
+
+    def located(self, event: FmuError | TerminationRequested, point: int) -> None:
+        """Tell where a step that ended with this began: an instance with a step size of its own, before ``point``."""
+        if event.point is None:
+            runner = self.runners.get(event.instance or "") or (self._engine.current if self._engine else None)
+            begun = runner.point if isinstance(event, FmuError) and runner is not None else point
+            event.at(begun, self.plan.grid.time(begun))
 
     def end(self) -> bool:
         """After the last point: end the run of all instances, and keep what the next one needs; whether that works."""
-        if not self._begins_again:
+        if not self._begins_again or not all(instance.runs_again for instance in self._instances):
             return False
         state = self._state or (None if self._alone else ProcessState())
-        with self._watch.surviving(", ".join(self.plan.order)):
+        with self._watch.surviving(self._names):
             ended = [instance.end_run() for instance in reversed(self._instances)]
         self.loads = not all(ended) or (state is not None and state.restore())
         return not self.loads

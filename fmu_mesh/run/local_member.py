@@ -60,8 +60,9 @@ class LocalMember:
 
     def begin_again(self, plan: Plan, name: str) -> bool:
         """Be as a new one, with the start values of a plan; False if the instance cannot be, and has to be closed."""
-        if not self.instance.begin_again():
+        if not self.instance.end_run():
             return False
+        self.instance.begin_again()
         self.plan = plan.nodes[plan.node_of(name)].instance(name)
         self.step, self._set_at = 0, -1
         self.settled.clear()

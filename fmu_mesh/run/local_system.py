@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
@@ -26,7 +27,7 @@ from ..rings.value_change import ValueChange
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
-from ..variables.value_types import Value
+from ..variables.value_types import PlainValue, Value
 from .local_member import LocalMember, SavedMember, element_at
 from .run_plan import opening_in
 from .threads import LimitedThreads
@@ -64,12 +65,18 @@ class LocalSystem:
         self._kept: dict[int, SavedSystem] = {}
         self._threads = LimitedThreads()
 
-    def start(self, open_instance: Callable[[str], Guarded], plan: Plan | None = None) -> None:
+    def start(
+        self,
+        open_instance: Callable[[str], Guarded],
+        plan: Plan | None = None,
+        start_values: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
+    ) -> None:
         """Open all instances and initialize them; then they are at point 0. Those of before are closed first.
 
         Args:
             open_instance: opens an instance by name; it is closed here.
             plan: replaces that of before; it has the same instances, with other start values.
+            start_values: by instance and variable, those that are not as in the plan.
 
         Raises:
             FmuError: an instance cannot be opened or initialized.
@@ -88,7 +95,7 @@ class LocalSystem:
                 self._members = before | members
             self._members = members
             self._limit_threads()  # with the libraries that a component has imported
-            self._initialize()
+            self._initialize(start_values)
         self._steps = tuple((name, member.step_from) for name, member in self._members.items())
         self._looked_after = tuple((name, partial(self._look_after, step)) for name, step in self._steps)
 
@@ -217,11 +224,12 @@ class LocalSystem:
         for name, own in saved.members.items():
             self._members[name].instance.free_state(own.state)
 
-    def _initialize(self) -> None:
+    def _initialize(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> None:
         grid, members = self._grid, self._members
         for member in members.values():
             stop_time = grid.told_stop_time(member.plan.step_points)
-            member.instance.enter_initialization(grid.start_time, stop_time, member.plan.start_values)
+            values = {**member.plan.start_values, **start_values.get(member.plan.name, {})}
+            member.instance.enter_initialization(grid.start_time, stop_time, values)
         levels = self._plan.initialization.levels
         known: dict[tuple[str, str], Value] = {}
         loops = iter((*self._plan.initialization.loops, None))

@@ -27,7 +27,7 @@ from ..instances.registry import check_showing, claims, content, describe, expec
 from ..results.formats import check_record, warn_of_endings
 from ..results.keys_file import KEYS_ENDING, keys_beside, recorded_keys
 from ..ros_wire.key_messages import check_messages
-from ..system.plan import make_plan
+from ..system.plan import Plan, make_plan
 from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
 from ..system.run_metadata import configuration_of
@@ -196,28 +196,44 @@ def planned(
 
 
 class OtherStartValues:
-    """Start values of further runs of a plan that change nothing else of it.
+    """Decides whether start values of a further run, or of a reset, change nothing else of its plan.
 
-    That is so if each is a finite number or a truth value for a scalar variable that is no structural parameter, if it
-    replaces another start value of the plan, and if the plan uses start values for nothing else: no loop is iterated in
-    Initialization Mode, and there is no scenario, no input with a timeout or a key. The files of the models have to be
-    as they were when the run was planned.
+    That is so if each is a value of a variable that is no structural parameter and has another start value in the plan,
+    and if the plan uses start values for nothing else: no loop is iterated in Initialization Mode, there is no
+    scenario, and the instance has no input with a timeout or a key. The files of the models have to be as they were
+    when the run was planned, unless nothing is loaded again.
+
+    Args:
+        run: the run.
+        plan: plans it again for a reset, with these start values besides; None: from the configuration of the run.
+        loads: whether models may be loaded again.
+
+    Attributes:
+        run: the run.
     """
 
-    def __init__(self, run: RunPlan) -> None:
-        plan = run.plan
-        items = [item for node in plan.nodes.values() for item in node.instances]
-        is_fixed = plan.initialization.loops or any(item.scenario or item.timeouts or item.keys_in for item in items)
-        self._variables: dict[str, Variable] = {}
-        for item in items if not is_fixed else ():
-            description = plan.system.instances[item.name].description
-            for name in item.start_values:
+    def __init__(
+        self,
+        run: RunPlan,
+        plan: Callable[[Mapping[str, PlainValue]], RunPlan] | None = None,
+        *,
+        loads: bool = True,
+    ) -> None:
+        self.run, self._plan_again = run, plan or self._planned
+        self._resets: dict[frozenset[str], OtherStartValues] = {}
+        items = [item for node in run.plan.nodes.values() for item in node.instances]
+        system = run.plan.system
+        is_fixed = run.plan.initialization.loops or system.config.scenario is not None
+        self._variables: dict[str, tuple[str, Variable, bool]] = {}
+        for item in items if not (is_fixed or any(item.scenario for item in items)) else ():
+            description, finite = system.instances[item.name].description, item.not_finite == "stop"
+            for name in item.start_values if not (item.timeouts or item.keys_in) else ():
                 variable = description.variable(name)
-                if variable is not None and not variable.shape and variable.causality != "structuralParameter":
-                    self._variables[f"{item.name}.{name}"] = variable
-        paths = [Path(item.fmu) for item in items]
-        self._archives = [path for path in paths if path.suffix == ".fmu" and path.is_file()]
-        self._models = [(path, item.section, run.contents[item.name]) for path, item in zip(paths, items, strict=True)]
+                if variable is not None and variable.causality != "structuralParameter":
+                    self._variables[f"{item.name}.{name}"] = item.name, variable, finite
+        loaded = items if loads else []
+        self._models = [(Path(item.fmu), item.section, run.contents[item.name]) for item in loaded]
+        self._archives = [path for path, _, _ in self._models if path.suffix == ".fmu" and path.is_file()]
         self._versions = [files.version_at(path) for path in self._archives]
         if not self._are_as_planned(self._models):
             self._variables.clear()
@@ -231,18 +247,39 @@ class OtherStartValues:
         """
         found = dict[str, dict[str, PlainValue]]()
         for path, value in start_values.items():
-            variable = self._variables.get(path)
-            if variable is None or not isinstance(value, float | int):
+            if (known := self._variables.get(path)) is None:
                 return None
+            instance, variable, finite = known
             try:
-                plain = to_plain(to_value(value, variable, finite=True))
+                plain = to_plain(to_value(value, variable, finite=finite))
             except ValueRefused:
                 return None
-            found.setdefault(path[: -len(variable.name) - 1], {})[variable.name] = plain
+            found.setdefault(instance, {})[variable.name] = plain
         with suppress(OSError):
             if [files.version_at(path) for path in self._archives] == self._versions:
                 return found if self._are_as_planned(self._models) else None
         return None
+
+    def of_reset(self, start_values: Mapping[str, PlainValue]) -> tuple[Plan, Mapping[str, Mapping[str, PlainValue]]]:
+        """The plan of a reset of the run to these start values, and those that the plan has not.
+
+        It is planned once for the same variables, if that is enough.
+
+        Raises:
+            ConfigurationError: a start value is wrong, or changes the size of an array; carries all findings.
+        """
+        if not start_values:
+            return self.run.plan, {}
+        before = self._resets.get(names := frozenset(start_values))
+        if before is not None and (values := before.taken(start_values)) is not None:
+            return before.run.plan, values
+        again = self._plan_again(start_values)
+        check_reset(self.run, again)
+        self._resets[names] = OtherStartValues(again, loads=False)
+        return again.plan, {}
+
+    def _planned(self, start_values: Mapping[str, PlainValue]) -> RunPlan:
+        return planned_reset(self.run, start_values, 0, KnownModels.of(self.run))
 
     @staticmethod
     def _are_as_planned(models: Sequence[tuple[Path, InstanceSection, str]]) -> bool:

@@ -1,14 +1,14 @@
 """Runs of a mesh in this process, one after another: `launch --local`, sweeps, optimizers and calibration.
 
-The instances of a run are stepped as those of one node, in bursts, and their rows go from the rings to the result files
-as those of a recorder do. So a short run takes less than a millisecond, and its floats are those of `LocalSystem`.
-Between two runs there are no instances, but the libraries of their models stay loaded
-(`fmu_mesh.instances.kept_models`), and so does what the runs of one plan share (`fmu_mesh.run.hosted_system`).
+The instances of a run are stepped as one copy of a batch is (`fmu_mesh.run.copies`), and their rows go from the rings
+to the result files as those of a recorder do. So a short run takes less than a millisecond, and its floats, and where
+it ends, are those of `LocalSystem`. Between two runs there are no instances, but the libraries of their models stay
+loaded (`fmu_mesh.instances.kept_models`), and so does what the runs of one plan share (`fmu_mesh.run.hosted_system`).
 """
 
-# Threads: that of the runs calls FMUs, and nobody else does (ADR 12). `interrupt` comes from any thread and rings the
-# bell of the engine, so that a wait for the wall clock or a burst ends. The thread of `CallWatch` takes a hang: the
-# thread of the runs is inside an FMU then and changes nothing, so the rows can be saved from outside.
+# Threads: that of the runs calls FMUs, and nobody else does (ADR 12). `interrupt` comes from any thread, and ends a
+# wait for the wall clock, or the run after the steps of about a millisecond. The thread of `CallWatch` takes a hang:
+# the thread of the runs is inside an FMU then and changes nothing, so the rows can be saved from outside.
 
 from __future__ import annotations
 
@@ -26,26 +26,16 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from ..config.mesh import TimeoutsConfig
-from ..errors import (
-    ConfigurationError,
-    FmuError,
-    FmuMeshError,
-    Interrupted,
-    NotFinite,
-    ProtocolBroken,
-    TerminationRequested,
-)
+from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, TerminationRequested
 from ..instances.call_guard import CallWatch
 from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..node.engine import Engine
+from ..node.engine import SLICE_S, Engine
 from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
-from ..rings import native
-from ..rings.host_memory import HostMemory
 from ..system.plan import Plan
 from ..variables.value_types import PlainValue
 from .hosted_system import HostedSystem, in_one_node
@@ -62,8 +52,7 @@ log = logging.getLogger(__name__)
 
 _SCRATCH = "scratch"
 _WRITE_ROWS = 2048
-# After this time without a step, the deadline of a step is looked at.
-_LONGEST_SLEEP_S = 0.5
+_MANY_POINTS = 1 << 16
 
 
 class RepeatedRuns:
@@ -268,16 +257,16 @@ class _Run:
 
     def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings) -> None:
         self.point = 0
-        self._system, self._plan, self._node = system, system.plan, system.node
-        self._runners = system.runners
+        self._system, self._plan = system, system.plan
         self._last = self._plan.grid.last_point
         self.writer = writer
         self._around = surroundings
         self._stop: str | None = None
+        self._stopping = threading.Event()
         self._seconds = 0.0
         self._engine: Engine | None = None
+        self._asked: TerminationRequested | None = None
         self._end: Outcome | None = None
-        self._first: tuple[tuple[int, int], FmuError | TerminationRequested] | None = None
 
     @property
     def names(self) -> str:
@@ -287,7 +276,7 @@ class _Run:
     @property
     def timeouts(self) -> TimeoutsConfig:
         """The deadlines."""
-        return self._node.timeouts
+        return self._system.node.timeouts
 
     def run(
         self, start_values: Mapping[str, Mapping[str, PlainValue]], watch: CallWatch, threads: LimitedThreads
@@ -302,29 +291,30 @@ class _Run:
             threads.limit(self._around.models.loads)  # with the libraries that a component has imported
             stack.callback(self.writer.close)  # before the instances are closed
             self._engine = engine = system.begin(start_values)
-            self.writer.begin(self._plan, self._runners)
+            self.writer.begin(self._plan, system.runners)
             stack.callback(self._write_rest, engine)
             started = time.perf_counter()
-            with watch.stepping(self._position, self._node.timeouts.step):
-                self._step_to_the_end(engine, system.memory)
+            try:
+                with watch.stepping(self._position, self.timeouts.step):
+                    self._step_to_the_end(engine)
+            except TerminationRequested as asked:
+                self._asked = asked
             self._seconds = time.perf_counter() - started
-            if self._first is not None and isinstance(self._first[1], FmuError):
-                raise self._first[1]
         return self._outcome()
 
     def _outcome(self) -> Outcome:
         """How a run ended that did not fail."""
         if self._end is not None:
             return self._end
-        writer, end = self.writer, self._first[1] if self._first is not None else None
-        files, warnings = writer.counted, writer.warnings
-        self._end = outcome_at(self._plan, self.point, files, None, end, seconds=self._seconds, warnings=warnings)
+        files, warnings = self.writer.counted, self.writer.warnings
+        own = self._plan, self.point, files, None, self._asked
+        self._end = outcome_at(*own, seconds=self._seconds, warnings=warnings)
         return self._end
 
     def _leave(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
         """Keep the system for the next run, if this one has come to its last point."""
         try:
-            if error is not None or self._first is not None or not self._system.end():
+            if error is not None or self._asked is not None or not self._system.end():
                 self._system.close()
         finally:
             self._engine = None  # not before: an FMU that does not return even now is told with the point
@@ -338,60 +328,37 @@ class _Run:
     def interrupt(self, reason: str) -> None:
         """From any thread: see `RepeatedRuns.interrupt`."""
         self._stop = reason
-        if (engine := self._engine) is not None:
-            engine.ring_bell()
+        self._stopping.set()
 
-    def _step_to_the_end(self, engine: Engine, memory: HostMemory) -> None:
-        """Grant points, step and write rows; rows that are not written yet are never overwritten."""
-        writer, window = self.writer, self._plan.window
+    def _step_to_the_end(self, engine: Engine) -> None:
+        """Take steps and write rows; rows that are not written yet are never overwritten."""
+        writer, window, most = self.writer, self._plan.window, 1
         pacer = Pacer(self._plan, self._plan.system.config.simulation.real_time_factor)
         pacer.start(0)
         many = max(1, min(_WRITE_ROWS, window // 2))
-        stepped_at = time.monotonic()
         while True:
-            self.point = point = min(engine.covered, self._last)
+            self.point = point = engine.point
             writer.write(point + 1, many)
             self._around.progress(point)
             if self._stop is not None:
-                raise Interrupted(self._stop, point=point, time=self._node.grid.time(point))
-            before = self._plan.order[: self._first[0][1]] if self._first is not None else ()
-            late = any(self._runners[name].covered <= self._last for name in before)
-            if point >= self._last and not late:
+                raise Interrupted(self._stop, point=point, time=self._plan.grid.time(point))
+            if point >= self._last:
                 return
-            granted, pause_s = pacer.limit(min(self._last + late, writer.written - 1 + window), point)
-            memory.grant.raise_to(granted)
-            try:
-                stepped = engine.run(min(pause_s, _LONGEST_SLEEP_S), eager=True)
-            except (FmuError, TerminationRequested) as event:
-                self._end_at(event, engine, memory)
+            granted, pause_s = pacer.limit(min(self._last, writer.written - 1 + window), point)
+            if granted <= point:
+                self._stopping.wait(pause_s)
                 continue
-            if stepped or granted <= point:
-                stepped_at = time.monotonic()
-            elif time.monotonic() - stepped_at > self._node.timeouts.step:
-                raise ProtocolBroken(f"no instance can step from point {point}, although point {granted} is granted")
-
-    def _end_at(self, event: FmuError | TerminationRequested, engine: Engine, memory: HostMemory) -> None:
-        """The run ends at the point of ``event``, unless another instance ends it before: all others go on to there.
-
-        Within a burst, an instance is ahead of those behind it; point by point, the first event would end the run. So
-        instances before it in the order also take the step in which it came, in which they may end the run themselves.
-        """
-        runner = self._runners.get(event.instance or "") or engine.current
-        if runner is None:
-            raise event
-        point = runner.covered
-        if not isinstance(event, NotFinite):
-            begun = runner.point if isinstance(event, FmuError) else point
-            event.at(begun, self._node.grid.time(begun))
-        for member in next(unit for unit in engine.units if runner in unit):
-            member.stop()
-        place = point, self._plan.order.index(runner.name)
-        if self._first is None or place < self._first[0]:
-            self._first = place, event
-            self._last = point
-            if native.library is not None:
-                memory.withdraw_grant()
-            memory.grant.raise_to(point)
+            started = time.perf_counter()
+            try:
+                engine.step_to(min(granted, point + most))
+            except (FmuError, TerminationRequested) as event:
+                self._system.located(event, engine.point)
+                raise
+            took_s = time.perf_counter() - started
+            if took_s < SLICE_S / 2 and granted >= point + most:
+                most = min(2 * most, _MANY_POINTS)
+            elif took_s > 2 * SLICE_S:
+                most = max(1, most // 2)
 
     def _position(self) -> tuple[str, int, str]:
         """See `CallWatch.stepping`; between two steps, the answer changes all the time."""
@@ -400,7 +367,7 @@ class _Run:
 
     def _write_rest(self, engine: Engine) -> None:
         """However the run ends: write the rows that are complete."""
-        self.point = min(engine.covered, self._last)
+        self.point = engine.point
         self.writer.write(self.point + 1, 1)
 
     def save(self, error: FmuMeshError) -> None:
@@ -409,7 +376,7 @@ class _Run:
         if engine is not None:
             runner = engine.current
             point, covered = (runner.point, runner.covered) if runner is not None else (self.point, self.point)
-            error.at(point, self._node.grid.time(point))
+            error.at(point, self._plan.grid.time(point))
             with suppress(FmuMeshError):  # the process ends now for another reason
                 self.writer.write(min(self.writer.complete, covered, self._last) + 1, 1)
         with suppress(FmuMeshError):

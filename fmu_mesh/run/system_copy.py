@@ -12,14 +12,12 @@ from typing import Any, Literal, NamedTuple, cast
 
 from numpy.typing import NDArray
 
-from ..errors import FmuError, FmuMeshError, ProtocolBroken
+from ..errors import FmuError, FmuMeshError, TerminationRequested
 from ..instances.contract import AccessedNatively, KeepsState, StepsNatively
-from ..node.burst_engine import BurstEngine
-from ..node.engine import Engine, PlainEngine
+from ..node.engine import Engine
 from ..node.inputs import TimedInputs, set_input
 from ..node.stepping import Runner
 from ..rings import native
-from ..rings.native import BurstEnd
 from ..variables.value_types import PlainValue, Value
 from .hosted_system import HostedSystem
 
@@ -70,28 +68,10 @@ class SystemCopy:
             self._system.close()
             self._system = self._made()
             raise
-        self._system.memory.grant.raise_to(self._system.plan.grid.last_point)
 
-    @property
-    def point(self) -> int:
-        """Without the library: the last point that all instances have reached."""
-        return min(self.engine.covered, self._system.plan.grid.last_point)
-
-    def step_to(self, goal: int) -> None:
-        """Without the library: step to a point."""
-        for point in range(self.point, goal):
-            cast("PlainEngine", self.engine).step_to(point + 1)
-
-    def complete(self, end: int) -> None:
-        """Let Python complete a step for which the library has returned ``end``."""
-        if end == BurstEnd.BLOCKED:
-            raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
-        cast("BurstEngine", self.engine).complete(end)
-
-    def begun_at(self, error: FmuError) -> int:
-        """The point at which the step began that has failed."""
-        runner = self.runners.get(error.instance or "") or self.engine.current
-        return runner.point if runner is not None else 0
+    def located(self, event: FmuError | TerminationRequested, point: int) -> None:
+        """See `HostedSystem`."""
+        self._system.located(event, point)
 
     def take_care(self) -> None:
         """Steps have changed the state of the process."""
@@ -158,7 +138,10 @@ class SystemCopy:
             part[...] = kept
 
     def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep]] | None:
-        """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept."""
+        """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept.
+
+        It is a state of point 0: of the outputs there is one row, and steps write the others before they are read.
+        """
         calls = []
         for name, keeper in self._keepers():
             call = keeper.state_access(saved.states[name]) if isinstance(keeper, AccessedNatively) else None
@@ -167,9 +150,10 @@ class SystemCopy:
             calls.append(call)
         if any(len(_texts(runner)) for runner in self.runners.values()):
             return None
+        rows = {own.outputs.address: own.outputs.stride for own in self.runners.values()}
         keeps, kept = [], ctypes.cast(ctypes.c_char_p(saved.kept), ctypes.c_void_p).value or 0
         for address, size in self._spans():
-            keeps.append(native.Keep(address, kept, size))
+            keeps.append(native.Keep(address, kept, rows.get(address, size) // 8))
             kept += size
         return calls, keeps
 

@@ -116,7 +116,14 @@ def test_no_instance_is_opened_again(name: str, tmp_path: Path) -> None:
 def test_an_fmu_that_cannot_be_reset_gets_new_instances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LoadedFmu, "reset", lambda _model: False)
     with System(plan_of(tmp_path, integrators(), ["first.y -> second.u"])) as system:
-        expected, opened, loaded = rows_of(system), system._guards["first"], system._models.loads
+        expected, loaded, made = rows_of(system), system._models.loads, list[bool]()
+        instantiate = LoadedFmu.instantiate
+
+        def counting(model: LoadedFmu, **arguments: object) -> None:
+            made.append(not model.has_instance)
+            instantiate(model, **arguments)
+
+        monkeypatch.setattr(LoadedFmu, "instantiate", counting)
         for values in (None, {"first.k": 2.0}, None):
             system.set("first.u", 5.0)
             system.step(3)
@@ -124,7 +131,8 @@ def test_an_fmu_that_cannot_be_reset_gets_new_instances(tmp_path: Path, monkeypa
             if not values:
                 assert rows_of(system) == expected
 
-        assert (system._guards["first"] is opened, system._models.loads) == (False, loaded)
+        assert made == [True] * 6  # two instances, three times
+        assert system._models.loads == loaded
 
 
 def integrators() -> dict[str, Any]:

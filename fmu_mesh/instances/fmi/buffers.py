@@ -46,7 +46,7 @@ class NumberBuffer:
             self._memory[:] = np.asarray(elements, dtype=np.bool_) ^ (self._signs < 0)
             return
         self._memory[:] = elements
-        if not self._is_boolean and (self._memory != elements).any() and self._memory.dtype.kind == "i":
+        if self._memory.dtype.kind == "i" and not self._is_boolean and (self._memory != elements).any():
             raise OverflowError(f"a value is out of the range of {self._memory.dtype}")
         if self._signs is not None:
             self._memory[:] = self._signed(self._memory)

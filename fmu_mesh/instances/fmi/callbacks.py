@@ -57,18 +57,19 @@ class _Message(ctypes.Structure):
 
 
 _by_address: dict[int, Logged] = {}
-_registered: dict[int, tuple[bytes, Logged]] = {}
-"""Names and instances, by the identity of the instance."""
+_registered: dict[int, tuple[bytes, Logged, list[int]]] = {}
+"""Names, instances and their addresses, by the identity of the instance."""
 
 
 def register(name: str, instance: Logged, environment: int) -> None:
     """Messages with the address ``environment``, or of the instance called ``name``, go to ``instance`` from now on."""
-    _registered[id(instance)] = name.encode(), instance
+    _registered[id(instance)] = name.encode(), instance, [environment]
     _by_address[environment] = instance
 
 
 def register_component(component: int, instance: Logged) -> None:
-    """Messages with the address ``component`` also go to ``instance``."""
+    """Messages with the address ``component`` also go to a registered ``instance``."""
+    _registered[id(instance)][2].append(component)
     _by_address[component] = instance
 
 
@@ -76,9 +77,9 @@ def unregister(instance: Logged) -> None:
     """Discard messages of ``instance`` from now on; tell how many were only counted."""
     recall()  # or another instance would get them later
     tell_counted(instance)
-    _registered.pop(id(instance), None)
-    for address in [address for address, one in tuple(_by_address.items()) if one is instance]:
-        del _by_address[address]
+    for address in _registered.pop(id(instance), (b"", instance, []))[2]:
+        if _by_address.get(address) is instance:
+            del _by_address[address]
 
 
 def fmi2_callbacks(environment: int) -> fmi2.fmi2CallbackFunctions:
@@ -111,8 +112,8 @@ def tell_counted(instance: Logged) -> None:
 
 def _receivers(address: int | None, name: bytes | None) -> list[Logged]:
     addressed, everyone = _by_address.get(address or 0), tuple(_registered.values())
-    named = [instance for own, instance in everyone if own == name]
-    return [addressed] if addressed is not None else named or [one for _, one in everyone]
+    named = [instance for own, instance, _ in everyone if own == name]
+    return [addressed] if addressed is not None else named or [one for _, one, _ in everyone]
 
 
 def _pass_on(passed: Any) -> None:  # noqa: ANN401 ctypes has no type for a pointer

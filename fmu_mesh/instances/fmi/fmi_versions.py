@@ -12,13 +12,20 @@ import numpy as np
 from ...variables.value_types import Value
 from ..call_guard import call_named
 from .callbacks import FMI1_CALLBACKS, FMI3_LOGGER, fmi2_callbacks
-from .calls import checked_function
+from .calls import cffi_function, checked_function
 from .fmu_instance import FmuInstance
-from .fmu_values import ValueFunctions
+from .fmu_values import WARNING, ValueFunctions
 
 __all__ = ["Fmi1", "Fmi2", "Fmi3"]
 
 _TERMINATE: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)
+_MODES: Final = {
+    "fmi2SetupExperiment": "int (*)(void *, int, double, double, int, double)",
+    "fmi2EnterInitializationMode": "int (*)(void *)",
+    "fmi2ExitInitializationMode": "int (*)(void *)",
+    "fmi2Terminate": "int (*)(void *)",
+}
+"""Functions of FMI 2.0 that each run calls, and their C types."""
 
 
 class Fmi1(FmuInstance):
@@ -74,6 +81,7 @@ class Fmi2(FmuInstance):
     VALUES = ValueFunctions("fmi2", np.intc, sized=False)
     NAMES: Final = {
         "instantiate": "fmi2Instantiate",
+        "instantiate_again": "fmi2Instantiate",
         "getFMUState": "fmi2GetFMUstate",
         "setFMUState": "fmi2SetFMUstate",
         "freeFMUState": "fmi2FreeFMUstate",
@@ -92,13 +100,28 @@ class Fmi2(FmuInstance):
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(callbacks=fmi2_callbacks(id(self._model)), **arguments)
+        self._modes = {name: cffi_function(getattr(self._fmu.dll, name), own) for name, own in _MODES.items()}
 
     def _enter_initialization(self, start_time: float, stop_time: float | None, start_values: dict[str, Value]) -> None:
         """FMI 2.0, 2.1.6 and 4.2.1."""
-        times = {"startTime": start_time, "stopTime": stop_time}
-        self._checked(lambda: self._fmu.setupExperiment(tolerance=self._tolerance(), **times))
+        tolerance = self._tolerance()
+        bound = (0, 0.0) if tolerance is None else (1, tolerance)
+        end = (0, 0.0) if stop_time is None else (1, stop_time)
+        self._change_mode("fmi2SetupExperiment", *bound, start_time, *end)
         self.set_values(start_values)
-        self._checked(self._fmu.enterInitializationMode)
+        self._change_mode("fmi2EnterInitializationMode")
+
+    def _exit_initialization(self) -> None:
+        self._change_mode("fmi2ExitInitializationMode")
+
+    def _terminate(self) -> None:
+        status = call_named("fmi2Terminate", self._modes["fmi2Terminate"], self._self)
+        if status > WARNING:
+            self._note(status)
+
+    def _change_mode(self, name: str, *arguments: float) -> None:
+        if (status := call_named(name, self._modes[name], self._self, *arguments)) > WARNING:
+            raise self._failed(name, status=status)
 
 
 class Fmi3(FmuInstance):

@@ -6,7 +6,6 @@ A version of FMI (`fmi_versions`) adds how an instance is made and initialized, 
 
 from __future__ import annotations
 
-import ctypes
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,9 +28,9 @@ from ..contract import LogMessage
 from ..instance_wrapper import of_kind, packed, unpacked
 from ..kept_models import KeptModels
 from .archive.system_libraries import missing_libraries
-from .buffers import BinaryBuffer, Buffer
+from .buffers import Buffer
 from .callbacks import recall, register, register_component, tell_counted, unregister
-from .calls import RowPointers, cffi_function, declared, memory, pointer
+from .calls import Function, RowPointers, cffi_function, pointer
 from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
 from .step_options import StepOptions, Terms
@@ -73,6 +72,8 @@ class _Transfer(NamedTuple):
     variables: Sequence[Variable]
     names: Sequence[str]
     buffer: Buffer
+    arguments: tuple[Any, ...]  # see `ValueFunctions.arguments`
+    is_plain: bool  # whether none of them is an array
 
 
 class FmuInstance(ABC):
@@ -83,7 +84,7 @@ class FmuInstance(ABC):
 
     _functions: FmuFunctions  # those of this version of FMI and this kind of FMU
 
-    _component: int  # the address of the instance, for functions called through ctypes; ``_self`` is the same for cffi
+    _component = 0  # the address of the instance, for functions called through ctypes; ``_self`` is the same for cffi
 
     _solver = ""  # what the error of a solver begins with
 
@@ -112,7 +113,7 @@ class FmuInstance(ABC):
         self._live = False
         self._was_reset = False
         self._keep: list[object] = []
-        self._known_functions: dict[tuple[Verb, VariableType], Callable[..., int]] = {}
+        self._known_functions: dict[tuple[Verb, VariableType], Function] = {}
         self._describe(description)
         prefix = self._functions.values.prefix
         # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
@@ -149,7 +150,8 @@ class FmuInstance(ABC):
         Binary values may be base64 as in a configuration.
         """
         self._check_live()
-        self._describe(self.description.sized(start_values))
+        if self._functions.values.sized:  # FMI 3.0 alone has arrays
+            self._describe(self.description.sized(start_values))
         values = {name: to_value(value, self._variables[name]) for name, value in start_values.items()}
         self._enter_initialization(start_time, stop_time, values)
         self._state = "initialization"
@@ -164,17 +166,23 @@ class FmuInstance(ABC):
         """Set variables by name."""
         self._check_live()
         for part in self._transfers(values):
-            elements = [e for v in part.variables for e in flattened(values[v.name], len(v.shape))]
+            if part.is_plain:
+                elements = [values[name] for name in part.names]
+            else:
+                elements = [e for v in part.variables for e in flattened(values[v.name], len(v.shape))]
             self._load(part.buffer, elements, part.names)
-            self._transfer("Set", part.type, part.variables, part.buffer)
+            self._transfer("Set", part)
 
     def get_values(self, names: Sequence[str]) -> list[Value]:
         """Current values of variables by name."""
         self._check_live()
         values: dict[str, Value] = {}
         for part in self._transfers(names):
-            self._transfer("Get", part.type, part.variables, part.buffer)
+            self._transfer("Get", part)
             elements, first = self._elements(part.buffer, part.names), 0
+            if part.is_plain:
+                values.update(zip(part.names, elements, strict=True))
+                continue
             for variable in part.variables:
                 values[variable.name] = nested(elements[first : first + variable.size], variable.shape)
                 first += variable.size
@@ -277,10 +285,15 @@ class FmuInstance(ABC):
 
     def _instantiate(self, **arguments: object) -> None:
         """Make the instance with these arguments for FMPy, unless one was reset; look up what the steps need."""
+        self._make(**arguments)
+
+    def _make(self, **arguments: object) -> None:
+        """Make the instance; without arguments, with those of the last one."""
         register(self.name, self, id(self._model))
         self._model.instantiate(**arguments)
-        self._component = self._fmu.component
-        self._self = pointer(self._component)
+        if self._component != self._model.component:
+            self._component = self._model.component
+            self._self = pointer(self._component)
         if not self._functions.values.sized:  # FMI 3.0 passes no component to its logger
             register_component(self._component, self)
 
@@ -439,7 +452,7 @@ class FmuInstance(ABC):
             variables = [self._variables[column.name] for column in part.columns]
             array, offset = ring.parts[number], ring.offsets[number]
             is_direct = functions.is_direct(part.type, variables)
-            references = (ctypes.c_uint * len(variables))(*(variable.value_reference for variable in variables))
+            buffer = None if is_direct else functions.buffer(part.type, variables)
             calls.append(
                 PartCall(
                     type=part.type,
@@ -448,9 +461,9 @@ class FmuInstance(ABC):
                     base=base,
                     place=ring.address + offset if base == RowBase.FIXED else offset,
                     sizes=(part.width,) if functions.sized else (),
-                    buffer=None if is_direct else functions.buffer(part.type, variables),
-                    function=cffi_function(self._function(verb, part.type), functions.declaration),
-                    references=memory(references),
+                    buffer=buffer,
+                    function=self._function(verb, part.type),
+                    arguments=functions.arguments(variables, buffer),
                     rows=RowPointers(array.ctypes.data, array.strides[0]),
                 )
             )
@@ -466,7 +479,7 @@ class FmuInstance(ABC):
                 self._call_part("Set", part, slot)
             else:
                 self._load(part.buffer, part.array[slot], part.names)
-                self._transfer("Set", part.type, part.variables, part.buffer)
+                self._transfer("Set", part)
 
     def _read_outputs(self, step: int) -> None:
         """Write the outputs to row ``step``, call by call."""
@@ -475,13 +488,12 @@ class FmuInstance(ABC):
             if part.buffer is None:
                 self._call_part("Get", part, slot)
             else:
-                self._transfer("Get", part.type, part.variables, part.buffer)
+                self._transfer("Get", part)
                 part.array[slot] = self._elements(part.buffer, part.names)
 
     def _call_part(self, verb: Verb, part: PartCall, slot: int) -> None:
         """Call a function of the FMU on the memory of a ring."""
-        arguments = self._self, part.references, len(part.variables), part.rows[slot], *part.sizes
-        status = call_named(_DOING[verb], part.function, *arguments)
+        status = call_named(_DOING[verb], part.function, self._self, *part.arguments, part.rows[slot], *part.sizes)
         if status > WARNING:
             raise self._part_failed(verb, part, status)
 
@@ -491,31 +503,24 @@ class FmuInstance(ABC):
             return self._failed(_DOING[verb], status=status)
         return self._transfer_failed(verb, part.type, part.variables, status)
 
-    def _transfer(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> None:
-        """Call the getter or setter of a type for some variables, once."""
-        status = call_named(self._function_name(verb, type_), self._call, verb, type_, variables, buffer)
-        if status > WARNING:
-            raise self._transfer_failed(verb, type_, variables, status)
-
-    def _call(self, verb: Verb, type_: VariableType, variables: Sequence[Variable], buffer: Buffer) -> int:
-        count, key = len(variables), (verb, type_)
-        references = (ctypes.c_uint * count)(*[variable.value_reference for variable in variables])
-        values = [buffer.sizes_address, buffer.address] if isinstance(buffer, BinaryBuffer) else [buffer.address]
-        if self._functions.values.sized:
-            values.append(sum(variable.size for variable in variables))
-        function = self._known_functions.get(key) or self._known_functions.setdefault(key, self._function(verb, type_))
-        return function(self._component, ctypes.addressof(references), count, *values)
+    def _transfer(self, verb: Verb, part: _Transfer | PartCall) -> None:
+        """Call the getter or setter of a type for some variables, once, on the memory of their buffer."""
+        function, name = self._function(verb, part.type), self._function_name(verb, part.type)
+        if (status := call_named(name, function, self._self, *part.arguments)) > WARNING:
+            raise self._transfer_failed(verb, part.type, part.variables, status)
 
     def _function_name(self, verb: Verb, type_: VariableType) -> str:
         """The name of a getter or setter, for errors."""
         functions = self._functions.values
         return functions.prefix + functions.name(verb, type_)
 
-    def _function(self, verb: Verb, type_: VariableType) -> Callable[..., int]:
+    def _function(self, verb: Verb, type_: VariableType) -> Function:
+        if (known := self._known_functions.get((verb, type_))) is not None:
+            return known
         functions = self._functions.values
-        name = self._symbols + functions.name(verb, type_)
-        function: Callable[..., int] = declared(self._fmu.dll, name, functions.prototype(type_))
-        return function
+        found = getattr(self._fmu.dll, self._symbols + functions.name(verb, type_))
+        made = self._known_functions[verb, type_] = cffi_function(found, functions.declaration(type_))
+        return made
 
     def _transfer_failed(
         self, verb: Verb, type_: VariableType, variables: Sequence[Variable], status: int
@@ -552,7 +557,10 @@ class FmuInstance(ABC):
         found = []
         for type_, members in groups.items():
             variables = [self._variables[name] for name in members]
-            found.append(_Transfer(type_, variables, members, self._functions.values.buffer(type_, variables)))
+            functions, is_plain = self._functions.values, not any(variable.shape for variable in variables)
+            buffer = functions.buffer(type_, variables)
+            arguments = functions.arguments(variables, buffer)
+            found.append(_Transfer(type_, variables, members, buffer, arguments, is_plain))
         if len(self._known_transfers) >= _MOST_KNOWN:
             self._known_transfers.clear()
         self._known_transfers[key] = found

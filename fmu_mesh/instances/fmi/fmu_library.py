@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from copy import copy
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -27,6 +27,7 @@ __all__ = ["MISSING", "FmuLibrary", "calling"]
 MISSING: Final = 999
 """Our own status of a function that the library of an FMU does not have."""
 
+_NOT_MADE: Final = "Failed to instantiate model"  # in the words of FMPy
 _ABSENT: Final = ctypes.CFUNCTYPE(ctypes.c_int)
 _DEEP_BINDING: Final = getattr(os, "RTLD_DEEPBIND", 0)
 _RTLD_DI_LINKMAP: Final = 2
@@ -131,6 +132,8 @@ class FmuLibrary(_Library):
 class _LoadedBefore:
     """Goes before FMPy's class of an FMU, which loads the library again: that gives the same one."""
 
+    made_by: Callable[[], object]  # what FMPy has called last to make an instance
+
     def __init__(self, library: FmuLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
         self._library = library
         self.environment = environment
@@ -142,6 +145,12 @@ class _LoadedBefore:
         other = copy(self)
         vars(other).update(environment=environment, component=None)
         return other
+
+    def instantiate_again(self) -> None:
+        """As FMPy's `instantiate` of FMI 2.0 the last time; there, to make the arguments takes most of the time."""
+        self.component = self.made_by()
+        if self.component is None:
+            raise RuntimeError(_NOT_MADE)
 
     @property
     def dll(self) -> FmuLibrary:
@@ -157,6 +166,7 @@ def calling(fmpy_class: type[Any]) -> type[Any]:
     """FMPy's class for the functions of an FMU, as one that takes ``library``, and ``environment`` for FMI 3.0."""
     functions = inspect.getmembers(fmpy_class, inspect.isfunction)
     ours = {name: _with_environment(one) for name, one in functions if name.startswith("fmi3Instantiate")}
+    ours |= {name: _remembered(one) for name, one in functions if name == "fmi2Instantiate"}
     return type(fmpy_class.__name__, (_LoadedBefore, fmpy_class), ours)
 
 
@@ -167,6 +177,17 @@ def _with_environment(function: Callable[..., object]) -> Callable[..., object]:
     @wraps(function)  # FMPy finds the types of C in the signature
     def called(self: _LoadedBefore, *given: object) -> object:
         return function(self, *given[: place - 1], self.environment, *given[place:])
+
+    return called
+
+
+def _remembered(function: Callable[..., object]) -> Callable[..., object]:
+    """A function of FMPy that makes an instance, which can be called again as the last time."""
+
+    @wraps(function)  # as above
+    def called(self: _LoadedBefore, *given: object) -> object:
+        self.made_by = partial(getattr(self.dll, function.__name__), *given)
+        return function(self, *given)
 
     return called
 

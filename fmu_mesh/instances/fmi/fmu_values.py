@@ -17,7 +17,7 @@ from ...rings.native import Call, RowBase
 from ...variables.model_description import Variable
 from ...variables.value_types import DTYPES, VariableType, is_text
 from .buffers import BinaryBuffer, Buffer, NumberBuffer, StringBuffer
-from .calls import Function, Pointer, RowPointers, address_of
+from .calls import Function, RowPointers, address_of, memory, pointer
 from .fmu_library import MISSING
 
 __all__ = ["DISCARD", "FATAL", "OK", "WARNING", "PartCall", "SolverFailed", "ValueFunctions", "Verb", "status_name"]
@@ -30,10 +30,6 @@ _STATUS_NAMES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
 
 Verb = Literal["Get", "Set"]
 
-_ADDRESS, _SIZE = ctypes.c_void_p, ctypes.c_size_t
-_GET_OR_SET: Final = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _SIZE, _ADDRESS)
-_GET_OR_SET_3: Final = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _SIZE, _ADDRESS, _SIZE)
-_GET_OR_SET_BINARY: Final = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _SIZE, _ADDRESS, _ADDRESS, _SIZE)
 _FMI2_NAMES: Final[dict[VariableType, str]] = {"Float64": "Real", "Int32": "Integer", "Enumeration": "Integer"}
 """The types of FMI 1.0 and 2.0 that have another name in FMI 3.0."""
 
@@ -51,20 +47,16 @@ class ValueFunctions(NamedTuple):
     # Enumeration is an `int` (FMI 2.0, 2.1.2)
     sized: bool
 
-    @property
-    def declaration(self) -> str:
-        """The C type of those for numbers."""
-        return f"int (*)(void *, void *, size_t, void *{', size_t' if self.sized else ''})"
+    def declaration(self, type_: VariableType) -> str:
+        """The C type of those for a type."""
+        sizes, count = ", void *" if type_ == "Binary" else "", ", size_t" if self.sized else ""
+        return f"int (*)(void *, void *, size_t{sizes}, void *{count})"
 
     def name(self, verb: Verb, type_: VariableType) -> str:
         """The name of the function for a type, after the prefix."""
         if self.sized:
             return f"{verb}{'Int64' if type_ == 'Enumeration' else type_}"
         return f"{verb}{_FMI2_NAMES.get(type_, type_)}"
-
-    def prototype(self, type_: VariableType) -> Any:  # noqa: ANN401 ctypes has no types
-        """The prototype of the functions for a type."""
-        return _GET_OR_SET_BINARY if type_ == "Binary" else _GET_OR_SET_3 if self.sized else _GET_OR_SET
 
     def buffer(self, type_: VariableType, variables: Sequence[Variable]) -> Buffer:
         """Memory for the values of variables of one type, in the C type of this version of FMI."""
@@ -78,6 +70,16 @@ class ValueFunctions(NamedTuple):
         negated = [variable.negated for variable in variables]
         signs = np.where(negated, -1, 1).astype(np.int8) if any(negated) else None
         return NumberBuffer(type_, self.boolean if type_ == "Boolean" else DTYPES[type_], size, signs)
+
+    def arguments(self, variables: Sequence[Variable], buffer: Buffer | None) -> tuple[Any, ...]:
+        """Those of a getter or setter after the instance: all if there is a ``buffer``, otherwise up to the values."""
+        references = (ctypes.c_uint * len(variables))(*(variable.value_reference for variable in variables))
+        first = memory(references), len(variables)
+        if buffer is None:
+            return first
+        places = (buffer.sizes_address, buffer.address) if isinstance(buffer, BinaryBuffer) else (buffer.address,)
+        size = (sum(variable.size for variable in variables),) if self.sized else ()
+        return *first, *map(pointer, places), *size
 
     def is_direct(self, type_: VariableType, variables: Sequence[Variable]) -> bool:
         """Whether a ring stores the values of variables of one type in the C type of this version of FMI."""
@@ -96,7 +98,7 @@ class PartCall(NamedTuple):
     sizes: tuple[int, ...]  # the number of elements, if the function takes it; otherwise empty
     buffer: Buffer | None  # what the function of the FMU works on; None: on the ring itself.
     function: Function  # the getter or setter
-    references: Pointer  # its value references
+    arguments: tuple[Any, ...]  # see `ValueFunctions.arguments`
     rows: RowPointers  # pointers to the elements in the ring
 
     @property
@@ -109,7 +111,7 @@ class PartCall(NamedTuple):
         """The call for the library."""
         base, values = (self.base, self.place) if self.buffer is None else (RowBase.FIXED, self.buffer.address)
         size = self.sizes[0] if self.sizes else -1
-        return Call(address_of(self.function), address_of(self.references), len(self.variables), base, values, size)
+        return Call(address_of(self.function), address_of(self.arguments[0]), len(self.variables), base, values, size)
 
 
 def status_name(status: int) -> str:

@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 from fmpy.fmi1 import FMICallException
 
 from ...variables.model_description import ModelDescription
+from ..call_guard import call_named
 from ..process_end import process_ends
 from ..process_state import FOLDER
 from .archive.examining import library_name
 from .archive.sources import extract
-from .calls import FmpyCalls
+from .calls import FmpyCalls, cffi_function, pointer
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
 from .step_options import Terms
@@ -114,6 +115,7 @@ class LoadedFmu:
         self.path = fmu.path
         self.calls: Any = None  # FMPy's object, once it is loaded
         self.has_instance = False
+        self.component = 0  # the address of the instance, as long as there is one
         self.is_lost = False  # whether it has returned fatal
         self._fmu = fmu
         self._files = files = (
@@ -137,6 +139,10 @@ class LoadedFmu:
             return
         functions = self._fmu.functions
         self.calls = FmpyCalls(self._files.loaded(self, self._load), functions.values.prefix, functions.names)
+        self._free_name = name = functions.names.get(functions.free, functions.free)
+        # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
+        symbol = name if functions.values.prefix != "fmi" else f"{self._fmu.description.model_identifier}_{name}"
+        self._free = cffi_function(getattr(self.calls.dll, symbol), "void (*)(void *)")
 
     def _load(self) -> Any:  # noqa: ANN401 FMPy is untyped
         functions, description = self._fmu.functions, self._fmu.description
@@ -158,10 +164,17 @@ class LoadedFmu:
         return self._files.changes_process
 
     def instantiate(self, **arguments: object) -> None:
-        """Make an instance with these arguments for FMPy, if none is there that was reset."""
+        """Make an instance with these arguments for FMPy, if none is there that was reset.
+
+        Without arguments they are those of the last one, for a version of FMI that `FmuLibrary` knows them of.
+        """
         if not self.has_instance:
-            self.calls.instantiate(loggingOn=False, **arguments)
-            self.has_instance = bool(self.calls.component)
+            if arguments:
+                self.calls.instantiate(loggingOn=False, **arguments)
+            else:
+                self.calls.instantiate_again()
+            self.component = self.calls.component or 0
+            self.has_instance = bool(self.component)
             if not self.has_instance:
                 raise RuntimeError(f"{self._fmu.functions.names['instantiate']} returned no instance")
 
@@ -185,8 +198,7 @@ class LoadedFmu:
         """Free the instance; the library stays."""
         if self.has_instance:
             self.has_instance = False
-            with suppress(FMICallException, OSError):
-                getattr(self.calls, self._fmu.functions.free)(self.calls.component)
+            call_named(self._free_name, self._free, pointer(self.component))
 
     def close(self) -> None:
         """Free the instance, unload the library and remove the files. Never raises; may be called twice.

@@ -7,7 +7,6 @@ version of FMI adds how a step is taken and what its statuses mean.
 from __future__ import annotations
 
 import ctypes
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal
@@ -19,11 +18,10 @@ from ...rings import native
 from ...rings.native import CopyCall, MemberTable, Move, NativeStep, Span, Stage, StepKind
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
-from ...variables.model_description import Variable
+from ...variables.model_description import ModelDescription, Variable
 from ...variables.value_types import DTYPES, Value
 from ..instance_wrapper import of_kind
 from .buffers import NumberBuffer
-from .callbacks import unregister
 from .calls import Function, Pointer, address_of, cffi_function, memory, pointer
 from .fmu_instance import FmuInstance, FmuState
 from .fmu_values import WARNING, PartCall, Verb
@@ -42,13 +40,9 @@ class NativeInstance(FmuInstance):
     _kind: StepKind
     _do_step: Function  # the function of the FMU, as cffi calls it
 
-    runs_again = False  # see `RunsAgain`
-
     _by_calls = False  # whether the steps have a part that the library does not know
 
     _derivatives: Mapping[str, float] = {}  # of the linear inputs, in 1/s, for the next step
-
-    _accesses: Sequence[object] = ()  # what the addresses of `access` point to
 
     _native: NativeStep | None = None
     _member: MemberTable | None = None  # the member that takes the steps of `do_step`
@@ -84,37 +78,6 @@ class NativeInstance(FmuInstance):
         self._member = member = self._table(self._native, outputs)
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
         self._in_step = take, pointer(ctypes.addressof(member))
-
-    def end_run(self) -> bool:
-        """See `RunsAgain`."""
-        if self._kept is None or not self._live or self._state != "stepping":
-            return False
-        self._end_simulation()
-        if self._is_used_up:
-            return False
-        if not self._was_reset:
-            self._model.free()
-        unregister(self)
-        return True
-
-    def run_again(self) -> None:
-        """See `RunsAgain`."""
-        self._last_messages, self._was_reset = [], False
-        self._said.note(step=-1, quiet_until=math.inf)
-        self._state = "instantiated"
-        try:
-            self._instantiate()
-        except Exception as error:
-            self._state = "failed"
-            raise self._refused(str(error)) from error
-
-    def bind_again(self) -> None:
-        """See `RunsAgain`: only the address of the instance may be another one."""
-        self._said.note(step=0)
-        if self._native is not None and self._member is not None:
-            self._native = self._native._replace(component=self._component)
-            self._member.note(component=self._component, step=0, stage=Stage.WAITING, outcome=0)
-        self._read_outputs(0)
 
     def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None:
         """See `FmuInstance` (FMI 1.0 CS, 3.3; FMI 2.0, 4.2.1)."""
@@ -156,16 +119,18 @@ class NativeInstance(FmuInstance):
         """See `AccessedNatively`."""
         if not self._is_plain(verb):
             return None
+        key = verb, *names
+        if key in self._accesses:
+            function, references, count, size = self._accesses[key]
+            return CopyCall(function, self._component, address_of(references), count, size)
         variables = [self._variables[name] for name in names]
         type_, functions = variables[0].type, self._functions.values
         if any(variable.type != type_ for variable in variables) or not functions.is_direct(type_, variables):
             return None
-        count = len(variables)
-        references = (ctypes.c_uint * count)(*(variable.value_reference for variable in variables))
-        function = address_of(cffi_function(self._function(verb, type_), functions.declaration))
         size = sum(variable.size for variable in variables) if functions.sized else -1
-        self._accesses = [*self._accesses, references]
-        return CopyCall(function, self._component, ctypes.addressof(references), count, size)
+        function, arguments = address_of(self._function(verb, type_)), functions.arguments(variables, None)
+        self._accesses[key] = function, *arguments, size
+        return self.access(verb, names)
 
     def setter(self, name: str) -> Callable[[Value], None] | None:
         """See `Prepares`."""
@@ -201,7 +166,7 @@ class NativeInstance(FmuInstance):
         if access is None:
             return None
         cell, size = np.zeros(1, DTYPES[variable.type]), (1,) if access.size >= 0 else ()
-        call = cffi_function(self._function(verb, variable.type), self._functions.values.declaration)
+        call = self._function(verb, variable.type)
         return variable, call, (self._self, pointer(access.references), 1, memory(cell), *size), cell.data
 
     def state_access(self, state: object) -> CopyCall | None:
@@ -211,6 +176,17 @@ class NativeInstance(FmuInstance):
         name = self._functions.names.get("setFMUState", f"{self._symbols}SetFMUState")
         function = address_of(cffi_function(getattr(self._fmu.dll, name), "int (*)(void *, void *)"))
         return CopyCall(function, self._component, of_kind(FmuState, state).handle.value, -1, -1)
+
+    def _describe(self, description: ModelDescription) -> None:
+        super()._describe(description)
+        # functions, value references, their number and that of their elements, by what `access` was asked
+        self._accesses: dict[tuple[str, ...], tuple[int, Pointer, int, int]] = {}
+
+    def _follow_component(self) -> None:
+        """The instance may be another one than that of the last `bind`."""
+        if self._native is not None and self._member is not None and self._native.component != self._component:
+            self._native = self._native._replace(component=self._component)
+            self._member.note(component=self._component)
 
     def _is_plain(self, verb: Verb | Literal["State"]) -> bool:
         """Whether nothing but a function of the FMU gets or sets values, or sets a state."""

@@ -75,14 +75,15 @@ class MujocoInstance(KeepsStateAsBytes):
         self._begin()
         self._set_limits()
 
-    def begin_again(self) -> bool:
+    def end_run(self) -> bool:
         """See `BeginsAgain`; a film has one beginning."""
-        if self._picture is not None:
-            return False
+        return self._picture is None
+
+    def begin_again(self) -> None:
+        """See `BeginsAgain`."""
         self._model.opt.timestep = self._timestep
         self._model.opt.wind[:] = self._wind
         self._begin()
-        return True
 
     def _begin(self) -> None:
         """Be in the state of the model."""

@@ -54,11 +54,14 @@ class OnnxInstance(KeepsStateAsBytes):
         self._is_initialized = False
         self._is_computed = False
 
-    def begin_again(self) -> bool:
+    def end_run(self) -> bool:
+        """See `BeginsAgain`."""
+        return True
+
+    def begin_again(self) -> None:
         """See `BeginsAgain`."""
         self._values.clear()
         self._is_initialized = self._is_computed = False
-        return True
 
     def enter_initialization(
         self, start_time: float, stop_time: float | None, start_values: Mapping[str, Value]

@@ -40,10 +40,10 @@ _PAUSES_S: Final = (0.0, 1e-3)
 class StepStatus:
     """Asks one instance about its last step.
 
-    ``failed`` makes the error of the instance.
+    ``component`` returns its address, and ``failed`` makes its error.
     """
 
-    def __init__(self, dll: Any, component: int, symbols: str, failed: Callable[..., Exception]) -> None:  # noqa: ANN401 of ctypes
+    def __init__(self, dll: Any, component: Callable[[], int], symbols: str, failed: Callable[..., Exception]) -> None:  # noqa: ANN401 of ctypes
         self._component = component
         self._prefix = symbols.rpartition("_")[2]
         self._failed = failed
@@ -59,7 +59,7 @@ class StepStatus:
         pause, longest = _PAUSES_S
         while status == PENDING:
             answer = ctypes.c_int(PENDING)
-            if self._get_status(self._component, _DO_STEP_STATUS, ctypes.addressof(answer)) > WARNING:
+            if self._get_status(self._component(), _DO_STEP_STATUS, ctypes.addressof(answer)) > WARNING:
                 what = f"{self._prefix}DoStep returned pending, and {self._prefix}GetStatus does not tell when the step"
                 raise self._failed(f"{what} is done")
             if (status := answer.value) != PENDING:
@@ -71,7 +71,7 @@ class StepStatus:
     def last_successful_time(self) -> float | None:
         """The time up to which a discarded step was calculated, in s of the FMU; None if the FMU does not tell."""
         answer = ctypes.c_double()
-        status = self._get_real_status(self._component, _LAST_SUCCESSFUL_TIME, ctypes.addressof(answer))
+        status = self._get_real_status(self._component(), _LAST_SUCCESSFUL_TIME, ctypes.addressof(answer))
         return answer.value if status <= WARNING else None
 
 

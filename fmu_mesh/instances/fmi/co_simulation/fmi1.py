@@ -51,7 +51,7 @@ class Fmi1Instance(NativeInstance, Fmi1):
         super()._instantiate(**arguments)
         dll = self._fmu.dll
         self._do_step = cffi_function(getattr(dll, f"{self._symbols}DoStep"), _DO_STEP)
-        self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
+        self._step_status = StepStatus(dll, lambda: self._component, self._symbols, self._failed)
         self._by_calls = bool(self._options.linear_inputs)
 
     def _complete(self, step: int, status: int | None) -> None:

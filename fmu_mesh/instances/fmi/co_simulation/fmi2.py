@@ -13,6 +13,7 @@ from ....rings.native import StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid, resolvable
 from ....variables.value_types import Value
+from ..callbacks import unregister
 from ..calls import cffi_function
 from ..fmi_versions import Fmi2
 from ..fmu_instance import Bookkeeping
@@ -33,14 +34,8 @@ class Fmi2Instance(NativeInstance, Fmi2):
 
     _kind = StepKind.FMI2
     _functions = FmuFunctions(FMU2Slave, Fmi2.VALUES, "fmi2FreeInstance", (*Fmi2.NEEDED, "fmi2DoStep"), Fmi2.NAMES)
-    runs_again = True
     _bound: tuple[object, ...] = ()  # what it is bound to
     _terminated = False  # whether the FMU has asked to end the simulation with the step that is complete now
-
-    def run_again(self) -> None:
-        """See `RunsAgain`."""
-        self._terminated = False
-        super().run_again()
 
     def advance(self, time: float, step_size: float) -> None:
         """One step of ``step_size`` from ``time`` (both in s) without rings, for callers with their own time base."""
@@ -71,26 +66,42 @@ class Fmi2Instance(NativeInstance, Fmi2):
         """See `Instance`; with what it was bound to before, only the outputs are written."""
         bound = inputs, tuple(outputs), grid, points
         if bound == self._bound:
+            self._follow_component()
             self._said.note(step=step)
             self._read_outputs(step)
             return
         super().bind(inputs, outputs, grid, points, step)
         self._bound = bound
 
-    def begin_again(self) -> bool:
+    def end_run(self) -> bool:
         """See `BeginsAgain` (fmi2Reset; FMI 2.0, 2.1.6)."""
-        if self._state != "stepping":
+        if self._kept is None or not self._live or self._state != "stepping":
             return False
-        self._state = "instantiated"
-        self._terminated, self._derivatives, self._last_messages = False, {}, []
+        self._end_simulation()
+        if self._is_used_up:
+            return False
+        if not self._was_reset:
+            self._model.free()
+        unregister(self)
+        return True
+
+    def begin_again(self) -> None:
+        """See `BeginsAgain`."""
+        self._terminated = self._was_reset = False
+        self._derivatives, self._last_messages, self._kept_state = {}, [], ctypes.c_void_p()
         self._said.note(step=-1, quiet_until=math.inf)
-        return self._end_run(resets=True)
+        self._state = "instantiated"
+        try:
+            self._make()
+        except Exception as error:
+            self._state = "failed"
+            raise self._refused(str(error)) from error
 
     def _instantiate(self, **arguments: object) -> None:
         super()._instantiate(**arguments)
         dll, options = self._fmu.dll, self._options
         self._do_step = cffi_function(dll.fmi2DoStep, _DO_STEP)
-        self._step_status = StepStatus(dll, self._component, self._symbols, self._failed)
+        self._step_status = StepStatus(dll, lambda: self._component, self._symbols, self._failed)
         self._by_calls = bool(options.retry_discarded_steps or options.linear_inputs)
         self._kept_state = ctypes.c_void_p()  # that before the step, where steps are retried
 

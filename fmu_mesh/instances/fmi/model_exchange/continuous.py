@@ -24,7 +24,6 @@ from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ...contract import LogMessage
-from ..calls import cffi_function
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping
@@ -252,7 +251,7 @@ class ContinuousInstance(NativeInstance):
             return None
         assert self._inputs is not None
         functions = self._functions.values
-        function = cffi_function(self._function("Set", "Float64"), functions.declaration)
+        function = self._function("Set", "Float64")
         setter = InputSetter(function, self._function_name("Set", "Float64"), self._self, functions.sized)
         begins = [float(self._inputs.value(slot, name)) for name in slopes]  # type: ignore[arg-type]  # Float64 only
         references = [self._variables[name].value_reference for name in slopes]
