@@ -22,6 +22,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable
@@ -30,6 +31,7 @@ from functools import partial
 from multiprocessing import spawn, util
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from typing import Any, Final
 
 from ..errors import MeshLost
@@ -40,18 +42,28 @@ from ..run.threads import one_thread_from_now_on
 __all__ = ["WorkerServer", "prepare_workers", "serve"]
 
 _ENDS_S: Final = 5.0
+_THREAD_ENDS_S: Final = 0.02
+"""How long a thread of Python may exist that has been waited for, such as those of the sweep before."""
 _PRELOADED: Final = "fmu_mesh.sweeps.preloaded"
 _SERVER: Final = "import sys; sys.path[:] = {}; from fmu_mesh.sweeps.worker_server import serve; serve({})"
-_CALLING_MODELS: Final = {"fmpy.fmi1", "fmu_mesh.instances.python.python_instance"}
-"""Modules that a program has imported if it, or we, may have called a model in it."""
+_CALLING_MODELS: Final = {"fmu_mesh.instances.fmi.opening", "fmu_mesh.instances.python.python_instance"}
+"""Modules that a program has imported if we have called a model in it."""
+_LIBRARIES: Final = "/binaries/"
+"""The folder of the libraries in an FMU (FMI 2.0, 2.3), in the path of one that somebody else has loaded."""
 
 _in_worker: list[bool] = []
+_preparing = threading.Lock()
 _ready: list[WorkerServer] = []
 """The server of the next pool, if it runs."""
 
 
 def prepare_workers() -> None:
     """Start what the workers need, while the program does something else; where it has no threads yet, it is faster."""
+    with _preparing:
+        _prepare()
+
+
+def _prepare() -> None:
     if _ready and (_ready[0].is_fork or not _ready[0].is_usable()):  # a fork is the program as it was
         _ready.pop().close()
     if not _ready:
@@ -88,9 +100,10 @@ class WorkerServer:
         if _in_worker:
             msg = "a worker has no workers of its own"
             raise RuntimeError(msg)
-        if not (_ready and _ready[0].is_usable()):
-            prepare_workers()
-        return _ready.pop() if _ready[0].is_fork else _ready[0]
+        with _preparing:
+            if not (_ready and _ready[0].is_usable()):
+                _prepare()
+            return _ready.pop() if _ready[0].is_fork else _ready[0]
 
     def is_usable(self) -> bool:
         """Whether it runs, and serves this process, which may be a fork of the one that started it."""
@@ -159,13 +172,23 @@ def _no_process(number: int | None) -> MeshLost:
 
 def _forked(control: int) -> int | None:
     """Start the server as a fork of this process; None if a model could find there what it does not in a new one."""
+    maps = Path("/proc/self/maps").read_text("utf-8", "replace")
+    has_models = _CALLING_MODELS & sys.modules.keys() or _LIBRARIES in maps
     is_plain = locale.setlocale(locale.LC_NUMERIC) == "C" and not floating_point_changed()
-    if threading.active_count() > 1 or _CALLING_MODELS & sys.modules.keys() or not is_plain:
+    if threading.active_count() > 1 or has_models or not is_plain:
         return None
+    deadline = time.monotonic() + _THREAD_ENDS_S
+    while (pid := _forked_alone(control)) is None and time.monotonic() < deadline:
+        continue
+    return pid
+
+
+def _forked_alone(control: int) -> int | None:
+    """As `_forked`; None if there are other threads, of whatever library."""
     waiting, go = os.pipe()
     _flush()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12 for threads; see below
+        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12, for other threads
         pid = os.fork()
         if pid == 0:
             os.close(go)

@@ -13,14 +13,14 @@ import psutil
 import pytest
 
 import fmu_mesh
-from tests.helpers import DEADLINE_S, wait_until, write_config
+from tests.helpers import DEADLINE_S, FMUS, wait_until, write_config
 
 PROGRAM = """
 import json, os, signal, sys, threading
 from fmu_mesh.sweeps.worker_pool import WorkerPool
 import fmu_mesh, psutil
 
-config, folder, before = sys.argv[1:]
+config, folder, before, fmu = sys.argv[1:]
 
 def look(descriptor):
     return os.readlink(f"/proc/self/fd/{descriptor}")
@@ -32,6 +32,12 @@ if __name__ == "__main__":
             threading.Thread(target=threading.Event().wait, daemon=True).start()
         case "a model":
             fmu_mesh.load(config).run(record="memory", processes=False)
+        case "a sweep":
+            with fmu_mesh.sweep(config, {"pendulum.d": [0.1, 0.2]}, folder="before", workers=2) as running:
+                running.wait()
+        case "FMPy":
+            import fmpy
+            model = fmpy.instantiate_fmu(fmpy.extract(fmu), fmpy.read_model_description(fmu, validate=False))
         case "a comma":
             import ctypes, locale
             locale.setlocale = lambda *_: "de_DE.UTF-8"
@@ -50,18 +56,18 @@ if __name__ == "__main__":
 def told(tmp_path: Path, before: str) -> dict[str, Any]:
     """What the program has found, in a process of its own: that of the tests has threads."""
     (tmp_path / "program.py").write_text(PROGRAM)
-    command = [sys.executable, "program.py", str(write_config(tmp_path)), "swept", before]
+    command = [sys.executable, "program.py", str(write_config(tmp_path)), "swept", before, str(FMUS / "Gain.fmu")]
     done = subprocess.run(command, cwd=tmp_path, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
     assert (done.returncode, done.stderr) == (0, "")
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
-@pytest.mark.parametrize("before", ["nothing", "a thread", "a model", "a comma"])
+@pytest.mark.parametrize("before", ["nothing", "a sweep", "a thread", "a model", "FMPy", "a comma"])
 def test_the_program_is_forked_only_where_that_changes_nothing(tmp_path: Path, before: str) -> None:
     found = told(tmp_path, before)
 
-    is_forked = before == "nothing"
+    is_forked = before in {"nothing", "a sweep"}
     assert found["forked"] is is_forked
     assert found["of program"]
     if is_forked:
@@ -78,7 +84,7 @@ def test_the_workers_end_with_a_program_that_is_killed(tmp_path: Path, before: s
     waits = "print(pool.submit(os.getpid).result(), flush=True); pool.submit(signal.pause).result(); server ="
     text = PROGRAM.replace("server =", waits)
     (tmp_path / "program.py").write_text(text)
-    command = [sys.executable, "program.py", str(write_config(tmp_path)), "swept", before]
+    command = [sys.executable, "program.py", str(write_config(tmp_path)), "swept", before, str(FMUS / "Gain.fmu")]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         worker = psutil.Process(int(program.stdout.readline()))
