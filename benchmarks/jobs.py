@@ -437,6 +437,13 @@ JOBS = (
                 204_800,
                 {"what": "batch", "copies": "1024", "threads": "2"},
             ),
+            Entry(
+                f"{_BATCH}, two processes",
+                STEPPED,
+                1_024_000,
+                204_800,
+                {"what": "batch", "copies": "1024", "processes": "2"},
+            ),
             Entry(_C_LOOP, "c_environment", 1_024_000, 204_800, {"what": "batch", "copies": "1024"}),
             Entry("FMPy loop over 64", "fmpy_environment", 25_600, 12_800, {"what": "batch", "copies": "64"}),
         ),

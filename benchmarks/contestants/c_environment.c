@@ -7,14 +7,9 @@
  * outputs. Otherwise each time goes back to the first point and
  * reads the output: by a state, or by fmi2Reset and an initialization in which OUTPUT has another start value. Prints
  * the time of all in s, and the last output. */
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <time.h>
+#include "fmi2_library.h"
 
-#include "fmi2FunctionTypes.h"
+#include <string.h>
 
 typedef struct {
     fmi2Component component;
@@ -28,25 +23,6 @@ typedef struct {
     fmi2SetFMUstateTYPE *set_state;
     fmi2ValueReference input, output;
 } Instance;
-
-static void fail(const char *what) {
-    fprintf(stderr, "%s\n", what);
-    exit(1);
-}
-
-static void check(fmi2Status status, const char *what) {
-    if (status > fmi2Warning) fail(what);
-}
-
-static void no_message(fmi2ComponentEnvironment e, fmi2String i, fmi2Status s, fmi2String c, fmi2String m, ...) {
-    (void)e, (void)i, (void)s, (void)c, (void)m;
-}
-
-static void *function(void *library, const char *name) {
-    void *found = dlsym(library, name);
-    if (found == NULL) fail(name);
-    return found;
-}
 
 static void initialize(Instance *self, const double *start) {
     check(self->setup(self->component, fmi2False, 0.0, 0.0, fmi2False, 0.0), "fmi2SetupExperiment");
@@ -112,8 +88,7 @@ int main(int argc, char **argv) {
     struct timespec from, to;
     Instance one;
     if (argc != 8 && argc != 12) fail("arguments");
-    void *library = dlopen(argv[2], RTLD_NOW | RTLD_LOCAL);
-    if (library == NULL) fail(dlerror());
+    void *library = loaded(argv[2]);
     fmi2InstantiateTYPE *instantiate = function(library, "fmi2Instantiate");
     one.component = instantiate("cart", fmi2CoSimulation, argv[3], "", &callbacks, fmi2False, fmi2False);
     if (one.component == NULL) fail("fmi2Instantiate");

@@ -5,15 +5,9 @@
  *
  * U and X are value references of the input and of an output. The second instance takes its step to point k + 1 with the
  * value that the first one has there. Prints the time of all steps in s, and both outputs at the end. */
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <time.h>
+#include "fmi2_library.h"
 
 #include SOLVER
-
-#include "fmi2FunctionTypes.h"
 
 enum { N = 2, EACH = 12 };
 
@@ -25,25 +19,6 @@ typedef struct {
     char none[8];
     fmi2ValueReference u, x;
 } Instance;
-
-static void fail(const char *what) {
-    fprintf(stderr, "%s\n", what);
-    exit(1);
-}
-
-static void check(int status, const char *what) {
-    if (status > fmi2Warning) fail(what);
-}
-
-static void no_message(fmi2ComponentEnvironment e, fmi2String i, fmi2Status s, fmi2String c, fmi2String m, ...) {
-    (void)e, (void)i, (void)s, (void)c, (void)m;
-}
-
-static void *function(void *library, const char *name) {
-    void *found = dlsym(library, name);
-    if (found == NULL) fail(name);
-    return found;
-}
 
 /* Point the equations to their memory and to the functions of the FMU. */
 static void connect(Equations *own, void *library, Instance *self) {
@@ -62,8 +37,7 @@ static void connect(Equations *own, void *library, Instance *self) {
 
 static void make(Instance *self, char **argv, int is_fed) {
     static const fmi2CallbackFunctions callbacks = {no_message, calloc, free, NULL, NULL};
-    void *library = dlopen(argv[0], RTLD_NOW | RTLD_LOCAL);
-    if (library == NULL) fail(dlerror());
+    void *library = loaded(argv[0]);
     const double tolerance = atof(argv[6]); /* without the name of the program */
     Equations *own = &self->equations;
     connect(own, library, self);

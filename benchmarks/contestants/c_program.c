@@ -10,21 +10,15 @@
  * lets other processes run from time to time. It never sleeps. With `tcp`, each output goes to its target through a
  * socket, eight bytes at a time, and who waits for it spins as well; memory then has the first and the last outputs.
  */
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <signal.h>
+#include "fmi2_library.h"
+
 #include <stdatomic.h>
-#include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/wait.h>
-#include <time.h>
 
 #include "sockets.h"
-
-#include "fmi2FunctionTypes.h"
 
 enum { ROWS = 4096, SPINS = 60, MOST = 16 };
 
@@ -50,24 +44,6 @@ typedef struct {
     int to_source, to_target;            /* sockets, where memory carries nothing */
 } Instance;
 
-static pid_t parent; /* 0 in the first process, which ends the others with it */
-
-static void fail(const char *what) {
-    fprintf(stderr, "%s\n", what);
-    if (parent != 0) kill(parent, SIGTERM); /* it would wait for ever */
-    _exit(1);
-}
-
-static void check(fmi2Status status, const char *what) {
-    if (status > fmi2Warning) fail(what);
-}
-
-static double now(void) {
-    struct timespec time;
-    clock_gettime(CLOCK_MONOTONIC, &time);
-    return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
-}
-
 static long wait_for(_Atomic long *counter, long goal) {
     for (int round = 0;; round++) {
         long value = atomic_load_explicit(counter, memory_order_acquire);
@@ -84,24 +60,13 @@ static long wait_for(_Atomic long *counter, long goal) {
 
 /* ---- an FMU */
 
-static void no_message(fmi2ComponentEnvironment e, fmi2String i, fmi2Status s, fmi2String c, fmi2String m, ...) {
-    (void)e, (void)i, (void)s, (void)c, (void)m;
-}
-
-static void *function(void *library, const char *name) {
-    void *found = dlsym(library, name);
-    if (found == NULL) fail(name);
-    return found;
-}
-
 /* Read one instance from the arguments; returns how many arguments that were. */
 static int instantiate(Instance *self, char **argv, double stop_time, Output *outputs, int is_mine) {
     static const fmi2CallbackFunctions callbacks = {no_message, calloc, free, NULL, NULL};
     int source = atoi(argv[3]), count = atoi(argv[7]);
     if (source >= 0) self->source = &outputs[source];
     if (!is_mine) return 8 + 2 * count;
-    void *library = dlopen(argv[0], RTLD_NOW | RTLD_LOCAL);
-    if (library == NULL) fail(dlerror());
+    void *library = loaded(argv[0]);
     fmi2InstantiateTYPE *make = function(library, "fmi2Instantiate");
     fmi2SetupExperimentTYPE *setup = function(library, "fmi2SetupExperiment");
     fmi2EnterInitializationModeTYPE *enter = function(library, "fmi2EnterInitializationMode");
@@ -202,10 +167,10 @@ int main(int argc, char **argv) {
     const int first = processes == 1 ? 0 : (int)process, end = processes == 1 ? n : first + 1;
     atomic_fetch_add(&shared->ready, 1);
     wait_for(&shared->ready, processes);
-    shared->begin[process] = now();
+    shared->begin[process] = clock_s();
     for (long point = 0; point < points; point++)
         for (int i = first; i < end; i++) step(&instances[i], point, lead, step_size);
-    shared->end[process] = now();
+    shared->end[process] = clock_s();
     if (process != 0) _exit(0);
 
     double began = shared->begin[0], ended = shared->end[0];

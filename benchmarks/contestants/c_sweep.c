@@ -8,18 +8,11 @@
  * instances, whose rows it keeps; at the end it takes the largest first output. Prints the time from the start of the
  * processes to their end in s, and one value for each variant.
  */
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <stdio.h>
-#include <stdlib.h>
+#include "fmi2_library.h"
+
 #include <sys/mman.h>
 #include <sys/prctl.h>
 #include <sys/wait.h>
-#include <signal.h>
-#include <time.h>
-#include <unistd.h>
-
-#include "fmi2FunctionTypes.h"
 
 typedef struct {
     fmi2InstantiateTYPE *make;
@@ -39,35 +32,9 @@ typedef struct {
     fmi2Component component;
 } Instance;
 
-static void fail(const char *what) {
-    fprintf(stderr, "%s\n", what);
-    _exit(1);
-}
-
-static void check(fmi2Status status, const char *what) {
-    if (status > fmi2Warning) fail(what);
-}
-
-static double now(void) {
-    struct timespec time;
-    clock_gettime(CLOCK_MONOTONIC, &time);
-    return (double)time.tv_sec + 1e-9 * (double)time.tv_nsec;
-}
-
-static void no_message(fmi2ComponentEnvironment e, fmi2String i, fmi2Status s, fmi2String c, fmi2String m, ...) {
-    (void)e, (void)i, (void)s, (void)c, (void)m;
-}
-
-static void *function(void *library, const char *name) {
-    void *found = dlsym(library, name);
-    if (found == NULL) fail(name);
-    return found;
-}
-
 /* Load the library of an instance; returns how many arguments describe the instance. */
 static int load(Instance *self, char **argv) {
-    void *library = dlopen(argv[0], RTLD_NOW | RTLD_LOCAL);
-    if (library == NULL) fail(dlerror());
+    void *library = loaded(argv[0]);
     self->make = function(library, "fmi2Instantiate");
     self->setup = function(library, "fmi2SetupExperiment");
     self->enter = function(library, "fmi2EnterInitializationMode");
@@ -138,7 +105,7 @@ int main(int argc, char **argv) {
     const double first_value = strtod(argv[3], NULL), step = strtod(argv[4], NULL), step_size = strtod(argv[6], NULL);
     double *found = mmap(NULL, (size_t)variants * sizeof *found, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
     if (found == MAP_FAILED) fail("mmap");
-    const double began = now();
+    const double began = clock_s();
     for (long process = 0; process < processes; process++) {
         pid_t child = fork();
         if (child < 0) fail("fork");
@@ -157,7 +124,7 @@ int main(int argc, char **argv) {
         int status;
         if (wait(&status) < 0 || status != 0) fail("a process has failed");
     }
-    printf("%.9f\n", now() - began);
+    printf("%.9f\n", clock_s() - began);
     for (long k = 0; k < variants; k++) printf("%a\n", found[k]);
     return 0;
 }

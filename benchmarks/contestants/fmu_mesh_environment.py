@@ -35,7 +35,8 @@ def run(task: Task) -> Outcome:
 def _batch(mesh: fmu_mesh.Mesh, task: Task) -> Outcome:
     copies = int(task.options["copies"])
     names = [f"cart.{name}" for name in OUTPUTS]
-    with mesh.batch(copies, threads=int(task.options.get("threads", "1"))) as batch:
+    threads, processes = (int(task.options.get(name, "1")) for name in ("threads", "processes"))
+    with mesh.batch(copies, threads=threads, processes=processes) as batch:
         found = np.zeros((copies, len(names)))
         started = perf_counter()
         for _ in range(task.points // copies):
@@ -48,7 +49,7 @@ def _batch(mesh: fmu_mesh.Mesh, task: Task) -> Outcome:
 
 def _batch_states(mesh: fmu_mesh.Mesh, task: Task) -> Outcome:
     copies = int(task.options["copies"])
-    with mesh.batch(copies) as batch:
+    with mesh.batch(copies, processes=1) as batch:
         batch.reset()  # from now on there are states of point 0
         found = np.zeros(copies)
         started = perf_counter()

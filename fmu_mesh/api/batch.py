@@ -1,11 +1,12 @@
-"""`Batch`: many copies of a mesh as arrays, in this process.
+"""`Batch`: many copies of a mesh as arrays.
 
-Owns names, values and the private folder. What a step does is `fmu_mesh.run.copies`.
+Owns names and values, in how many processes the copies are, and the private folder of those in this one. What a step
+does is `fmu_mesh.run.copies`, or `fmu_mesh.run.process_copies`.
 """
 
-# Threads: the one that made a batch calls it, and so all FMUs (ADR 12). The object of a state may be freed on any
-# thread: then it is only noted in `_lost`. Where the last reference to a batch is dropped on another thread, only its
-# files are removed, because its FMUs may not be called there.
+# Threads: the one that made a batch calls it, and so all FMUs that are here (ADR 12). The object of a state may be
+# freed on any thread: then it is only noted in `_lost`. Where the last reference to a batch is dropped on another
+# thread, processes end as ever; of copies that are here, only the files are removed: their FMUs may not be called.
 
 from __future__ import annotations
 
@@ -26,9 +27,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import CallRefused
 from ..run.copies import Copies
+from ..run.copies_messages import FIRST_COPIES
+from ..run.limits import resident_bytes
 from ..run.local_system import forwarded
 from ..run.preparing import OtherStartValues
 from ..run.process import interrupts_later
+from ..run.process_copies import ProcessCopies
 from ..run.run_plan import RunPlan
 from ..run.system_copy import Overrides, SavedCopy
 from ..text import option_text, shown
@@ -39,8 +43,8 @@ from .system_state import BatchState
 
 __all__ = ["Batch"]
 
-_LOOKED_AT: Final = 16
-"""After so many copies it is known how much memory one takes."""
+_COPIES_EACH: Final = 512
+"""So many copies at least pay for a process: a round of messages takes as long as a step of some 300 small FMUs."""
 
 _MOST_OF_MEMORY: Final = 0.9
 
@@ -48,15 +52,17 @@ Values = Mapping[str, ArrayLike]
 
 
 class Batch:
-    """Many copies of a mesh that your program steps as arrays, in this process; `Mesh.batch` makes it.
+    """Many copies of a mesh that your program steps as arrays; `Mesh.batch` makes it.
 
     Copy ``i`` is element ``i`` of each array, and gives the floats of a `System` with its values. Copies are
     independent: each has a point of its own, and one that fails does not end the others. All calls come from the thread
     that made the batch; with several ``threads``, each of those makes the calls of its copies. Ctrl-C ends `step` with
     all copies at one point.
 
-    A call that hangs in an FMU cannot be ended, and an FMU that crashes takes the program with it. Copies of an FMU
-    share its library, as the standard allows (FMI 2.0, 2.1.1).
+    Where copies are in ``processes``, an FMU that crashes, or does not return within `timeouts.step`, ends the copies
+    of its process: they are `done`, and `reset` starts another process for them. In this process, a call that hangs
+    cannot be ended, and an FMU that crashes takes the program with it. Copies of an FMU in one process share its
+    library, as the standard allows (FMI 2.0, 2.1.1).
 
     Example:
         >>> import fmu_mesh, numpy as np
@@ -72,17 +78,21 @@ class Batch:
         copies: how many.
         threads: on how many threads they are stepped; each has its own library of each FMU, and makes all calls of its
             copies.
+        processes: in how many processes they are, at most one for each; 1: in this one. None: as many as this process
+            may use processors, where each has 512 copies or more.
 
     Raises:
         NotInOneProcess: copies of an FMU need a process each.
-        CallRefused: there is not enough memory; ``copies`` is no number above 0; or the models share something that
-            several threads cannot use.
+        CallRefused: there is not enough memory; ``copies`` is no number above 0; the models share something that
+            several threads cannot use; or threads and processes are asked for.
         FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
+        MeshLost: a process has ended before its copies were ready.
     """
 
-    def __init__(self, run: RunPlan, copies: int, *, threads: int = 1) -> None:
+    def __init__(self, run: RunPlan, copies: int, *, threads: int = 1, processes: int | None = None) -> None:
         if copies < 1:
             raise CallRefused(f"{option_text('copies', copies)}: expected a whole number of 1 or more")
+        count = _processes(copies, threads, processes)
         self._run = run
         self._count = copies
         self._thread = threading.get_ident()
@@ -91,15 +101,21 @@ class Batch:
         self._settable: set[str] = set()
         self._saved: weakref.WeakKeyDictionary[BatchState, list[SavedCopy]] = weakref.WeakKeyDictionary()
         self._lost: deque[list[SavedCopy]] = deque()
-        folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+        folder: Path | None = None
+        own: Copies | ProcessCopies
         try:
-            own = Copies(run, copies, folder, forwarded, min(threads, copies))
+            if count > 1:
+                own = ProcessCopies(run, copies, count, forwarded)
+            else:
+                folder = Path(tempfile.mkdtemp(prefix="fmu_mesh-"))
+                own = Copies(run, copies, folder, forwarded, min(threads, copies))
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
+            _remove(folder)
             raise
         self._copies = own
         self._release = weakref.finalize(self, _release, own, folder, self._thread)
-        self._before = _resident_bytes()
+        self._before = resident_bytes()
+        self._is_looked_at = False
         try:
             own.start(self._look_at_memory)
         except BaseException:
@@ -294,7 +310,8 @@ class Batch:
             copies: which copies, truths of shape (copies,); None: all.
 
         Raises:
-            CallRefused: it is no state of this batch, or is closed; or see `close`.
+            CallRefused: it is no state of this batch, or is closed; the FMU of a copy has failed since then, so that a
+                reset has made new instances; or see `close`.
             FmuError: an FMU failed.
         """
         self._demand("restore")
@@ -399,11 +416,12 @@ class Batch:
             self._resets.of_reset({name: to_plain(values[number]) for name, _, _, values in found})
         return of_copy
 
-    def _look_at_memory(self, ready: int) -> None:
+    def _look_at_memory(self, ready: int, taken: int | None = None) -> None:
         """Once some copies are there: whether all of them fit into memory."""
-        if ready != _LOOKED_AT or self._count <= ready:
+        if self._is_looked_at or ready < FIRST_COPIES or self._count <= ready:
             return
-        each = max(0, _resident_bytes() - self._before) // ready
+        self._is_looked_at = True
+        each = (taken if taken is not None else max(0, resident_bytes() - self._before)) // ready
         needed, free = each * (self._count - ready), os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         if needed > _MOST_OF_MEMORY * free:
             text = f"{self._count} copies take about {each * self._count / 2**30:.1f} GiB of memory, {each / 1024:.0f} "
@@ -415,16 +433,29 @@ class Batch:
             self._copies.free(self._lost.popleft())
 
 
-def _resident_bytes() -> int:
-    """The memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
+def _processes(copies: int, threads: int, processes: int | None) -> int:
+    """In how many processes the copies are."""
+    if processes is not None and processes > 1:
+        if threads > 1:
+            text = f"{option_text('threads', threads)} and {option_text('processes', processes)} exclude each other"
+            raise CallRefused(text, hint="Leave one of them out; threads are those of this process.")
+        if not hasattr(os, "memfd_create"):
+            raise CallRefused(f"{option_text('processes', processes)}: several processes need Linux")
+        return min(processes, copies)
+    if processes == 1 or threads > 1 or not hasattr(os, "memfd_create"):
+        return 1
+    return max(1, min(len(os.sched_getaffinity(0)), copies // _COPIES_EACH))
 
 
-def _release(copies: Copies, folder: Path, thread: int) -> None:
-    """Free everything. On another thread only the files: an FMU is only called on its own."""
-    if threading.get_ident() == thread:
+def _release(copies: Copies | ProcessCopies, folder: Path | None, thread: int) -> None:
+    """Free everything. On another thread only the files and processes: an FMU is only called on its own."""
+    if threading.get_ident() == thread or isinstance(copies, ProcessCopies):
         copies.close()
     else:
         copies.end_threads()
-    shutil.rmtree(folder, ignore_errors=True)
+    _remove(folder)
+
+
+def _remove(folder: Path | None) -> None:
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)

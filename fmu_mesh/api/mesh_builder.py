@@ -646,9 +646,10 @@ class Mesh:
 
     @takes(BatchOptions)
     def batch(self, copies: int, options: BatchOptions) -> Batch:
-        """Open many copies of all instances in this process, for a program that steps them as arrays (docs/batches.md).
+        """Open many copies of all instances, for a program that steps them as arrays (docs/batches.md).
 
-        Nothing is recorded into a file, and no other process is started. Inputs with a Zenoh key are free to be set.
+        Nothing is recorded into a file. Inputs with a Zenoh key are free to be set. Many copies get processes of their
+        own, as many as this program may use processors; `processes` says how many, and 1 that it is this process.
 
         Example:
             >>> with fmu_mesh.load("configs/pendulum_delay.yaml").batch(2, {"pendulum.a": 0.5}) as batch:
@@ -663,18 +664,21 @@ class Mesh:
         Raises:
             ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
                 instances need a process of their own each.
-            CallRefused: there is not enough memory, or these models cannot be stepped on several threads.
+            CallRefused: there is not enough memory, or these models cannot be stepped on several threads, or threads
+                and processes are asked for.
             FmuError: an instance cannot be opened or initialized. Nothing is left behind.
+            MeshLost: a process has ended before its copies were ready.
         """
         from .batch import Batch  # noqa: PLC0415  only this needs it
 
-        return Batch(self._opened(options), copies, threads=options.threads)
+        return Batch(self._opened(options), copies, threads=options.threads, processes=options.processes)
 
     def _opened(self, options: OpenOptions) -> RunPlan:
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `set`.")
         given = options.given()
-        given.pop("threads", None)
+        for own in ("threads", "processes"):
+            given.pop(own, None)
         return without_keys(self.plan(**given))
 
     def repeated(self, *, reset: bool = False, on_hang: Callable[[FmuError], None] = log.error) -> RepeatedMesh:

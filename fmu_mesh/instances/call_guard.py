@@ -119,7 +119,7 @@ class CallWatch:
         self._step_limit_s = 0.0
         self._closed = False
         self._asleep = False
-        self._crash: FmuError | None = None
+        self._crash: tuple[str, str] | None = None
         self._thread = threading.Thread(target=self._run, name="call watch", daemon=True)
         self._thread.start()
 
@@ -146,9 +146,9 @@ class CallWatch:
         """Around the last calls of FMUs: a crash is reported as a call that does not return."""
 
         def crashed(how: str) -> None:
-            function, call = current_function(self._caller) or "its last call", self._call
+            call = self._call
             name = call.instance if call is not None else instance
-            self._crash = FmuError(f"the FMU ended its process in {function} ({how})", instance=name)
+            self._crash = name, how
             self._call = _Call(instance, FmuError, "terminate", 0.0, time.monotonic())  # whose deadline is now
             self._notify()
 
@@ -214,7 +214,12 @@ class CallWatch:
         self._asleep = False
 
     def _overrun(self, call: _Call, seconds: float, otherwise: str) -> FmuError:
-        return self._crash or call.kind(
+        if self._crash is not None:
+            (name, how), position = self._crash, self._position
+            last = position()[2] if position is not None else "its last call"
+            function = current_function(self._caller) or last
+            return FmuError(f"the FMU ended its process in {function} ({how})", instance=name)
+        return call.kind(
             not_returned(self._caller, seconds, otherwise),
             instance=call.instance,
             hint=f"If it needs that long, raise `timeouts.{call.setting}` in the configuration.",

@@ -129,6 +129,11 @@ class AroundNativeSteps(AroundInstance[Instance]):
         """The inner instance, if it has such steps: to ask whether it has takes longer than a step."""
         return self._instance if isinstance(self._instance, StepsNatively) else None
 
+    @cached_property
+    def _accessed(self) -> AccessedNatively | None:
+        """As `_stepping`."""
+        return self._instance if isinstance(self._instance, AccessedNatively) else None
+
     @property
     def native(self) -> NativeStep | None:
         """See `StepsNatively`; None if the inner instance has no such steps."""
@@ -145,11 +150,11 @@ class AroundNativeSteps(AroundInstance[Instance]):
 
     def access(self, verb: Literal["Get", "Set"], names: Sequence[str]) -> CopyCall | None:
         """See `AccessedNatively`; None if the inner instance is none."""
-        return self._instance.access(verb, names) if isinstance(self._instance, AccessedNatively) else None
+        return self._accessed.access(verb, names) if self._accessed is not None else None
 
     def state_access(self, state: object) -> CopyCall | None:
         """See `AccessedNatively`; None if the inner instance is none."""
-        return self._instance.state_access(state) if isinstance(self._instance, AccessedNatively) else None
+        return self._accessed.state_access(state) if self._accessed is not None else None
 
     def finish(self, step: int, outcome: int) -> None:
         """See `StepsNatively`; only called if there is `native`."""

@@ -39,6 +39,10 @@ class KeptModels:
         self.is_closed = False
         self._models: dict[str, KeptModel] = {}
 
+    def reset_from_now_on(self) -> None:
+        """Somebody has states of the instances: they belong to these, and to no others made in their place."""
+        self.resets = True
+
     def take(self, name: str, key: Hashable) -> KeptModel | None:
         """What was kept of the instance ``name``, if it was made from the same; the caller owns it from now on."""
         found = self._models.pop(name, None)

@@ -90,11 +90,15 @@ def surviving(on_crash: Callable[[str], None]) -> Iterator[None]:
             _handled.add(number)
         elif number not in _handled:
             _libc.sigaction(number, action, None)
-    _closing[threading.get_ident()] = os.getpid(), on_crash
+    thread = threading.get_ident()
+    before = _closing.get(thread)  # who looks after all calls looks after the others again
+    _closing[thread] = os.getpid(), on_crash
     try:
         yield
     finally:
-        del _closing[threading.get_ident()]
+        del _closing[thread]
+        if before is not None:
+            _closing[thread] = before
         while _handled and not _closing:
             _libc.signal(_handled.pop(), None)
 

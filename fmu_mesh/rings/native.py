@@ -17,7 +17,7 @@ from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_voi
 from enum import IntEnum
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from ..variables.value_types import VariableType
 from .library import LibraryFunctions, load_library
@@ -129,20 +129,10 @@ class WorkKind(IntEnum):
     STEP, CALL, READ, RESTORE, HAND_OVER = range(5)
 
 
-NUMBER_TYPES: Final[dict[VariableType, int]] = {
-    "Float64": 0,
-    "Float32": 1,
-    "Int8": 2,
-    "UInt8": 3,
-    "Int16": 4,
-    "UInt16": 5,
-    "Int32": 6,
-    "UInt32": 7,
-    "Int64": 8,
-    "Enumeration": 8,
-    "UInt64": 9,
-    "Boolean": 10,
-}
+_NUMBERS: Final = "Float64 Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 Boolean".split()  # noqa: SIM905  shorter
+NUMBER_TYPES: Final = cast(
+    "dict[VariableType, int]", {name: number for number, name in enumerate(_NUMBERS)} | {"Enumeration": 8}
+)
 """The types of `Move`. An Enumeration is 64 bits in a ring."""
 
 
@@ -247,7 +237,7 @@ class Span(Structure):
 
 
 @_declared("Said")
-class Said(Structure):
+class Said(_Changed):
     """What a model says in a step besides its status, and how far it is."""
 
     @property
@@ -255,15 +245,6 @@ class Said(Structure):
         """Of the results of a step in FMI 3.0: `event_needed`, `terminate`, `early` and `last_time`."""
         first = ctypes.addressof(self)
         return first, first + 1, first + 2, first + Said.last_time.offset
-
-    def note(self, *, step: int | None = None, time: float | None = None, quiet_until: float | None = None) -> None:
-        """Change what is given."""
-        if step is not None:
-            self.step = step
-        if time is not None:
-            self.time = time
-        if quiet_until is not None:
-            self.quiet_until = quiet_until
 
     def clear(self) -> None:
         """Before a step in FMI 3.0: nothing is said yet."""

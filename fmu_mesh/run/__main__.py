@@ -1,7 +1,8 @@
 """The program of one process of a run: `python -Pm fmu_mesh.run node PLAN NODE`, or `master PLAN`, or `gateway PLAN`.
 
 PLAN is the file of a run plan. The launcher lets the fork server start it, which is `forks DESCRIPTOR`; a node that
-needs another Python is started by exec. The process ends with the process that started it.
+needs another Python is started by exec. A batch lets the fork server start `copies`. The process ends with the process
+that started it.
 """
 
 from __future__ import annotations

@@ -11,8 +11,9 @@ mistyped: `fmu_mesh.api.batch` checks them.
 # as a call for `CopyThreads.each` runs on the thread of its copy, while this one waits. The library releases the lock
 # of the interpreter while it steps, so other threads of the program go on; they may look at nothing here.
 #
-# A step of an FMU that does not return cannot be ended: the process is the user's. Ctrl-C ends a call between two
-# pieces of it, so all copies are at one point then.
+# In the process of the user, a step of an FMU that does not return cannot be ended. In one of ours, a watch looks at
+# the calls, and asks from its thread which copy is under way (`fmu_mesh.run.copies_role`). Ctrl-C ends a call between
+# two pieces of it, so all copies are at one point then.
 
 from __future__ import annotations
 
@@ -28,12 +29,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..errors import CallRefused, FmuError, FmuMeshError, NotInOneProcess, TerminationRequested
-from ..instances.call_guard import Unwatched
+from ..instances.call_guard import CallWatch, Unwatched
 from ..instances.contract import ChangesProcess, Instance, LogMessage
 from ..instances.kept_models import SharedModels
 from ..instances.registry import open_instance
 from ..node.burst_engine import BurstEngine
 from ..node.inputs import TimedInputs
+from ..node.stepping import Runner
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import BurstEnd, WorkKind
@@ -43,8 +45,8 @@ from ..system.plan import NodePlan, Plan
 from ..system.process_sharing import SharedProcess
 from ..text import listed
 from ..variables.value_types import is_text
-from .copy_pieces import Pieces
-from .copy_threads import CopyThreads
+from .copy_threads import CopyThreads, Pieces
+from .first_points import FirstPoints
 from .hosted_system import IN_ONE_NODE, HostedSystem, in_one_node
 from .local_system import opening_of
 from .one_process import claims_in
@@ -68,14 +70,22 @@ class Copies:
         folder: an existing private folder; FMUs are extracted below it.
         log: called with every log message of a model.
         threads: how many threads call the FMUs.
+        watch: watches the calls of FMUs, if somebody does.
 
     Attributes:
         points: the last point that all instances of a copy have reached, shape (count,).
         errors: how copies have ended before the stop time, by their numbers.
     """
 
-    def __init__(
-        self, run: RunPlan, count: int, folder: Path, log: Callable[[LogMessage], None], threads: int = 1
+    def __init__(  # noqa: PLR0913  what copies need of their surroundings
+        self,
+        run: RunPlan,
+        count: int,
+        folder: Path,
+        log: Callable[[LogMessage], None],
+        threads: int = 1,
+        *,
+        watch: CallWatch | Unwatched | None = None,
     ) -> None:
         self.errors: dict[int, FmuMeshError] = {}
         self._run = run
@@ -85,6 +95,8 @@ class Copies:
         self._places = _rings_of(plan)
         self._rooms = HostMemory.rooms(self._places[0], count, _bytes_beside(self._node))
         self._log = log
+        self._watch = watch or Unwatched()
+        self._by_python: int | None = None
         self._copies: list[SystemCopy] = []
         self._table = (native.CopyTable * count)()
         self._several = threads > 1
@@ -99,9 +111,7 @@ class Copies:
         self._timed: list[str] = []
         self._accesses: dict[tuple[str, Verb, tuple[str, ...]], Any] = {}
         self._columns: dict[tuple[str, str], Any] = {}
-        self._first: dict[int, SavedCopy] = {}
-        self._first_kept = b""
-        self._back: _WaysBack | None = None
+        self._first = FirstPoints(self._threads, self._copies, self._table)
         self._limits = ExitStack()
         self._pieces = Pieces()
 
@@ -167,16 +177,36 @@ class Copies:
 
     def _end_of(self, number: int, call: Callable[[], object]) -> None:
         """Make a call for a copy; what it raises ends the copy."""
+        self._by_python = number
         try:
             call()
         except (FmuError, TerminationRequested) as error:
-            point = int(self.points[number])
-            self._copies[number].located(error, point)
-            self.errors[number] = error
-            self._ended[number] = True
-            self._goals[number] = point
-            if self._back is not None:
-                self._back.forget(number)
+            self._copies[number].located(error, int(self.points[number]))
+            self.end(number, error)
+        finally:
+            self._by_python = None
+
+    def end(self, number: int, error: FmuMeshError) -> None:
+        """From now on a copy takes no steps, until it is reset."""
+        self.errors[number] = error
+        self._ended[number] = True
+        self._goals[number] = self.points[number]
+        self._first.leave(number)
+
+    @property
+    def under_way(self) -> tuple[int | None, Runner | None]:
+        """From any thread: which copy a call is for, and the instance whose step it is; None if it is not known."""
+        number = self._by_python
+        begun = range(len(self._copies) - 1, -1, -1) if number is None else (number,)
+        for own in begun:  # those before the last one may have a step that Python takes later
+            if not self._ended[own] and (runner := self._copies[own].current) is not None:
+                return own, runner
+        return number, None
+
+    def reached(self, number: int) -> int:
+        """From any thread: the last point that all instances of a copy have reached, also within a call."""
+        current = self._copies[number].current
+        return min(self._copies[number].engine.covered, self._last) if current is not None else int(self.points[number])
 
     # --- values
 
@@ -275,6 +305,8 @@ class Copies:
             FmuError: an FMU cannot, or has failed.
         """
         saved: list[SavedCopy] = []
+        for _, models in self._models:
+            models.reset_from_now_on()
         try:
             every = range(len(self._copies))
             self._threads.each(every, lambda number: saved.append(self._copies[number].save(int(self.points[number]))))
@@ -287,13 +319,17 @@ class Copies:
         """Bring the ``wanted`` copies back to what was saved of them.
 
         What an FMU raises is in `errors`, and ends its copy.
+
+        Raises:
+            CallRefused: a copy has other instances since then; those before it are there.
         """
 
         def one(number: int) -> None:
+            self._copies[number].restore(saved[number])
             self._back_at(number, saved[number].point)
-            self._end_of(number, partial(self._copies[number].restore, saved[number]))
 
-        self._threads.each(np.flatnonzero(wanted).tolist(), one)
+        numbers = np.flatnonzero(wanted).tolist()
+        self._threads.each(numbers, lambda number: self._end_of(number, partial(one, number)))
 
     def free(self, saved: Sequence[SavedCopy]) -> None:
         """Free saved copies, in the order of the copies."""
@@ -309,22 +345,16 @@ class Copies:
         Raises:
             FmuError: one cannot be initialized, and has ended; those after it stay as they were.
         """
-        rest = wanted
-        if overrides is None and self._back is not None:
-            for name in self._is_set:
-                np.copyto(self._set_at[name], -1, where=wanted)
-            if (left := self._back.restore(wanted)) is None:
-                return
-            rest = left
-        self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
+        rest = self._first.restore(wanted) if overrides is None else wanted
+        back = wanted if rest is None else wanted & ~rest
+        for name in self._is_set:
+            np.copyto(self._set_at[name], -1, where=back)
+        if rest is not None:
+            self._threads.each(np.flatnonzero(rest).tolist(), partial(self._reset, overrides))
 
     def _reset(self, overrides: Callable[[int], Overrides] | None, number: int) -> None:
         """Make a copy as a new one."""
-        copy, first = self._copies[number], self._first.pop(number, None)
-        if first is not None:
-            copy.free(first)
-        if self._back is not None:
-            self._back.forget(number)
+        self._first.free(number)
         self._ended[number] = True
         own = overrides(number) if overrides is not None else {}
         try:
@@ -333,25 +363,14 @@ class Copies:
             self.errors[number] = error
             raise
         if overrides is None and self.why_not_saved is None:
-            self._note_first(number)
-
-    def _note_first(self, number: int) -> None:
-        """A copy is at its first point, and may come back there."""
-        first = self._copies[number].save(0)
-        if first.kept == self._first_kept:  # as in most copies: then it is once in the processor's caches
-            first = first._replace(kept=self._first_kept)
-        self._first[number], self._first_kept = first, first.kept
-        by_calls = self._copies[number].restored_by(first)
-        if by_calls is not None and native.library is not None:
-            calls, pieces = by_calls
-            self._back = self._back or _WaysBack(self._threads, self._table, len(calls), len(pieces))
-            self._back.note(number, calls, pieces)
+            self._first.note(number)
 
     def _begin(self, number: int, overrides: Overrides, *, is_new: bool) -> None:
-        copy = self._copies[number]
+        copy, self._by_python = self._copies[number], number
         try:
             copy.begin(overrides, is_new=is_new)
         finally:  # without instances, nothing can be read
+            self._by_python = None
             for own, columns in self._columns.items():
                 columns[number] = copy.column(*own)
         if isinstance(copy.engine, BurstEngine):
@@ -371,15 +390,17 @@ class Copies:
 
     def close(self) -> None:
         """Close all instances and free all models. Never raises; may be called twice."""
-        first, self._first = self._first, {}
-        self._threads.each([*first], lambda number: self._copies[number].free(first[number]))
-        self._threads.each(range(len(self._copies)), lambda number: self._copies[number].close())
+        self._threads.each(range(len(self._copies)), self._close)
         for thread, (_, models) in enumerate(self._models):
             self._threads.on(thread, models.close)
         self._models.clear()
         self._copies.clear()
         self.end_threads()
         self._limits.close()
+
+    def _close(self, number: int) -> None:
+        self._first.free(number)
+        self._copies[number].close()
 
     def end_threads(self) -> None:
         """End the threads that were started here, from any thread; after that, only `close` is allowed."""
@@ -394,7 +415,7 @@ class Copies:
             for name in self._plan.order:
                 if (refusal := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:
                     raise NotInOneProcess(
-                        refusal, hint="Make a batch of one copy, or sweep the mesh, which uses processes."
+                        refusal, hint="Give each copy a process (`processes` as many as copies), or make one copy."
                     )
 
     def _system(self, number: int) -> HostedSystem:
@@ -402,59 +423,12 @@ class Copies:
         room, opened = self._rooms[number], partial(self._opened, self._threads.part_of(number))
         if number < len(self._copies):  # it had another system
             room[:] = bytes(len(room))
-        return HostedSystem(self._plan, Unwatched(), opened, self._log, alone=True, places=self._places, room=room)
+        return HostedSystem(self._plan, self._watch, opened, self._log, alone=True, places=self._places, room=room)
 
     def _opened(self, thread: int, name: str) -> Instance:
         folder, models = self._models[thread]
         opening = opening_of(self._plan, name, folder, self._log, self._run.showing)
         return open_instance(replace(opening, content=self._run.contents.get(name), kept=models))
-
-
-class _WaysBack:
-    """How the library brings copies back to their first point.
-
-    Args:
-        threads: of the copies.
-        copies: their tables.
-        states: how many FMUs a copy has.
-        pieces: how many pieces of memory.
-    """
-
-    def __init__(self, threads: CopyThreads, copies: Any, states: int, pieces: int) -> None:  # noqa: ANN401  an array of ctypes
-        self._threads, self._copies = threads, copies
-        self._sizes = states, 1 + pieces
-        self._calls = (native.CopyCall * (len(copies) * states))()
-        self._pieces = (native.Keep * (len(copies) * (1 + pieces)))()
-        self._zeros = (ctypes.c_int64 * 2)()
-
-    def note(self, number: int, calls: list[native.CopyCall], pieces: list[native.Keep]) -> None:
-        """From now on, a copy comes back by these."""
-        states, size = self._sizes
-        point = ctypes.addressof(self._copies[number]) + native.CopyTable.point.offset  # and the goal is beside it
-        self._calls[number * states : (number + 1) * states] = calls
-        self._pieces[number * size : (number + 1) * size] = [
-            native.Keep(point, ctypes.addressof(self._zeros), 2),
-            *pieces,
-        ]
-
-    def forget(self, number: int) -> None:
-        """A copy has ended, or is made anew."""
-        self._pieces[number * self._sizes[1]] = native.Keep()
-
-    def restore(self, wanted: Truths) -> Truths | None:
-        """Bring those of ``wanted`` back that it knows; which ones are left, if any."""
-        left = wanted.copy()
-        (calls, pieces), (calls_each, pieces_each) = (self._calls, self._pieces), self._sizes
-        if self._threads.work(
-            WorkKind.RESTORE,
-            calls=ctypes.addressof(calls),
-            calls_each=calls_each,
-            pieces=ctypes.addressof(pieces),
-            pieces_each=pieces_each,
-            wanted=left.ctypes.data,
-        ):
-            return left
-        return None
 
 
 def _bytes_beside(node: NodePlan) -> int:

@@ -1,4 +1,4 @@
-"""The threads of many copies: each calls the FMUs of a part of them, from the first call to the last.
+"""How calls for many copies are divided: among threads, of which each has a part of the copies, and into pieces.
 
 Owns which thread has which copies, and how a call is given to all of them. What a copy does is `fmu_mesh.run.copies`.
 """
@@ -18,20 +18,28 @@ Owns which thread has which copies, and how a call is given to all of them. What
 from __future__ import annotations
 
 import ctypes
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from threading import Thread
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
+from ..instances.process_state import ProcessState
+from ..node.engine import STATE_CHECK_S
 from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import WorkKind
 from ..system.memory_map import map_memory
 
-__all__ = ["CopyThreads"]
+__all__ = ["CopyThreads", "Pieces"]
+
+_PIECE_S: Final = 0.05
+"""About how long in s a piece takes: then somebody may end the call."""
+
+_MANY_POINTS: Final = 4096
 
 
 class CopyThreads:
@@ -59,7 +67,7 @@ class CopyThreads:
             for own, done, (first, end) in zip(self._members, self._done, self.parts, strict=True)
         ]
         self._workers = native.table(native.WorkerTable, places)
-        self._call: Callable[[], object] | None = None
+        self._handed_over: list[Callable[[], object]] = []
         self._error: BaseException | None = None
         self._others = [Thread(target=self._serve, args=[number], daemon=True) for number in range(1, threads)]
         for thread in self._others:
@@ -95,9 +103,9 @@ class CopyThreads:
         if thread == 0:
             call()
             return
-        self._call = call
+        self._handed_over.append(call)
         self.work(WorkKind.HAND_OVER, size=thread)
-        error, self._call, self._error = self._error, None, None
+        error, self._error = self._error, None
         if error is not None:
             raise error
 
@@ -113,17 +121,50 @@ class CopyThreads:
         own, done = ctypes.addressof(self._workers[number]), self._done[number]
         while True:
             native.library.copies_serve(own)
-            call = self._call
+            goes_on = bool(self._handed_over)
             try:
-                if call is not None:
-                    call()
+                if goes_on:
+                    self._handed_over.pop()()
             except BaseException as error:  # noqa: BLE001  it is raised on the first thread
                 self._error = error
             done.raise_to(done.value + 1)
-            if call is None:
+            if not goes_on:
                 return
 
 
 def _in_turn(copies: Sequence[int], call: Callable[[int], object]) -> None:
     for number in copies:
         call(number)
+
+
+class Pieces:
+    """Takes long calls in pieces of about 50 ms, and looks after the state of the process after them."""
+
+    def __init__(self) -> None:
+        self._points = 1
+        self._looked_after: ProcessState | None = None
+        self._look_at = 0.0
+
+    def step(self, points: int, is_asked: Callable[[], bool], take: Callable[[int], object]) -> bool:
+        """Take a step over so many points; whether it has changed the state of the process, which is restored."""
+        self._looked_after = self._looked_after or ProcessState()
+        try:
+            self.take(points, is_asked, take)
+        finally:
+            is_changed = False
+            if (now := time.perf_counter()) >= self._look_at:
+                self._look_at = now + STATE_CHECK_S
+                is_changed = self._looked_after.restore()
+        return is_changed
+
+    def take(self, points: int, is_asked: Callable[[], bool], take: Callable[[int], object]) -> None:
+        """Take a step over so many points in pieces, which change nothing of this process."""
+        while points > 0 and not is_asked():
+            piece, began = min(points, self._points), time.perf_counter()
+            take(piece)
+            points -= piece
+            took_s = time.perf_counter() - began
+            if took_s < _PIECE_S / 2 and piece == self._points:
+                self._points = min(2 * piece, _MANY_POINTS)
+            elif took_s > _PIECE_S:
+                self._points = max(1, self._points // 2)

@@ -5,8 +5,9 @@ then forks a process for each request of its launcher. It loads no model. A fork
 shares the memory of all imported modules with the others.
 
 Launcher and server share a pair of sockets. A request has the arguments of `fmu_mesh.run.__main__`, and two descriptors
-for standard output and standard error. The server answers with the process id, and later with the exit code. When the
-launcher sends no more requests, the server ends after its last process.
+for standard output and standard error; the numbers of further ones are its last arguments. The server answers with the
+process id, and later with the exit code. When the launcher sends no more requests, the server ends after its last
+process. A batch uses the server as a launcher does.
 """
 
 # Who meets here (ADR 71). In the launcher: the thread of `Launcher.run`, which asks for processes, the thread "fork
@@ -59,6 +60,7 @@ _ROOM: Final = "-" * 64
 
 _SIGNALS: Final = (signal.SIGCHLD, signal.SIGINT, signal.SIGTERM)
 _REQUEST_BYTES: Final = 1 << 16
+_MOST_DESCRIPTORS: Final = 4
 _KILL_S: Final = 5.0
 """How long processes may take to end after the server was asked to end them. Each ends itself in less."""
 
@@ -119,15 +121,26 @@ class ForkServer:
         """Ask for a process of the mesh ``mesh``, with these arguments of `fmu_mesh.run.__main__`."""
         output, errors = os.pipe(), os.pipe()
         forked = Forked(os.fdopen(output[0], "rb"), os.fdopen(errors[0], "rb"))
-        self._forked.append(forked)
-        request = msgspec.msgpack.encode(_Request(len(self._forked) - 1, mesh, arguments))
-        try:
-            socket.send_fds(self._control, [request], [output[1], errors[1]])
-        except OSError:  # the server is gone, which its own end tells
-            forked.orphaned()
+        self._ask(forked, mesh, arguments, [output[1], errors[1]])
         os.close(output[1])
         os.close(errors[1])
         return forked
+
+    def fork_with(self, mesh: str, *arguments: str, descriptors: Sequence[int]) -> Forked:
+        """As `fork`, with the output of this process, and with descriptors, whose numbers are its last arguments."""
+        forked = Forked()
+        with open(os.devnull, "w", encoding="utf-8") as nowhere:  # noqa: PTH123  it has to be closed
+            output = [number if _is_open(number) else nowhere.fileno() for number in (1, 2)]
+            self._ask(forked, mesh, arguments, [*output, *descriptors])
+        return forked
+
+    def _ask(self, forked: Forked, mesh: str, arguments: tuple[str, ...], descriptors: Sequence[int]) -> None:
+        self._forked.append(forked)
+        request = msgspec.msgpack.encode(_Request(len(self._forked) - 1, mesh, arguments))
+        try:
+            socket.send_fds(self._control, [request], descriptors)
+        except OSError:  # the server is gone, which its own end tells
+            forked.orphaned()
 
     def finish(self) -> None:
         """Ask for no more processes: the server ends when all have ended."""
@@ -185,13 +198,13 @@ class Forked:
 
     Attributes:
         pid: its process id; None before it has started.
-        stdout: the reading end of its standard output.
+        stdout: the reading end of its standard output; None: it has that of this process.
         stderr: the same of its standard error.
     """
 
     stdin: None = None
 
-    def __init__(self, stdout: IO[bytes], stderr: IO[bytes]) -> None:
+    def __init__(self, stdout: IO[bytes] | None = None, stderr: IO[bytes] | None = None) -> None:
         self.stdout = stdout
         self.stderr = stderr
         self.pid: int | None = None
@@ -220,9 +233,9 @@ class Forked:
             return None
         return self._known_code()
 
-    def wait(self) -> int:
+    def wait(self, timeout_s: float | None = None) -> int:
         """Wait until the server has told its exit code, or is gone; then the code says that a process is missing."""
-        self._ended.wait()
+        self._ended.wait(timeout_s)
         return self._known_code()
 
     def send_signal(self, number: int) -> None:
@@ -256,6 +269,14 @@ def serve(control: int) -> Job | None:
     gc.freeze()  # otherwise the next collection in a forked process would copy the memory that it shares
     gc.enable()
     return _Server(control, partial(job_of, forks=True)).run()
+
+
+def _is_open(descriptor: int) -> bool:
+    try:
+        os.fstat(descriptor)
+    except OSError:
+        return False
+    return True
 
 
 class _Server:
@@ -308,7 +329,7 @@ class _Server:
 
         from .process import die_with_parent  # noqa: PLC0415 as above
 
-        data, descriptors, _, _ = socket.recv_fds(self._control, _REQUEST_BYTES, 2)
+        data, descriptors, _, _ = socket.recv_fds(self._control, _REQUEST_BYTES, _MOST_DESCRIPTORS)
         if not data:
             self._accepting = False
             return None
@@ -318,7 +339,7 @@ class _Server:
             return None
         setproctitle(f"fmu-mesh fork server {request.mesh}")
         die_with_parent()  # no longer by SIGKILL: the signal is passed on
-        job = self._job(*request.arguments)
+        job = self._job(*request.arguments, *map(str, descriptors[2:]))
         # A signal for the server must not run the handler of the server in the new process.
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
         server = os.getpid()
@@ -352,7 +373,7 @@ class _Server:
         self._control.close()
         for own in (self._reading, self._writing):
             os.close(own)
-        for target, descriptor in enumerate(descriptors, start=1):
+        for target, descriptor in enumerate(descriptors[:2], start=1):
             os.dup2(descriptor, target)
             os.close(descriptor)
         sys.argv[1:] = request.arguments

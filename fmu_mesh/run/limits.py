@@ -7,6 +7,7 @@ a command and imports nothing large, so that the check itself works.
 from __future__ import annotations
 
 import errno
+import os
 import re
 import resource
 from collections.abc import Mapping
@@ -15,7 +16,15 @@ from pathlib import Path
 
 from ..errors import ConfigurationError
 
-__all__ = ["FEWEST_MIB", "RUN_MIB", "address_space_problem", "needed_mib", "out_of_memory", "ring_problem"]
+__all__ = [
+    "FEWEST_MIB",
+    "RUN_MIB",
+    "address_space_problem",
+    "needed_mib",
+    "out_of_memory",
+    "resident_bytes",
+    "ring_problem",
+]
 
 FEWEST_MIB = 300
 """Need of any command in MiB. Measured on two processors: `check` 200, `plot` 270."""
@@ -52,6 +61,12 @@ def address_space_problem(mib: int) -> ConfigurationError | None:
         f"{_limited(limit)}, and this command needs {_gigabytes(mib << 20)} of it, most of which it never uses",
         hint=_WAY_OUT,
     )
+
+
+def resident_bytes() -> int:
+    """The memory that this process takes."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def out_of_memory(error: BaseException) -> ConfigurationError | None:

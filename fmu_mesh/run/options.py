@@ -69,6 +69,10 @@ class BatchOptions(OpenOptions, frozen=True):
     threads: Annotated[
         int, Option("step the copies on so many threads, each with a library of its own of each FMU", least=1)
     ] = 1
+    processes: Annotated[
+        int | None,
+        Option("have the copies in so many processes; 1: in this one; default: as many as pay", least=1),
+    ] = None
 
 
 class PlanOptions(VariantOptions, frozen=True, kw_only=True):

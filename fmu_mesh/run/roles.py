@@ -52,13 +52,14 @@ __all__ = ["job_of", "run_master", "run_node"]
 log = logging.getLogger(__name__)
 
 
-def job_of(role: str, plan: str, node: str = "", *, forks: bool = False) -> Callable[[], None]:
+def job_of(role: str, plan: str, node: str = "", *others: str, forks: bool = False) -> Callable[[], None]:
     """What a process does that the launcher starts: as a `node`, as the `master`, or as the `gateway`.
 
     Args:
-        role: one of the three.
+        role: one of the three; or `copies`, which a batch starts.
         plan: the file of the run plan.
-        node: name of the node.
+        node: name of the node, or the number of the process with copies.
+        others: what a process with copies needs besides.
         forks: whether the process is forked from this one. Then what several nodes need is done here, once, such as
             extracting the FMU of all.
     """
@@ -74,6 +75,10 @@ def job_of(role: str, plan: str, node: str = "", *, forks: bool = False) -> Call
             run_node(run)
 
         return be_node
+    if role == "copies":
+        from .copies_role import job_with_copies  # noqa: PLC0415  a run has none
+
+        return job_with_copies(read_run(file), node, *others)
 
     def be_other() -> None:
         run = read_run(file)

@@ -12,8 +12,9 @@ from typing import Any, Literal, NamedTuple, cast
 
 from numpy.typing import NDArray
 
-from ..errors import FmuError, FmuMeshError, TerminationRequested
+from ..errors import CallRefused, FmuError, FmuMeshError, TerminationRequested
 from ..instances.contract import AccessedNatively, KeepsState, StepsNatively
+from ..instances.instance_wrapper import AroundNativeSteps
 from ..node.engine import Engine
 from ..node.inputs import TimedInputs, set_input
 from ..node.stepping import Runner
@@ -28,11 +29,15 @@ Overrides = Mapping[str, Mapping[str, PlainValue]]
 
 
 class SavedCopy(NamedTuple):
-    """The state of one copy at a point; the states of its instances by name, and its texts by the name ""."""
+    """The state of one copy at a point; the states of its instances by name, and its texts by the name "".
+
+    ``instances`` stands for the instances that the states belong to.
+    """
 
     point: int
     states: Mapping[str, object]
     kept: bytes
+    instances: object
 
 
 class SystemCopy:
@@ -40,13 +45,21 @@ class SystemCopy:
 
     def __init__(self, made: Callable[[], HostedSystem]) -> None:
         self._made = made
-        self._system = made()
+        self._make()
         self.engine: Engine
+
+    def _make(self) -> None:
+        self._system, self._instances = self._made(), object()
 
     @property
     def runners(self) -> dict[str, Runner]:
         """The instances, by name."""
         return self._system.runners
+
+    @property
+    def current(self) -> Runner | None:
+        """From any thread: the instance whose step is under way, or has failed."""
+        return self.engine.current if hasattr(self, "engine") else None
 
     def begin(self, overrides: Overrides, *, is_new: bool) -> None:
         """Initialize all instances; then they are at point 0. Those that cannot begin again are opened anew.
@@ -60,13 +73,13 @@ class SystemCopy:
         """
         if is_new or (self._system.runners and not self._system.end()):
             self._system.close()
-            self._system = self._made()
+            self._make()
         try:
             self._system.open()
             self.engine = self._system.begin(overrides)
         except BaseException:
             self._system.close()
-            self._system = self._made()
+            self._make()
             raise
 
     def located(self, event: FmuError | TerminationRequested, point: int) -> None:
@@ -90,7 +103,7 @@ class SystemCopy:
         if instance not in self.runners:  # it could not begin
             return None
         own = self.runners[instance].instance
-        return own.access(verb, names) if isinstance(own, AccessedNatively) else None
+        return own.access(verb, names) if isinstance(own, AroundNativeSteps) else None
 
     def column(self, instance: str, name: str) -> native.CopyOutput:
         """Where an output lies in the rows of an instance."""
@@ -119,14 +132,23 @@ class SystemCopy:
             for name, keeper in self._keepers():
                 states[name] = keeper.get_state()
         except BaseException:
-            self.free(SavedCopy(point, states, b""))
+            self.free(SavedCopy(point, states, b"", self._instances))
             raise
         text = tuple(part.copy() for runner in self.runners.values() for part in _texts(runner))
         kept = b"".join(ctypes.string_at(address, size) for address, size in self._spans())
-        return SavedCopy(point, states | {"": text}, kept)
+        return SavedCopy(point, states | {"": text}, kept, self._instances)
 
     def restore(self, saved: SavedCopy) -> None:
-        """Bring it back to a point; see `save`."""
+        """Bring it back to a point; see `save`.
+
+        Raises:
+            CallRefused: it has other instances since then.
+        """
+        if saved.instances is not self._instances:
+            text = (
+                "a copy whose FMU had failed has new instances, and a state that was saved before belongs to the others"
+            )
+            raise CallRefused(text, hint="Save a new state after the reset.")
         for name, keeper in self._keepers():
             keeper.set_state(saved.states[name])
         first = 0
@@ -158,8 +180,8 @@ class SystemCopy:
         return calls, keeps
 
     def free(self, saved: SavedCopy) -> None:
-        """Free what was saved."""
-        for name, keeper in self._keepers():
+        """Free what was saved; the states of instances that are closed went with them."""
+        for name, keeper in self._keepers() if saved.instances is self._instances else ():
             if name in saved.states:
                 with suppress(FmuMeshError, ValueError):  # it has failed before, and its memory goes with it
                     keeper.free_state(saved.states[name])

@@ -78,8 +78,8 @@ def to_value(plain: object, variable: Variable, *, finite: bool = False) -> Valu
     Raises:
         ValueRefused: it is no value of the variable's type and shape, or out of its range.
     """
-    is_free = variable.minimum is None and variable.maximum is None and not finite
-    if plain.__class__ is float and variable.type == "Float64" and not variable.shape and is_free:
+    is_number = variable.type == "Float64" and not variable.shape
+    if is_number and type(plain) is float and math.isfinite(plain) and _within(plain, variable):
         return plain  # most start values, in each run
     if hasattr(plain, "tolist"):
         import numpy as np  # noqa: PLC0415 only for whoever has given an array

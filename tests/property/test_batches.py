@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -16,7 +18,10 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 import fmu_mesh
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
+from fmu_mesh.run import preparing
+from fmu_mesh.run.run_plan import RunPlan
 from tests.helpers import FMUS
 
 H = 0.01
@@ -85,13 +90,27 @@ def mesh_of(kind: str, folder: Path, event_fmu: Callable[..., Path]) -> fmu_mesh
     return fmu_mesh.load(config)
 
 
-@pytest.fixture(scope="module", params=[("native", 1), ("mixed", 1), ("native", 2)], ids=["native", "mixed", "threads"])
+WAYS: dict[str, dict[str, Any]] = {"alone": {}, "threads": {"threads": 2}, "processes": {"processes": 2}}
+"""Where copies are."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("native", "alone"),
+        ("mixed", "alone"),
+        ("native", "threads"),
+        ("native", "processes"),
+        ("mixed", "processes"),
+    ],
+    ids=" ".join,
+)
 def pair(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, event_fmu: Callable[..., Path]
 ) -> Iterator[Pair]:
-    kind, threads = request.param
+    kind, way = request.param
     mesh = mesh_of(kind, tmp_path_factory.mktemp("batches"), event_fmu)
-    with mesh.batch(COPIES, threads=threads) as batch:
+    with mesh.batch(COPIES, **WAYS[way]) as batch:
         yield Pair(kind, mesh, batch)
 
 
@@ -198,9 +217,10 @@ class Turning(fmu_mesh.Component):
 """
 
 
-@pytest.mark.parametrize("library", [True, False], ids=["C", "Python"])
+@pytest.mark.parametrize(("library", "processes"), [(True, 1), (False, 1), (True, 2)], ids=["C", "Python", "processes"])
 def test_components_arrays_texts_and_scenarios_are_the_same(
     library: bool,  # noqa: FBT001 a parameter of tests
+    processes: int,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -227,7 +247,7 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
     mesh = fmu_mesh.load(config)
     names = ["turning.y", "turning.word", "turning.count", "gain.y", "fast.y", "turning.u", "cart.x", "cart.force"]
     inputs = np.arange(6.0).reshape(2, 3)
-    with mesh.batch(2) as batch, mesh.open() as first, mesh.open() as second:
+    with mesh.batch(2, processes=processes) as batch, mesh.open() as first, mesh.open() as second:
         systems = [first, second]
         for points in (1, 9, 30, 50, 25):
             batch.step(points)
@@ -252,11 +272,11 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
     assert batch.point.tolist() == [125, 10]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(threads: int) -> None:
+@pytest.mark.parametrize("way", WAYS)
+def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(way: str) -> None:
     mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=None)
     mesh.add("cart", fmu=str(FMUS / "CartPole.fmu"))
-    with mesh.batch(3, threads=threads) as batch:
+    with mesh.batch(3, **WAYS[way]) as batch:
         batch.step(10)
         threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
         with pytest.raises(KeyboardInterrupt):
@@ -267,10 +287,14 @@ def test_ctrl_c_ends_a_call_with_all_copies_at_one_point(threads: int) -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize(("library", "threads"), [(True, 1), (False, 1), (True, 3)], ids=["C", "Python", "threads"])
+@pytest.mark.parametrize(
+    ("library", "way"),
+    [(True, {}), (False, {}), (True, {"threads": 3}), (True, {"processes": 3})],
+    ids=["C", "Python", "threads", "processes"],
+)
 def test_each_copy_ends_where_a_single_system_ends(
     library: bool,  # noqa: FBT001 a parameter of tests
-    threads: int,
+    way: dict[str, Any],
     faulty: Path,
     event_fmu: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
@@ -287,7 +311,7 @@ def test_each_copy_ends_where_a_single_system_ends(
     mesh.connect("faulty.y", "last.u")
     fail_at = [1e300, 0.42, 1e300, 0.55, 0.07]
     end = [1000, 1000, 3, 2, 1000]
-    with mesh.batch(5, threads=threads) as batch:
+    with mesh.batch(5, **way) as batch:
         batch.reset(start_values={"faulty.fail_at": fail_at, "stairs.end": end})
         for points in (1, 6, 13, 30, 60):
             batch.step(points)
@@ -326,6 +350,52 @@ def test_number_of_copies_is_one_or_more(copies: Any, words: str) -> None:  # no
         mesh.batch(copies)
 
 
+def test_a_state_of_instances_that_have_failed_is_refused(faulty: Path) -> None:
+    mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
+    mesh.add("faulty", fmu=str(faulty))
+    with mesh.batch(2) as batch:
+        batch.reset(start_values={"faulty.fail_at": [0.055, 1e300]})
+        state = batch.save()
+        batch.step(10)
+        batch.reset([True, False], {"faulty.fail_at": 1e300})
+        batch.step(3)
+
+        with pytest.raises(fmu_mesh.CallRefused, match="a state that was saved before belongs to the others"):
+            batch.restore(state, [True, False])
+        batch.restore(state, [False, True])
+        batch.step(20)
+        assert batch.point.tolist() == [23, 20]
+
+
+@pytest.mark.parametrize("how", ["closed", "dropped_elsewhere"])
+def test_threads_end_with_their_batch(how: str) -> None:
+    before = {*threading.enumerate()}
+    mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
+    mesh.add("gain", fmu=str(FMUS / "Gain.fmu"))
+    batches = [mesh.batch(4, threads=3)]
+    batches[0].step()
+    assert len({*threading.enumerate()} - before) == 2
+
+    if how == "closed":
+        batches.pop().close()
+    else:
+        other = threading.Thread(target=batches.clear)
+        other.start()
+        other.join()
+
+    assert {*threading.enumerate()} <= before
+
+
+def test_a_batch_that_is_left_open_lets_the_interpreter_end() -> None:
+    text = "import fmu_mesh; mesh = fmu_mesh.Mesh('m', step_size=0.1, stop_time=1.0)"
+    text += f"; mesh.add('gain', fmu='{FMUS}/Gain.fmu'); batch = mesh.batch(4, threads=2)"
+    program = f"{text}; batch.step(); print(batch.point.tolist())"
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=100)
+
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[1, 1, 1, 1]\n", "")
+
+
 @pytest.fixture
 def gains() -> Iterator[fmu_mesh.Batch]:
     mesh = fmu_mesh.Mesh("m", step_size=H, stop_time=1.0)
@@ -360,6 +430,30 @@ def test_start_values_of_other_copies_are_ignored(gains: fmu_mesh.Batch) -> None
 
     assert gains.get("gain.k").tolist() == [1.0, 4.0]
     assert gains.point.tolist() == [3, 0]
+
+
+def test_a_batch_is_planned_once_for_the_same_start_values(
+    gains: fmu_mesh.Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned, original = list[object](), preparing.planned
+
+    def counting(*given: Any, **named: Any) -> RunPlan:  # noqa: ANN401  those of the function
+        planned.append(given)
+        return original(*given, **named)
+
+    monkeypatch.setattr(preparing, "planned", counting)
+    for value in (1.0, 2.0, 3.0):
+        gains.reset(start_values={"gain.k": [value, -value]})
+        assert gains.get("gain.k").tolist() == [value, -value]
+    assert len(planned) == 1
+    gains.reset(start_values={"gain.k": 4.0, "gain.u": 5.0})
+    assert len(planned) == 2
+
+    for _ in range(2):  # what is wrong is planned, which says why
+        with pytest.raises(ConfigurationError, match="'NaN' for the Real 'k'; expected a finite number"):
+            gains.reset(start_values={"gain.k": np.nan})
+    assert len(planned) == 4
+    assert gains.get("gain.k").tolist() == [4.0, 4.0]
 
 
 def test_results_go_into_given_arrays(gains: fmu_mesh.Batch) -> None:

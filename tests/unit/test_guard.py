@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -21,9 +21,11 @@ from fmu_mesh import FMIAdapter
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
 from fmu_mesh.instances.call_guard import CallWatch, current_function
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.instances.fmi.calls import FmpyCalls
+from fmu_mesh.instances.fmi.calls import FmpyCalls, Function
 from fmu_mesh.instances.fmi.co_simulation.fmi2 import Fmi2Instance
+from fmu_mesh.instances.fmi.fmu_values import Verb
 from fmu_mesh.instances.process_state import floating_point_changed, kept_state, restore_floating_point
+from fmu_mesh.variables.value_types import VariableType
 from fmus.build import find_compiler
 from tests.fmus.helpers import NO_COMPILER
 from tests.fmus.packing import repacked
@@ -236,13 +238,18 @@ def test_what_python_sets_is_no_change_of_the_process(monkeypatch: pytest.Monkey
 
 def test_a_call_that_sets_or_gets_values_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     named: list[str | None] = []
-    call: Callable[..., int] = Fmi2Instance._call
+    found = Fmi2Instance._named
 
-    def noted(*arguments: object) -> int:
-        named.append(current_function(threading.get_ident()))
-        return call(*arguments)
+    def noting(instance: Fmi2Instance, verb: Verb, type_: VariableType) -> tuple[str, Function]:
+        name, function = found(instance, verb, type_)
 
-    monkeypatch.setattr(Fmi2Instance, "_call", noted)
+        def noted(*arguments: object) -> int:
+            named.append(current_function(threading.get_ident()))
+            return function(*arguments)
+
+        return name, noted
+
+    monkeypatch.setattr(Fmi2Instance, "_named", noting)
     path = FMUS / "Gain.fmu"
     with closing(Fmi2Instance(path, "gain", read_description(path), tmp_path)) as gain:
         gain.enter_initialization(0.0, None, {"u": 2.0})

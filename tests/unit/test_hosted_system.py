@@ -19,6 +19,7 @@ from fmu_mesh.run.hosted_system import HostedSystem
 from fmu_mesh.run.preparing import OtherStartValues
 from tests.fmus.helpers import FMUS
 from tests.helpers import PAIR, write_config
+from tests.onnx_models import write_network
 
 ENGINES = pytest.mark.parametrize(
     "library",
@@ -121,6 +122,24 @@ def test_the_plan_of_a_scenario_uses_start_values_itself(tmp_path: Path) -> None
 
     assert OtherStartValues(plain).taken({"pendulum.d": 0.5}) is not None
     assert OtherStartValues(prescribed).taken({"pendulum.d": 0.5}) is None
+
+
+def test_a_network_begins_again_without_being_opened(tmp_path: Path, opened: list[bool]) -> None:
+    pytest.importorskip("onnxruntime")
+    write_network(tmp_path / "policy.onnx", inputs=2)
+    mesh = fmu_mesh.load(write_config(tmp_path))
+    mesh.add("policy", onnx="policy.onnx")
+    mesh.connect("pendulum.a", "policy.observation[1]")
+    variants = [{"pendulum.d": d} for d in (0.1, 0.7, 0.1)]
+    expected = [alone(mesh, values) for values in variants]
+    opened.clear()
+
+    with mesh.repeated() as runs:
+        found = [runs.run(start_values=values) for values in variants]
+
+    assert opened == [True, False, False]
+    for one, other in zip(found, expected, strict=True):
+        assert_same(one, other)
 
 
 def test_another_file_of_a_model_is_loaded_by_the_next_run(tmp_path: Path) -> None:

@@ -107,6 +107,21 @@ def allowing_one(description: str) -> str:
     return description.replace(attribute.format("false"), attribute.format("true"))
 
 
+def refusing_fmu(folder: Path, most: int) -> Path:
+    """A gain whose library makes so many instances, and no other."""
+    if NO_COMPILER is not None:
+        pytest.skip(NO_COMPILER)
+    skeleton = (FMUS / "src" / "skeleton" / "skeleton.c").read_text()
+    made = "    start_again(instance);\n    return instance;\n"
+    assert skeleton.count(made) == 1
+    refused = f"    static int made;\n    if (made++ >= {most}) return NULL;\n{made}"
+    return repacked(
+        folder / "refusing.fmu",
+        keep=lambda name: not name.startswith("binaries/") and name != "sources/skeleton.c",
+        add={"sources/skeleton.c": skeleton.replace(made, refused).encode()},
+    )
+
+
 def counting_fmu(folder: Path, description: Callable[[str], str] = str) -> Path:
     """A gain whose output is 1000 times the number of instances that its library has, plus those that it ever had."""
     if NO_COMPILER is not None:
@@ -419,6 +434,24 @@ def test_instance_that_cannot_be_made_is_told_and_next_run_makes_it(
         with pytest.raises(LoadFailed, match="is not the FMU that this run was planned with"):
             repeated(runs, wrong)
         assert repeated(runs, good).point == 1000
+
+
+def test_an_instance_that_is_refused_later_is_told_as_at_first(tmp_path: Path) -> None:
+    found = []
+    for most in (0, 1):
+        config = write_config(
+            tmp_path, instances={"it": {"fmu": str(refusing_fmu(tmp_path, most))}}, connections=[], stop_time=0.01
+        )
+        plan = fmu_mesh.load(config).plan()
+        with repeating(tmp_path) as runs:
+            for _ in range(most):
+                assert repeated(runs, plan).point == 10
+            with pytest.raises(LoadFailed) as refused:
+                repeated(runs, plan)
+        found.append(str(refused.value))
+
+    assert found[0] == found[1]
+    assert "cannot be instantiated: Failed to instantiate model; the FMU gave no message." in found[0]
 
 
 def test_two_instances_of_an_fmu_that_allows_one_are_refused(tmp_path: Path) -> None:

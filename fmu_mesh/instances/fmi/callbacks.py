@@ -75,8 +75,9 @@ def register_component(component: int, instance: Logged) -> None:
 
 def unregister(instance: Logged) -> None:
     """Discard messages of ``instance`` from now on; tell how many were only counted."""
-    recall()  # or another instance would get them later
-    tell_counted(instance)
+    message = _Message()
+    recall(message)  # or another instance would get them later
+    tell_counted(instance, message)
     for address in _registered.pop(id(instance), (b"", instance, []))[2]:
         if _by_address.get(address) is instance:
             del _by_address[address]
@@ -89,17 +90,17 @@ def fmi2_callbacks(environment: int) -> fmi2.fmi2CallbackFunctions:
     return callbacks
 
 
-def recall() -> None:
-    """Give the instances the last messages that were only counted."""
-    message = _Message()
+def recall(message: _Message | None = None) -> None:
+    """Give the instances the last messages that were only counted; ``message`` is memory for them."""
+    message = message or _Message()
     while _library is not None and _library.recall_message(ctypes.byref(message)):
         for instance in _receivers(message.address, message.name):
             instance.recalled(message.text)
 
 
-def tell_counted(instance: Logged) -> None:
-    """Tell how many messages of ``instance`` were only counted, and not told yet."""
-    message, number = _Message(), 0
+def tell_counted(instance: Logged, message: _Message | None = None) -> None:
+    """Tell how many messages of ``instance`` were only counted, and not told yet; ``message`` is memory for them."""
+    message, number = message or _Message(), 0
     while _library is not None and _library.message_of_kind(ctypes.c_int64(number), ctypes.byref(message)):
         receivers = _receivers(message.address, message.name)
         if instance not in receivers:

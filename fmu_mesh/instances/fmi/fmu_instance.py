@@ -30,7 +30,7 @@ from ..kept_models import KeptModels
 from .archive.system_libraries import missing_libraries
 from .buffers import Buffer
 from .callbacks import recall, register, register_component, tell_counted, unregister
-from .calls import Function, RowPointers, cffi_function, pointer
+from .calls import Function, RowPointers, cffi_function
 from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status_name
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
 from .step_options import StepOptions, Terms
@@ -113,7 +113,7 @@ class FmuInstance(ABC):
         self._live = False
         self._was_reset = False
         self._keep: list[object] = []
-        self._known_functions: dict[tuple[Verb, VariableType], Function] = {}
+        self._known_functions: dict[tuple[Verb, VariableType], tuple[str, Function]] = {}
         self._describe(description)
         prefix = self._functions.values.prefix
         # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
@@ -291,9 +291,7 @@ class FmuInstance(ABC):
         """Make the instance; without arguments, with those of the last one."""
         register(self.name, self, id(self._model))
         self._model.instantiate(**arguments)
-        if self._component != self._model.component:
-            self._component = self._model.component
-            self._self = pointer(self._component)
+        self._component, self._self = self._model.component, self._model.pointer
         if not self._functions.values.sized:  # FMI 3.0 passes no component to its logger
             register_component(self._component, self)
 
@@ -505,7 +503,7 @@ class FmuInstance(ABC):
 
     def _transfer(self, verb: Verb, part: _Transfer | PartCall) -> None:
         """Call the getter or setter of a type for some variables, once, on the memory of their buffer."""
-        function, name = self._function(verb, part.type), self._function_name(verb, part.type)
+        name, function = self._named(verb, part.type)
         if (status := call_named(name, function, self._self, *part.arguments)) > WARNING:
             raise self._transfer_failed(verb, part.type, part.variables, status)
 
@@ -515,11 +513,16 @@ class FmuInstance(ABC):
         return functions.prefix + functions.name(verb, type_)
 
     def _function(self, verb: Verb, type_: VariableType) -> Function:
+        return self._named(verb, type_)[1]
+
+    def _named(self, verb: Verb, type_: VariableType) -> tuple[str, Function]:
+        """A getter or setter, and its name."""
         if (known := self._known_functions.get((verb, type_))) is not None:
             return known
         functions = self._functions.values
         found = getattr(self._fmu.dll, self._symbols + functions.name(verb, type_))
-        made = self._known_functions[verb, type_] = cffi_function(found, functions.declaration(type_))
+        made = self._function_name(verb, type_), cffi_function(found, functions.declaration(type_))
+        self._known_functions[verb, type_] = made
         return made
 
     def _transfer_failed(

@@ -116,6 +116,7 @@ class LoadedFmu:
         self.calls: Any = None  # FMPy's object, once it is loaded
         self.has_instance = False
         self.component = 0  # the address of the instance, as long as there is one
+        self.pointer = pointer(0)  # the same for functions called through cffi
         self.is_lost = False  # whether it has returned fatal
         self._fmu = fmu
         self._files = files = (
@@ -173,7 +174,8 @@ class LoadedFmu:
                 self.calls.instantiate(loggingOn=False, **arguments)
             else:
                 self.calls.instantiate_again()
-            self.component = self.calls.component or 0
+            if (component := self.calls.component or 0) != self.component:
+                self.component, self.pointer = component, pointer(component)
             self.has_instance = bool(self.component)
             if not self.has_instance:
                 raise RuntimeError(f"{self._fmu.functions.names['instantiate']} returned no instance")
@@ -198,7 +200,7 @@ class LoadedFmu:
         """Free the instance; the library stays."""
         if self.has_instance:
             self.has_instance = False
-            call_named(self._free_name, self._free, pointer(self.component))
+            call_named(self._free_name, self._free, self.pointer)
 
     def close(self) -> None:
         """Free the instance, unload the library and remove the files. Never raises; may be called twice.
