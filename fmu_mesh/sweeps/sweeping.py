@@ -42,7 +42,7 @@ from .sweep_options import SweepOptions
 from .sweep_result import SweepResult
 from .variant_run import Row, run_variants
 from .worker_pool import WorkerLost, WorkerPool, unguarded_call
-from .worker_server import prepare_workers
+from .worker_server import join, prepare_workers
 
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 
@@ -193,7 +193,7 @@ class Sweep(ABC):
     def close(self) -> None:
         """Let go of the sweep; if it goes on, it is cancelled. May be called twice."""
         self._cancelled.set()
-        self._thread.join(_JOIN_S)
+        join(self._thread, _JOIN_S)
 
     def _bar(self) -> ShownProgress:
         now = self.progress

@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 from ..errors import MeshLost
 from ..run.child import how_it_ended
 from ..text import short_path
-from .worker_server import WorkerServer
+from .worker_server import WorkerServer, join
 
 __all__ = ["WorkerLost", "WorkerPool", "unguarded_call"]
 
@@ -77,7 +77,7 @@ class WorkerPool(Executor):
         for worker in self._workers:
             worker.end(now=cancel_futures)
         for worker in self._workers if wait else ():
-            worker.thread.join()
+            join(worker.thread)
         if wait and self._server.is_fork:
             self._server.close()
 

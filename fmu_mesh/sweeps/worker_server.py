@@ -39,11 +39,9 @@ from ..instances.process_state import floating_point_changed
 from ..run.process import die_with_parent
 from ..run.threads import one_thread_from_now_on
 
-__all__ = ["WorkerServer", "prepare_workers", "serve"]
+__all__ = ["WorkerServer", "join", "prepare_workers", "serve"]
 
 _ENDS_S: Final = 5.0
-_THREAD_ENDS_S: Final = 0.02
-"""How long a thread of Python may exist that has been waited for, such as those of the sweep before."""
 _PRELOADED: Final = "fmu_mesh.sweeps.preloaded"
 _SERVER: Final = "import sys; sys.path[:] = {}; from fmu_mesh.sweeps.worker_server import serve; serve({})"
 _CALLING_MODELS: Final = {"fmu_mesh.instances.fmi.opening", "fmu_mesh.instances.python.python_instance"}
@@ -55,6 +53,14 @@ _in_worker: list[bool] = []
 _preparing = threading.Lock()
 _ready: list[WorkerServer] = []
 """The server of the next pool, if it runs."""
+
+
+def join(thread: threading.Thread, timeout: float | None = None) -> None:
+    """Wait for the end of a thread, and until the system has it no more: the next sweep may fork this program."""
+    thread.join(timeout)
+    task, deadline = Path(f"/proc/self/task/{thread.native_id}"), time.monotonic() + _ENDS_S
+    while not thread.is_alive() and task.exists() and time.monotonic() < deadline:
+        os.sched_yield()
 
 
 def prepare_workers() -> None:
@@ -177,14 +183,6 @@ def _forked(control: int) -> int | None:
     is_plain = locale.setlocale(locale.LC_NUMERIC) == "C" and not floating_point_changed()
     if threading.active_count() > 1 or has_models or not is_plain:
         return None
-    deadline = time.monotonic() + _THREAD_ENDS_S
-    while (pid := _forked_alone(control)) is None and time.monotonic() < deadline:
-        continue
-    return pid
-
-
-def _forked_alone(control: int) -> int | None:
-    """As `_forked`; None if there are other threads, of whatever library."""
     waiting, go = os.pipe()
     _flush()
     with warnings.catch_warnings():
@@ -194,7 +192,7 @@ def _forked_alone(control: int) -> int | None:
             os.close(go)
             _as_process(lambda: serve(control) if os.read(waiting, 1) else None)
     os.close(waiting)
-    is_alone = len(os.listdir("/proc/self/task")) == 1  # noqa: PTH208  numbers
+    is_alone = len(os.listdir("/proc/self/task")) == 1  # noqa: PTH208  numbers; threads of other libraries, too
     if is_alone:
         os.write(go, b"!")
     os.close(go)
