@@ -26,12 +26,15 @@ from ..run.overriding import memory_of
 from ..run.preparing import OtherStartValues
 from ..run.repeated import RepeatedRuns
 from ..run.run_plan import RunPlan
-from ..variables.value_types import DTYPES
+from ..variables.value_types import DTYPES, VariableType
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name
 from .result import Result, types_of
 from .run_thread import check_memory
 
 __all__ = ["RepeatedMesh"]
+
+_IN_MEMORY = Path()
+"""The path of rows that have no file."""
 
 
 class RepeatedMesh:
@@ -129,7 +132,7 @@ class RepeatedMesh:
             self._key, self._planned, others = key, None, {}
             self._planned = _Planned.of(self._plan(**options()))
         plan = self._planned.run
-        self._rows = rows = _CollectedRows(plan, in_memory=self._planned.in_memory)
+        self._rows = rows = _CollectedRows(self._planned)
         runs = self._runs(plan.mesh)
         try:
             outcome = runs.run(plan, rows.open, others)
@@ -165,22 +168,22 @@ class _Planned(NamedTuple):
 
     run: RunPlan
     others: OtherStartValues
+    types: dict[str, VariableType]
     in_memory: bool
 
     @classmethod
     def of(cls, run: RunPlan) -> _Planned:
         check_memory(run, sys.maxsize, to_its_end=True)
-        return cls(run, OtherStartValues(run), memory_of(run) is not None)
+        return cls(run, OtherStartValues(run), types_of(run.plan.system) or {}, memory_of(run) is not None)
 
 
 class _CollectedRows:
     """The rows of a run in memory, and in its result file if it has one; see `ResultFile`."""
 
-    def __init__(self, plan: RunPlan, *, in_memory: bool) -> None:
-        self._plan, self._in_memory = plan, in_memory
+    def __init__(self, planned: _Planned) -> None:
+        self._plan, self._types, self._in_memory = planned.run, planned.types, planned.in_memory
         self._file: ResultFile | None = None
-        nothing = {name: np.zeros(0, DTYPES[type_]) for name, type_ in (types_of(plan.plan.system) or {}).items()}
-        self._pieces = [Columns(np.zeros(0), nothing)]
+        self._pieces: list[Columns] = []
         self.rows = 0
         self._made: tuple[Outcome, Result] | None = None
 
@@ -192,14 +195,14 @@ class _CollectedRows:
 
     @property
     def path(self) -> Path:
-        return self._file.path if self._file is not None else Path()
+        return self._file.path if self._file is not None else _IN_MEMORY
 
     @property
     def kept(self) -> Kept:
         return self._file.kept if self._file is not None else Kept()
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
-        values = {name: np.array(column) for name, column in zip(self._pieces[0].values, columns, strict=True)}
+        values = {name: np.array(column) for name, column in zip(self._types, columns, strict=True)}
         self._pieces.append(Columns(np.array(times), values))
         self.rows += len(times)
         if self._file is not None:
@@ -227,7 +230,12 @@ class _CollectedRows:
         system, file = self._plan.plan.system, self._file.path if self._file is not None else None
         files = ((str(file), outcome.rows),) if file is not None else ()
         outcome = replace(outcome, file=str(file) if file is not None else None, files=files)
-        return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=joined(self._pieces))
+        if len(self._pieces) == 1:
+            (columns,) = self._pieces
+        else:
+            nothing = Columns(np.zeros(0), {name: np.zeros(0, DTYPES[type_]) for name, type_ in self._types.items()})
+            columns = joined([nothing, *self._pieces])
+        return Result(self._plan.mesh, file=file, outcome=outcome, system=system, columns=columns)
 
 
 def _release(loaded: list[tuple[RepeatedRuns, Path]], thread: int) -> None:

@@ -84,7 +84,6 @@ class Result(Mapping[str, NDArray[Any]]):
         self._step_size = system.grid.step_size if system is not None else 0.0
         self._given = columns
         self._record = record
-        self._variables = _recorded(system, record)
 
     @classmethod
     @checked
@@ -296,7 +295,6 @@ class Result(Mapping[str, NDArray[Any]]):
         note = machine_difference(self.metadata.get("versions", {}), other.metadata.get("versions", {}))
         return replace(comparison, note=note, drawn=lambda chosen: self.plot(*chosen, others=(other,), difference=True))
 
-    @checked
     def __getitem__(self, name: str) -> NDArray[Any]:
         """The values of one variable, one per row; elements of arrays are variables of their own, such as `a.y[1,2]`.
 
@@ -306,15 +304,21 @@ class Result(Mapping[str, NDArray[Any]]):
             UnknownName: it was not recorded; suggests the nearest name. Or it means several.
         """
         columns = self._columns.values
-        if name in columns:
-            return columns[name]
         try:
-            found = chosen_names(self.title, list(columns), [name])
+            return columns[name]
+        except (KeyError, TypeError):  # no name of a column, or no name at all
+            return columns[self._meant(name)]
+
+    @checked
+    def _meant(self, name: str) -> str:
+        """The only column that a name means."""
+        try:
+            found = chosen_names(self.title, list(self._columns.values), [name])
         except ConfigurationError as error:
             raise UnknownName(error.message, hint=error.hint) from None
         if len(found) > 1:
             raise UnknownName(f"'{name}' means {len(found)} columns of '{self.title}': {listed(found)}")
-        return columns[found[0]]
+        return found[0]
 
     def __contains__(self, name: object) -> bool:
         names = self._variables or self._head.values
@@ -339,6 +343,10 @@ class Result(Mapping[str, NDArray[Any]]):
     @property
     def _is_here(self) -> bool:
         return self._given is not None or "_columns" in self.__dict__
+
+    @cached_property
+    def _variables(self) -> dict[str, tuple[str, Variable]]:
+        return _recorded(self._system, self._record)
 
     @cached_property
     def _columns(self) -> Columns:

@@ -17,7 +17,7 @@ from ..sweeps.sweep_folder import is_sweep
 from ..sweeps.sweep_options import SweepOptions
 from ..sweeps.sweeping import ExecutorSweep, Sweep, SweepPart
 from ..sweeps.variants import Values, read_values
-from ..sweeps.worker_pool import prepare_workers
+from ..sweeps.worker_server import prepare_workers
 from ..text import short_path, shown
 from .arguments import Runs
 from .output.json_output import Failure, failure_of, print_json

@@ -69,24 +69,29 @@ class GrowthWatch:
         if self.warnings:
             return
         normal = min(max(self._normal, first), end)
-        for part, values in self._blocks(first, normal):
-            sizes = np.where(np.isfinite(values), np.abs(values), 0.0)
-            self._scales[part] = self._limits[part] = np.maximum(self._scales[part], sizes.max(axis=1))
-        for part, values in self._blocks(normal, end):
-            most = np.maximum(values.max(axis=1), -values.min(axis=1))
-            for row in np.flatnonzero(most > self._limits[part]).tolist():
-                self._take(part.start + row, normal, np.abs(values[row]))
+        for part, sizes in self._blocks(first, end):
+            if normal > first:
+                usual = sizes[:, : normal - first]
+                most = usual.max(axis=1)
+                if not np.isfinite(most).all():
+                    most = np.where(np.isfinite(usual), usual, 0.0).max(axis=1)
+                self._scales[part] = self._limits[part] = np.maximum(self._scales[part], most)
+            if normal < end:
+                later = sizes[:, normal - first :]
+                for row in np.flatnonzero(later.max(axis=1) > self._limits[part]).tolist():
+                    self._take(part.start + row, normal, later[row])
         reached = {column: own for column, own in self._crossings.items() if len(own) == len(_STEPS)}
         if reached:
             column = min(reached, key=lambda own: (reached[own][-1][0], own))
             self.warnings = (self._told(column, *reached[column]),)
 
     def _blocks(self, first: int, end: int) -> Iterator[tuple[slice, NDArray[np.float64]]]:
-        """The values of some columns at a time at the points first to end - 1, and which columns these are."""
+        """The sizes of the values of some columns at a time at the points first to end - 1, and which columns."""
         count = max(1, _BLOCK_NUMBERS // max(1, end - first))
         for start in range(0, len(self._columns) if first < end else 0, count):
             part = slice(start, start + count)
-            yield part, np.array([read(first, end) for _, _, read in self._columns[part]], np.float64)
+            values = np.array([read(first, end) for _, _, read in self._columns[part]], np.float64)
+            yield part, np.abs(values, out=values)
 
     def _take(self, column: int, first: int, sizes: NDArray[np.float64]) -> None:
         """Find where the values of a column that begin at a point are above the next steps."""

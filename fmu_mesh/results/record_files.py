@@ -89,12 +89,16 @@ class RecordFiles:
         files: the files, in the order of their plans.
         growth: looks at all rows.
         notes: the folder of the run, if somebody calls `rows_left` when this process was killed.
+
+    Attributes:
+        in_memory: whether no file has a path.
     """
 
     def __init__(
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
+        self.in_memory = not any(file.path.name for file in files)
         self._keys = KeysFile(files[0].path) if files and files[0].path.name else None
         self._files = [
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)

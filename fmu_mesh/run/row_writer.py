@@ -12,7 +12,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from ..node.stepping import Runner
 from ..recorder.recorder import RecordedSource
@@ -50,7 +49,7 @@ class RowWriter:
 
     def begin(self, plan: Plan, runners: Mapping[str, Runner]) -> None:
         """All instances are at point 0."""
-        if not any(Path(file).name for file, _ in self.counted):
+        if self._files.in_memory:
             self._flushed = time.monotonic()  # nobody can look into memory: the first row waits for others
         if RECORDER not in plan.nodes:
             return

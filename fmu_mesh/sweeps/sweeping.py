@@ -41,7 +41,8 @@ from .sweep_folder import RowFile
 from .sweep_options import SweepOptions
 from .sweep_result import SweepResult
 from .variant_run import Row, run_variants
-from .worker_pool import WorkerLost, WorkerPool, prepare_workers, unguarded_call
+from .worker_pool import WorkerLost, WorkerPool, unguarded_call
+from .worker_server import join, prepare_workers
 
 __all__ = ["ExecutorSweep", "Sweep", "SweepPart", "SweepProgress", "sweep"]
 
@@ -192,7 +193,7 @@ class Sweep(ABC):
     def close(self) -> None:
         """Let go of the sweep; if it goes on, it is cancelled. May be called twice."""
         self._cancelled.set()
-        self._thread.join(_JOIN_S)
+        join(self._thread, _JOIN_S)
 
     def _bar(self) -> ShownProgress:
         now = self.progress
@@ -257,7 +258,6 @@ class ExecutorSweep(Sweep):
         part: SweepPart | None = None,
     ) -> None:
         super().__init__(planned, part)
-        self._executor = executor
         if not workers:  # one for each processor that this process may use; fewer where a run has several processes
             processes = len(planned.plan.plan.nodes) + 1 if planned.wanted.processes else 1
             workers = len(os.sched_getaffinity(0)) // processes
@@ -266,40 +266,30 @@ class ExecutorSweep(Sweep):
         self._alone: set[int] = set()  # variants that were in a job whose worker was lost
         self._at_once = 1  # how many variants the next job has
         self._ended: SimpleQueue[Future[list[Row]]] = SimpleQueue()
+        self._is_ours = executor is None
+        self._executor = executor or WorkerPool(self._workers, lambda rows: bool(rows) and rows[-1].spent)
         self._thread.start()
 
     def _run(self) -> None:
         part = self._part.number if self._part is not None else None
-        with (
-            self._planned.folder.writing(part) as rows,
-            self._table() if part is None else nullcontext(),
-            self._running() as executor,
-        ):
-            self._run_variants(executor, rows)
-
-    @contextmanager
-    def _running(self) -> Iterator[Executor]:
-        """The executor; one of our own ends with the block, and at once if the sweep was cancelled."""
-        if self._executor is not None:
-            yield self._executor
-            return
-        pool = WorkerPool(self._workers)
         try:
-            yield pool
+            with self._planned.folder.writing(part) as rows, self._table() if part is None else nullcontext():
+                self._run_variants(rows)
         finally:
-            pool.shutdown(cancel_futures=self._cancelled.is_set() or bool(self._waiting))
-            remove_stale_folders()
+            if self._is_ours:
+                self._executor.shutdown(cancel_futures=bool(self._left))
+                remove_stale_folders()
 
-    def _run_variants(self, executor: Executor, rows: RowFile) -> None:
+    def _run_variants(self, rows: RowFile) -> None:
         """The loop of the module's docstring."""
         under_way: dict[Future[list[Row]], list[int]] = {}
-        most = _ELSEWHERE if self._executor is not None else self._workers * _AHEAD
+        most = self._workers * _AHEAD if self._is_ours else _ELSEWHERE
         most = min(most, self._planned.at_once or most)
         try:
             while (self._waiting or under_way) and not self._cancelled.is_set():
                 while self._waiting and len(under_way) < most:
                     numbers = self._next_job()
-                    under_way[self._submit(executor, numbers)] = numbers
+                    under_way[self._submit(numbers)] = numbers
                 try:
                     future = self._ended.get(timeout=_CANCEL_CHECK_S)
                 except Empty:
@@ -310,10 +300,8 @@ class ExecutorSweep(Sweep):
                 rows.add(found)
                 for row in found:
                     self._take(row)
-                if found and self._executor is None:
+                if found and self._is_ours:
                     self._at_once = max(1, int(_JOB_S * len(found) / max(1e-6, sum(row.seconds for row in found))))
-                if found and found[-1].spent and isinstance(executor, WorkerPool):
-                    executor.replace(int(found[-1].worker.rpartition(":")[2]))
         finally:
             for future in under_way:
                 future.cancel()
@@ -326,11 +314,11 @@ class ExecutorSweep(Sweep):
             numbers.append(self._waiting.popleft())
         return numbers
 
-    def _submit(self, executor: Executor, numbers: list[int]) -> Future[list[Row]]:
+    def _submit(self, numbers: list[int]) -> Future[list[Row]]:
         planned = self._planned
         variants = [(planned.wanted.identities[number], planned.wanted.parameters(number)) for number in numbers]
         try:
-            future = executor.submit(run_variants, planned.task, planned.functions, variants)
+            future = self._executor.submit(run_variants, planned.task, planned.functions, variants, ours=self._is_ours)
         except RuntimeError as error:  # it is shut down, or broken
             raise self._executor_lost(error) from error
         future.add_done_callback(self._ended.put)

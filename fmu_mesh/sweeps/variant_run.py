@@ -101,12 +101,15 @@ def options_of_variant(options: Mapping[str, Any], instances: Sequence[str], par
     return {**options, **{name: {**options.get(name, {}), **values} for name, values in own.items()}}
 
 
-def run_variants(task: bytes, functions: OwnReductions, variants: Sequence[Variant]) -> list[Row]:
+def run_variants(
+    task: bytes, functions: OwnReductions, variants: Sequence[Variant], *, ours: bool = False
+) -> list[Row]:
     """Run variants one after another, up to one whose row is `Row.spent`; a run that failed has a row, too.
 
-    Called in a worker, by whichever executor.
+    Called in a worker, by whichever executor; ``ours`` says that the process does nothing else.
     """
-    return _mine.loaded_for(task, functions).rows(variants, functions)
+    alone = (ours or parent_process() is not None) and not functions  # those of a user may change what they like
+    return _mine.loaded_for(task, alone=alone).rows(variants, functions)
 
 
 class _Mine(threading.local):
@@ -115,9 +118,8 @@ class _Mine(threading.local):
     def __init__(self) -> None:
         self._loaded: _Loaded | None = None
 
-    def loaded_for(self, task: bytes, functions: OwnReductions) -> _Loaded:
+    def loaded_for(self, task: bytes, *, alone: bool) -> _Loaded:
         if self._loaded is None or self._loaded.task != task or self._loaded.hung.stuck:
-            alone = parent_process() is not None and not functions  # those of a user may change what they like
             self._loaded = _Loaded(task, alone=alone)
         return self._loaded
 
@@ -143,6 +145,7 @@ class _Loaded:
         weakref.finalize(self, os.close, self._memory)
         self._bytes = 0
         self._started = 0.0
+        self._worker, self._machine = f"{socket.gethostname()}:{os.getpid()}", ", ".join(machine().values())
         work = partial(_work, self._mesh, self._jobs, self.hung, reset=self._task.reset, alone=alone)
         threading.Thread(target=work, name="variants", daemon=True).start()
         weakref.finalize(self, self._jobs.put, None)
@@ -216,9 +219,9 @@ class _Loaded:
             message=_line(report) if report is not None else " ".join(filter(None, warnings)),
             values=values,
             seconds=time.perf_counter() - self._started,
-            worker=f"{socket.gethostname()}:{os.getpid()}",
+            worker=self._worker,
             spent=self.hung.stuck or self._has_grown(),
-            machine=", ".join(machine().values()),
+            machine=self._machine,
         )
 
     def _values(self, result: Result, functions: OwnReductions) -> dict[str, Cell]:
