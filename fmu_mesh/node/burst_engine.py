@@ -163,6 +163,9 @@ class BurstEngine(Engine):
         copy, step, address = self._copy, self._library.step_copy, ctypes.addressof(self._copy)
         copy.goal = point
         while (end := step(address)) != BurstEnd.DONE:
+            if end == BurstEnd.ATTENTION:
+                self._library.attended(self._address)
+                return
             self.complete(end)
 
     def send(self) -> None:

@@ -135,7 +135,8 @@ class Engine(ABC):
     def step_to(self, point: int) -> None:
         """Take all steps that end at this point or before, in a process that waits for nobody: point by point.
 
-        So an event ends them as if each instance had been called in its turn; it raises what `run` raises.
+        So an event ends them as if each instance had been called in its turn; it raises what `run` raises. `ring_bell`
+        ends them after the current point.
         """
         with self._looking_after():
             self._step_to(point)
@@ -174,7 +175,7 @@ class Engine(ABC):
 
     @abstractmethod
     def ring_bell(self) -> None:
-        """From any thread: let `run` return after the current step."""
+        """From any thread: let `run` or `step_to` return after the current step."""
 
     def note_wait(self, seconds: float) -> None:
         """The node has waited for so long because nothing could step."""
@@ -233,10 +234,11 @@ class PlainEngine(Engine):
     def _step_to(self, point: int) -> None:
         for unit, place in zip(self.units, self._units, strict=False):
             place.last_tick = point // place.tick_points
-            while (before := place.tick) < place.last_tick and not place.stopped:
+            while (before := place.tick) < place.last_tick and not (place.stopped or self._attention):
                 self._advance(unit, place, perf_counter())
-                if place.tick == before:
+                if place.tick == before and not self._attention:
                     raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
+        self._attention = False
 
     slice_s = SLICE_S  # every unit has a turn before it is looked at
     _attention = False

@@ -700,6 +700,7 @@ PUBLIC int64_t step_copy(Copy *copy) {
     copy->point = (unit->tick + 1) * unit->tick_points - 1; /* between two ticks, the outputs hold */
     if (result != SLICE) return result;
     if (ticks == 0) return BLOCKED;
+    if (atomic_load_explicit(&copy->node->attention, memory_order_relaxed)) return ATTENTION;
   }
   copy->point = copy->goal;
   return DONE;

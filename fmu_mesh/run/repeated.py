@@ -7,7 +7,7 @@ loaded (`fmu_mesh.instances.kept_models`), and so does what the runs of one plan
 """
 
 # Threads: that of the runs calls FMUs, and nobody else does (ADR 12). `interrupt` comes from any thread, and ends a
-# wait for the wall clock, or the run after the steps of about a millisecond. The thread of `CallWatch` takes a hang:
+# wait for the wall clock, or the run after the current step. The thread of `CallWatch` takes a hang:
 # the thread of the runs is inside an FMU then and changes nothing, so the rows can be saved from outside.
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
-from ..node.engine import SLICE_S, Engine
+from ..node.engine import Engine
 from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..system.plan import Plan
@@ -53,6 +53,7 @@ log = logging.getLogger(__name__)
 _SCRATCH = "scratch"
 _WRITE_ROWS = 2048
 _MANY_POINTS = 1 << 16
+_SLICE_S = 0.01
 
 
 class RepeatedRuns:
@@ -76,7 +77,7 @@ class RepeatedRuns:
     Args:
         folder: an existing private folder; FMUs are extracted below it.
         log: called with every log message of a model.
-        progress: called with the last point reached, about every millisecond.
+        progress: called with the last point reached, about every 10 ms.
         on_hang: called on another thread if a model does not return in time. All complete rows are in the result files.
             The thread that is inside the model cannot be stopped, so the caller has to end the process.
         reset: whether instances stay between runs and are reset, where their models can be reset.
@@ -108,6 +109,7 @@ class RepeatedRuns:
         self._run: _Run | None = None
         self._system: HostedSystem | None = None
         self._made_for: tuple[object, ...] = ()
+        self._slices = _Slices()
         self._stop: str | None = None
 
     def run(
@@ -131,7 +133,7 @@ class RepeatedRuns:
         try:
             with closing(RowWriter(open_files(), GrowthWatch(run.plan))) as writer:
                 system = self._system_for(run, len(writer.counted))
-                self._run = current = _Run(system, writer, self._around)
+                self._run = current = _Run(system, writer, self._around, self._slices)
                 if self._stop is not None:
                     current.interrupt(self._stop)
                 return current.run(start_values, self._watch_here(), self._threads)
@@ -141,7 +143,7 @@ class RepeatedRuns:
                 self._remove_scratch()
 
     def interrupt(self, reason: str) -> None:
-        """From any thread: end the run under way with `Interrupted` within about a millisecond, or after one step.
+        """From any thread: end the run under way with `Interrupted` after the current step.
 
         Between two runs this ends the next one.
         """
@@ -210,6 +212,7 @@ class RepeatedRuns:
             opening = opening_of(plan, name, around.scratch, around.log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
+        self._slices = _Slices()
         self._system, self._made_for = HostedSystem(plan, watch, opened, around.log, alone=self._alone), made_for
         return self._system
 
@@ -247,6 +250,24 @@ class _Surroundings(NamedTuple):
     before_close: Callable[[Outcome | BaseException], None] | None
 
 
+class _Slices:
+    """Over how many points a system is stepped before its rows are written; from run to run.
+
+    Attributes:
+        points: how many.
+    """
+
+    def __init__(self) -> None:
+        self.points = 1
+
+    def note(self, points: int, took_s: float) -> None:
+        """A slice over so many points has taken so long."""
+        if took_s > 2 * _SLICE_S:
+            self.points = max(1, int(self.points * _SLICE_S / took_s))
+        elif took_s < _SLICE_S / 2 and points == self.points:
+            self.points = min(2 * points, _MANY_POINTS)
+
+
 class _Run:
     """One run of a system, and how it ended.
 
@@ -255,8 +276,9 @@ class _Run:
         writer: writes its rows.
     """
 
-    def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings) -> None:
+    def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings, slices: _Slices) -> None:
         self.point = 0
+        self._slices = slices
         self._system, self._plan = system, system.plan
         self._last = self._plan.grid.last_point
         self.writer = writer
@@ -329,10 +351,12 @@ class _Run:
         """From any thread: see `RepeatedRuns.interrupt`."""
         self._stop = reason
         self._stopping.set()
+        if (engine := self._engine) is not None:
+            engine.ring_bell()
 
     def _step_to_the_end(self, engine: Engine) -> None:
         """Take steps and write rows; rows that are not written yet are never overwritten."""
-        writer, window, most = self.writer, self._plan.window, 1
+        writer, window, slices = self.writer, self._plan.window, self._slices
         pacer = Pacer(self._plan, self._plan.system.config.simulation.real_time_factor)
         pacer.start(0)
         many = max(1, min(_WRITE_ROWS, window // 2))
@@ -350,15 +374,11 @@ class _Run:
                 continue
             started = time.perf_counter()
             try:
-                engine.step_to(min(granted, point + most))
+                engine.step_to(min(granted, point + slices.points))
             except (FmuError, TerminationRequested) as event:
                 self._system.located(event, engine.point)
                 raise
-            took_s = time.perf_counter() - started
-            if took_s < SLICE_S / 2 and granted >= point + most:
-                most = min(2 * most, _MANY_POINTS)
-            elif took_s > 2 * SLICE_S:
-                most = max(1, most // 2)
+            slices.note(engine.point - point, time.perf_counter() - started)
 
     def _position(self) -> tuple[str, int, str]:
         """See `CallWatch.stepping`; between two steps, the answer changes all the time."""

@@ -589,7 +589,7 @@ def test_many_runs_end_where_a_run_point_by_point_ends(
         if not library:
             patch.setattr(native, "library", None)
         if slow:
-            patch.setattr("fmu_mesh.run.repeated.SLICE_S", 1e-7)
+            patch.setattr("fmu_mesh.run.repeated._SLICE_S", 1e-7)
         file = Path(folder, "rows.csv")
         plan = with_file(plan, file)
         loaded = LoadedConfig(plan.system.config, Path())
