@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -25,7 +26,10 @@ def gains() -> fmu_mesh.Mesh:
 
 def places() -> list[str]:
     """The titles of the processes with copies."""
-    titles = [own.cmdline()[0] for own in psutil.Process().children(recursive=True)]
+    titles = []
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):  # it is that of an earlier test, and has ended
+            titles.append(" ".join(child.cmdline()))
     return sorted(title for title in titles if title.startswith("fmu-mesh copies "))
 
 
