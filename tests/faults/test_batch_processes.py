@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +35,17 @@ def faulty_mesh(faulty: Path) -> fmu_mesh.Mesh:
 
 def processes() -> list[psutil.Process]:
     """Those with copies, in the order of their copies."""
-    found = [own for own in below() if own.cmdline()[0].startswith("fmu-mesh copies ")]
-    return sorted(found, key=lambda own: int(own.cmdline()[0].split()[2].split(":")[0]))
+    titles = {own: title for own, title in below().items() if title.startswith("fmu-mesh copies ")}
+    return sorted(titles, key=lambda own: int(titles[own].split()[2].split(":")[0]))
 
 
-def below() -> list[psutil.Process]:
-    """Our processes that this one has started."""
-    found = psutil.Process().children(recursive=True)
-    return [own for own in found if own.is_running() and any("fmu" in part for part in own.cmdline()[:3])]
+def below() -> dict[psutil.Process, str]:
+    """The processes of a batch that this one has started, and their titles."""
+    titles = {}
+    for own in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):  # it has ended
+            titles[own] = " ".join(own.cmdline())
+    return {own: title for own, title in titles.items() if title.startswith("fmu-mesh ") or "fmu_mesh.run" in title}
 
 
 @pytest.fixture
