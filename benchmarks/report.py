@@ -93,8 +93,6 @@ class Report:
         """The figure of a target; None if it was not measured."""
         own = self._results[target.job][target.entry]
         match target.figure:
-            case "points/s":
-                return None if own.cost is None else 1 / own.cost
             case "first point, s":
                 return own.first_point_s
             case "MB per node":
