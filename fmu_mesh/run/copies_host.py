@@ -50,6 +50,7 @@ class CopiesHost:
         self._number, self._block = number, block
         self._how = ""
         self._beat, self._since = 0, 0.0
+        self._is_ready = False  # whether it has opened its first copies
 
     def is_at(self, descriptor: int) -> bool:
         """Whether this is the descriptor of its channel."""
@@ -89,7 +90,7 @@ class CopiesHost:
             )
         self.channel = Channel(own, News, run.loaded.config.timeouts.step)
         self.starts += 1
-        self.failed, self._how = None, ""
+        self.failed, self._how, self._is_ready = None, "", False
 
     def ask(self, request: Request) -> None:
         """Send it a request; one that is gone takes none, which the end of its channel tells."""
@@ -106,7 +107,7 @@ class CopiesHost:
         for message in messages:
             match message:
                 case Answer():
-                    answer = message
+                    answer, self._is_ready = message, True
                 case LoggedByModel(own):
                     log_message(own)
                 case Failed():
@@ -121,7 +122,7 @@ class CopiesHost:
         """Kill it if it has done nothing for too long; its own watch has not seen it."""
         beat, process = int(self._block.beats[self._number]), self.process
         assert process is not None
-        limit_s = timeouts.step if beat else timeouts.start
+        limit_s = timeouts.step if self._is_ready else timeouts.start
         if beat != self._beat:
             self._beat, self._since = beat, now
         elif now - self._since > limit_s:

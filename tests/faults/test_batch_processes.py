@@ -48,6 +48,13 @@ def below() -> dict[psutil.Process, str]:
     return {own: title for own, title in titles.items() if title.startswith("fmu-mesh ") or "fmu_mesh.run" in title}
 
 
+def seconds_in(reason: str, why: str) -> float:
+    """How long a process has done nothing, as the reason says; that of a start would be a minute."""
+    found = re.search(rf"{re.escape(why)} for ([\d.]+) s", reason)
+    assert found is not None, reason
+    return float(found[1])
+
+
 @pytest.fixture
 def nothing_is_left() -> Iterator[None]:
     """After the test no process and no file of a batch is there."""
@@ -146,7 +153,7 @@ def test_a_stopped_process_is_ended_after_the_time_of_a_step(faulty: Path) -> No
         processes()[1].suspend()
         batch.step()
         assert batch.done.tolist() == [False, True]
-        assert "is stopped (state T) for" in batch.reasons[1]
+        assert 1.5 <= seconds_in(batch.reasons[1], "is stopped (state T)") < 15.0
 
 
 @pytest.mark.usefixtures("nothing_is_left")
@@ -165,7 +172,7 @@ def test_a_component_that_keeps_the_interpreter_is_ended(tmp_path: Path) -> None
     with mesh.batch(2, config_values={"timeouts.step": 1.5}, processes=2) as batch:
         batch.step(5)
         assert batch.done.all()
-        assert "does not answer, because a component does not let it for" in batch.reasons[0]
+        assert 1.5 <= seconds_in(batch.reasons[0], "does not answer, because a component does not let it") < 15.0
 
 
 @pytest.mark.usefixtures("nothing_is_left")
