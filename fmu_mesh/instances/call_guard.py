@@ -30,7 +30,7 @@ from ..variables.model_description import Value
 from .contract import BeginsAgain, ChangesProcess, Instance, Prepares
 from .instance_wrapper import AroundNativeSteps
 from .process_end import surviving
-from .process_state import floating_point_changed, kept_mode, kept_state, restore_floating_point
+from .process_state import in_kept_mode, kept_mode, kept_state
 
 __all__ = [
     "ENDED",
@@ -403,13 +403,8 @@ class Guarded(AroundNativeSteps):
         return own if isinstance(own, Prepares) and not self._is_watched else None
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
-        if self._trusted and not (self._is_watched or self._careful):  # as `_made`, in half the time
-            was_changed = floating_point_changed()
-            try:
-                return call(*arguments)
-            finally:
-                if not was_changed and floating_point_changed():
-                    restore_floating_point()
+        if self._trusted and not (self._is_watched or self._careful):  # as `_made`, which takes longer
+            return in_kept_mode(call, *arguments)
         if self._running:
             return self._made(StepFailed, "step", call, *arguments)
         return self._made(InitializationFailed, "call", call, *arguments)
@@ -424,12 +419,7 @@ class Guarded(AroundNativeSteps):
             self._watch.begin(self._name, cast("type[FmuError]", kind), setting, getattr(self._timeouts, setting))
         try:
             if (self._running or self._trusted) and not self._careful:
-                was_changed = floating_point_changed()
-                try:
-                    return call(*arguments)
-                finally:
-                    if not was_changed and floating_point_changed():
-                        restore_floating_point()
+                return in_kept_mode(call, *arguments)
             with kept_state() as state:
                 result = call(*arguments)
             if state.changed:

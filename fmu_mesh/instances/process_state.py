@@ -13,19 +13,22 @@ import signal
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 __all__ = [
     "FOLDER",
     "LOOK_STEPS",
     "ProcessState",
     "floating_point_changed",
+    "in_kept_mode",
     "kept_mode",
     "kept_state",
     "restore_floating_point",
 ]
+
+Result = TypeVar("Result")
 
 # Who meets here: every thread of the process. Working directory, locale, umask, environment and signal handlers are
 # those of all threads; the locale of `uselocale`, the blocked signals and the floating-point mode are those of one. So
@@ -190,6 +193,16 @@ def kept_mode() -> Iterator[None]:
     is_own = floating_point_changed()
     try:
         yield
+    finally:
+        if not is_own and floating_point_changed():
+            restore_floating_point()
+
+
+def in_kept_mode(call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any function
+    """Make a call as in a block of `kept_mode`, in half the time."""
+    is_own = floating_point_changed()
+    try:
+        return call(*arguments)
     finally:
         if not is_own and floating_point_changed():
             restore_floating_point()
