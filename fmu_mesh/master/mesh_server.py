@@ -14,6 +14,7 @@ from typing import Literal, Protocol
 import msgspec
 import zenoh
 from msgspec.structs import replace
+from zenoh.handlers import Callback
 
 from ..errors import MessageRefused
 from ..wire.inbox import Inbox
@@ -128,9 +129,9 @@ class MasterServer:
         """From now on the log messages of all instances go to `Events.log` and into one log, which is published."""
         self.show("log", lambda: [*self._newest_lines])
         post = self._inbox.post
-        self._entities.append(
-            self._session.declare_subscriber(f"{self._keys.root}/*/log", lambda sample: post(lambda: self._log(sample)))
-        )
+        # On the thread that reads the link: a line is taken before the report of its node, which came after it.
+        take = Callback(lambda sample: post(lambda: self._log(sample)), indirect=False)
+        self._entities.append(self._session.declare_subscriber(f"{self._keys.root}/*/log", take))
 
     def _log(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
