@@ -98,6 +98,7 @@ class RecordFiles:
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
+        self._stiff: dict[str, Any] = {}
         self.in_memory = not any(file.path.name for file in files)
         self._keys = KeysFile(files[0].path) if files and files[0].path.name else None
         self._files = [
@@ -141,6 +142,11 @@ class RecordFiles:
     def note(self, entry: Mapping[str, Any]) -> None:
         """Add what happened to the metadata of all files; the errors are those of `write`."""
         self._each(lambda own: own.file.note(entry))
+
+    def note_stiff(self, instance: str, point: int, message: str) -> None:
+        """Add to the metadata at which point a model was found to be stiff; the errors are those of `write`."""
+        self._stiff = {**self._stiff, instance: {"point": point, "message": message}}
+        self.note({"stiff": self._stiff})
 
     def keep(self, values: Sequence[KeyValue]) -> None:
         """Keep values that have come by keys, beside the first file; the errors are those of `write`."""

@@ -28,7 +28,7 @@ from msgspec.structs import replace
 from ..config.mesh import TimeoutsConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, TerminationRequested
 from ..instances.call_guard import CallWatch
-from ..instances.contract import Instance, LogMessage
+from ..instances.contract import SOLVER, Instance, LogMessage
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
@@ -209,12 +209,17 @@ class RepeatedRuns:
             if around.open_instance is not None:
                 return around.open_instance(name)
             around.scratch.mkdir(mode=0o700, exist_ok=True)
-            opening = opening_of(plan, name, around.scratch, around.log, run.showing)
+            opening = opening_of(plan, name, around.scratch, self._log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
         self._slices = _Slices()
-        self._system, self._made_for = HostedSystem(plan, watch, opened, around.log, alone=self._alone), made_for
+        self._system, self._made_for = HostedSystem(plan, watch, opened, self._log, alone=self._alone), made_for
         return self._system
+
+    def _log(self, message: LogMessage) -> None:
+        self._around.log(message)
+        if message.category == SOLVER and self._run is not None:
+            self._run.note_stiff(message)
 
     def _remove_scratch(self) -> None:
         shutil.rmtree(self._around.scratch, ignore_errors=True)
@@ -353,6 +358,11 @@ class _Run:
         self._stopping.set()
         if (engine := self._engine) is not None:
             engine.ring_bell()
+
+    def note_stiff(self, message: LogMessage) -> None:
+        """A solver has found that its model is stiff."""
+        step_points = self._plan.system.instances[message.instance].step_points
+        self.writer.note_stiff(message.instance, message.step * step_points, message.message)
 
     def _step_to_the_end(self, engine: Engine) -> None:
         """Take steps and write rows; rows that are not written yet are never overwritten."""
