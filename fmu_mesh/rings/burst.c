@@ -715,27 +715,28 @@ static inline int call_copy(const CopyCall *own, char *values) {
 
 /* Copy an output from the row at the point of a copy. */
 static inline void read_copy(const Copy *copy, const CopyOutput *output, int64_t size, char *to) {
-  const Member *member = output->member;
-  if (member == NULL) return; /* it could not begin */
-  const Output *own = &member->outputs[0];
-  const int64_t row = member->points == 1 ? copy->point : copy->point / member->points;
-  const char *from = own->rows + (row & own->mask) * own->stride + output->place;
+  if (output->first == NULL) return;
+  const int64_t row = output->points == 1 ? copy->point : copy->point / output->points;
+  const char *from = output->first + (row & output->mask) * output->stride;
   if (size == 8)
     memcpy(to, from, 8);
   else
     memcpy(to, from, (size_t)size);
 }
 
-/* Bring a copy back to where it was: each of its FMUs by its state, and memory that was kept. Whether there is that. */
-static inline int restore_copy(const CopyCall *calls, int64_t n_calls, const Keep *pieces, int64_t n_pieces) {
-  if (pieces->kept == NULL) return 0;
-  for (int64_t i = 0; i < n_calls; i++)
+/* Bring a copy back to its first point: each of its FMUs by its state, and memory that was kept. Whether there is that. */
+static inline int restore_copy(const Work *work, int64_t number) {
+  int64_t *const *places = (int64_t *const *)work->places + number * (1 + work->pieces_each);
+  if (places[0] == NULL) return 0;
+  const CopyCall *calls = &work->calls[number * work->calls_each];
+  for (int64_t i = 0; i < work->calls_each; i++)
     if (!call_copy(&calls[i], NULL)) return 0;
-  for (int64_t i = 0; i < n_pieces; i++) {
-    int64_t *restrict to = pieces[i].memory;
-    const int64_t *restrict from = pieces[i].kept;
-    for (int64_t left = pieces[i].size; left > 0; left--) *to++ = *from++;
+  for (int64_t i = 0; i < work->pieces_each; i++) {
+    int64_t *restrict to = places[1 + i];
+    const int64_t *restrict from = places[0] + work->pieces[i].kept;
+    for (int64_t left = work->pieces[i].size; left > 0; left--) *to++ = *from++;
   }
+  work->copies[number].point = work->copies[number].goal = 0;
   return 1;
 }
 
@@ -749,9 +750,7 @@ static int64_t work_on(const Work *work, int64_t first, int64_t end) {
       case STEP: is_done = (work->copies[i].end = step_copy(&work->copies[i])) == DONE; break;
       case CALL: is_done = call_copy(&work->calls[i], work->values + i * work->stride); break;
       case READ: read_copy(&work->copies[i], &work->reads[i], work->size, work->values + i * work->stride); break;
-      default:
-        is_done = restore_copy(&work->calls[i * work->calls_each], work->calls_each, &work->pieces[i * work->pieces_each],
-                               work->pieces_each);
+      default: is_done = restore_copy(work, i);
     }
     left += !is_done;
     if (work->wanted != NULL) work->wanted[i] = !is_done;

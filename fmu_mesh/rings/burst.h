@@ -290,15 +290,13 @@ typedef struct { /* a getter or setter of one copy, for some variables */
   int64_t count, size; /* as those of Call; with the count -1, the function sets the state `references` */
 } CopyCall;
 
-typedef struct { /* an output in the rows of one copy: `place` in bytes */
-  const Member *member;
-  int64_t place;
+typedef struct { /* an output of one copy: where it is in the first row of its ring, whose rows are so many points apart */
+  const char *first; /* NULL: the copy could not begin */
+  int64_t stride, mask, points;
 } CopyOutput;
 
-typedef struct { /* memory of a copy, and what it has to be again; in numbers of eight bytes */
-  int64_t *memory;
-  const int64_t *kept;
-  int64_t size;
+typedef struct { /* memory that each copy has: its place among what was kept, in numbers of eight bytes */
+  int64_t kept, size;
 } Keep;
 
 enum WorkKind { STEP, CALL, READ, RESTORE, HAND_OVER }; /* Work.kind */
@@ -308,7 +306,8 @@ typedef struct { /* what is done with many copies: `wanted` says with which (NUL
   Copy *copies;
   const CopyCall *calls; /* one for each copy; RESTORE: one for each of its FMUs */
   const CopyOutput *reads;
-  const Keep *pieces; /* RESTORE: so many for each copy */
+  const Keep *pieces;     /* RESTORE: the same of all copies */
+  const void *places;     /* pointers: for each copy what was kept of it (NULL: nothing), and then where its pieces are */
   int64_t calls_each, pieces_each; /* of one copy */
   uint8_t *wanted;
   char *values;

@@ -399,12 +399,12 @@ class CopyCall(Structure):
 
 @_declared("Keep")
 class Keep(Structure):
-    """Memory of a copy, and what it has to be again."""
+    """Memory that each copy has, and what it has to be again."""
 
 
 @_declared("CopyOutput")
 class CopyOutput(Structure):
-    """An output in the rows of one copy."""
+    """Where the rows of one copy have an output."""
 
 
 @_declared("Work")

@@ -237,9 +237,6 @@ class Copies:
         Where a failed copy has no value any more, it stays as it is.
         """
         members = self._node.instance(instance)
-        wanted = np.ones(len(self._copies), np.bool_)
-        if self.errors:
-            wanted[[number for number, error in self.errors.items() if isinstance(error, FmuError)]] = False
         in_rows = all(name in members.outputs.names for name in names) and native.library is not None
         if in_rows and not is_text(members.outputs.column(names[0]).type):
             first = 0
@@ -250,9 +247,13 @@ class Copies:
                 first += place.size
             if instance not in self._is_set:
                 return
-            wanted &= self._set_at[instance] == self.points // members.step_points
+            wanted = self._set_at[instance] == self.points // members.step_points
             if not wanted.any():
                 return
+        else:
+            wanted = np.ones(len(self._copies), np.bool_)
+        if self.errors:
+            wanted[[number for number, error in self.errors.items() if isinstance(error, FmuError)]] = False
 
         def by_python(number: int) -> None:
             copy = self._copies[number]

@@ -6,7 +6,9 @@ Owns the states of the first point, and how the library brings copies back to th
 
 # A way back is little work, but a copy has that memory in many places, so the time goes into the caches of the
 # processor. Therefore the memory of a copy is in one piece where that can be (`HostMemory.rooms`), what is kept is
-# there once for all copies that have the same (as most do), and of the outputs one row is brought back.
+# there once for all copies that have the same (as most do), sizes are there once for all copies, and of the outputs
+# one row is brought back. What is left are some five cache lines of each copy, beside those of its FMU, that the
+# library writes; a program in C that does nothing but set states writes none of them.
 #
 # Tried and given up, because nothing was gained: to fetch the places of the next copies ahead, to go place by place
 # through all copies, and large pages.
@@ -46,10 +48,10 @@ class FirstPoints:
         self._threads, self._copies, self._tables = threads, copies, tables
         self._saved: dict[int, SavedCopy] = {}
         self._kept = b""
-        self._sizes = 0, 0
         self._calls: Any = None
         self._pieces: Any = None
-        self._zeros = (ctypes.c_int64 * 2)()
+        self._places: NDArray[np.int64] | None = None
+        self._places_at = 0
 
     def note(self, number: int) -> None:
         """A copy is at its first point: from now on, it comes back by what it has there.
@@ -65,21 +67,20 @@ class FirstPoints:
         by_calls = copy.restored_by(saved)
         if by_calls is None or native.library is None:
             return
-        calls, pieces = by_calls
-        point = ctypes.addressof(self._tables[number]) + native.CopyTable.point.offset  # and the goal is beside it
-        pieces = [native.Keep(point, ctypes.addressof(self._zeros), 2), *pieces]
-        if self._pieces is None:
-            self._sizes = len(calls), len(pieces)
+        calls, pieces, places = by_calls
+        if self._places is None:
+            self._pieces = native.table(native.Keep, pieces)
             self._calls = (native.CopyCall * (len(self._tables) * len(calls)))()
-            self._pieces = (native.Keep * (len(self._tables) * len(pieces)))()
-        of_calls, of_pieces = self._sizes
-        self._calls[number * of_calls : (number + 1) * of_calls] = calls
-        self._pieces[number * of_pieces : (number + 1) * of_pieces] = pieces
+            self._places = np.zeros((len(self._tables), 1 + len(pieces)), np.int64)
+            self._places_at = self._places.ctypes.data
+        self._calls[number * len(calls) : (number + 1) * len(calls)] = calls
+        kept = ctypes.cast(ctypes.c_char_p(saved.kept), ctypes.c_void_p).value
+        self._places[number] = kept or 0, *places
 
     def leave(self, number: int) -> None:
         """A copy cannot come back to its first point."""
-        if self._pieces is not None:
-            self._pieces[number * self._sizes[1]] = native.Keep()
+        if self._places is not None:
+            self._places[number, 0] = 0
 
     def free(self, number: int) -> None:
         """Free the states of a copy, if there are any; it cannot come back then."""
@@ -102,14 +103,15 @@ class FirstPoints:
     def restore(self, wanted: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Bring the ``wanted`` copies, shape (count,), back to their first points; which ones are left, if any."""
         left = wanted.copy()
-        if self._pieces is None:
+        if self._places is None:
             return left
         is_any_left = self._threads.work(
             WorkKind.RESTORE,
             calls=ctypes.addressof(self._calls),
-            calls_each=self._sizes[0],
+            calls_each=len(self._calls) // len(self._tables),
             pieces=ctypes.addressof(self._pieces),
-            pieces_each=self._sizes[1],
+            places=self._places_at,
+            pieces_each=self._places.shape[1] - 1,
             wanted=left.ctypes.data,
         )
         return left if is_any_left else None

@@ -112,9 +112,9 @@ class SystemCopy:
         if instance not in self.runners:
             return native.CopyOutput()
         runner = self.runners[instance]
-        place = runner.outputs.layout.place(name)
-        at = runner.outputs.place_in_row(place.part, place.first)
-        return native.CopyOutput(ctypes.addressof(runner.table), at)
+        ring, place = runner.outputs, runner.outputs.layout.place(name)
+        first = ring.address + ring.place_in_row(place.part, place.first)
+        return native.CopyOutput(first, ring.stride, ring.mask, runner.plan.step_points)
 
     def values(self, instance: str, names: Sequence[str], point: int, since: int) -> list[Value]:
         """The values of variables; those of outputs are in their row, if nothing was set since then."""
@@ -163,8 +163,8 @@ class SystemCopy:
         for runner in self.runners.values():
             runner.follow_inputs()
 
-    def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep]] | None:
-        """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept.
+    def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep], list[int]] | None:
+        """What `restore` does, as calls, pieces, and their places in memory; None if there is more to do.
 
         It is a state of point 0: of the outputs there is one row, and steps write the others before they are read.
         """
@@ -177,11 +177,12 @@ class SystemCopy:
         if any(len(_texts(runner)) for runner in self.runners.values()):
             return None
         rows = {own.outputs.address: own.outputs.stride for own in self.runners.values()}
-        keeps, kept = [], ctypes.cast(ctypes.c_char_p(saved.kept), ctypes.c_void_p).value or 0
+        pieces, places, kept = [], [], 0
         for address, size in self._spans():
-            keeps.append(native.Keep(address, kept, rows.get(address, size) // 8))
+            pieces.append(native.Keep(kept // 8, rows.get(address, size) // 8))
+            places.append(address)
             kept += size
-        return calls, keeps
+        return calls, pieces, places
 
     def free(self, saved: SavedCopy) -> None:
         """Free what was saved; the states of instances that are closed went with them."""
@@ -198,7 +199,7 @@ class SystemCopy:
         yield from self.engine.places
         for runner in self.runners.values():
             yield runner.counter.address, 8
-            for ring in (runner.outputs, runner.inputs):
+            for ring in (runner.outputs, runner.inputs) if runner.inputs.layout.names else (runner.outputs,):
                 yield ring.address, ring.rows * ring.stride
             if isinstance(runner.instance, StepsNatively) and (own := runner.instance.native) is not None:
                 yield own.said, ctypes.sizeof(native.Said)
