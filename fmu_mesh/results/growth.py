@@ -47,7 +47,7 @@ class GrowthWatch:
         self.warnings: tuple[str, ...] = ()
         self._plan = plan
         self._columns: list[tuple[str, str, ReadColumn]] = []
-        self._given = np.zeros(0)
+        self._given, self._harmless = np.zeros(0), 0.0
         self._crossings: dict[int, list[tuple[int, float]]] = {}  # points and values above each of the steps so far
         last = plan.grid.last_point
         self._normal = _FIRST_POINTS if last >= ENDLESS else max(1, math.ceil(_FIRST_PART * (last + 1)))
@@ -63,6 +63,7 @@ class GrowthWatch:
                 scales.append(max([0.0 if variable.nominal else 1.0, *given]))
                 self._columns.append((instance, name, read))
         self._given = np.array(scales)
+        self._harmless = _STEPS[-1] * min(scales, default=0.0)
         self.begin_again()
 
     def begin_again(self) -> None:
@@ -75,8 +76,10 @@ class GrowthWatch:
         """Look at the points first to end - 1."""
         if self.warnings:
             return
-        normal = min(max(self._normal, first), end)
+        normal, is_whole_run = min(max(self._normal, first), end), first == 0 and end > self._plan.grid.last_point
         for part, sizes in self._blocks(first, end):
+            if is_whole_run and np.maximum.reduce(sizes, axis=None) <= self._harmless:
+                continue  # no scale is less than the one that is given, and nobody looks at the scales again
             scales, limits = self._scales[part], self._limits[part]
             if normal > first:
                 usual = sizes[:, : normal - first]
