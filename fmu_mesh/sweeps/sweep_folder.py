@@ -21,13 +21,14 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from types import NoneType
 from typing import Any, Final
 
 import msgspec
 
 from ..errors import ConfigurationError
 from ..files import decoded_json, is_file, replaced, write_whole
-from .variant_run import Cell, Common, Row, path_of
+from .variant_run import Common, Row, path_of
 from .variants import Parameters
 
 __all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
@@ -36,6 +37,8 @@ _WANTED: Final = "sweep.json"
 _ROWS: Final = "rows"
 _TABLE: Final = "table.csv"
 _CURVES: Final = "runs"
+_WRITTEN: Final = frozenset({float, int, str, NoneType})
+"""What `csv` writes as it is in the table: a float with the digits that give the same bits again."""
 
 
 class Wanted(Common, frozen=True, kw_only=True):
@@ -128,8 +131,10 @@ class SweepFolder:
         writer.writerow(["variant", *wanted.names, "exit_code", "message", *columns, "id", "seconds", "worker"])
         for number, row in enumerate(rows):
             if row is not None:
-                cells = cells_of(wanted, number, row, columns) | {"seconds": f"{row.seconds:.4f}"}
-                writer.writerow(map(_cell, cells.values()))
+                found = [row.values.get(name) for name in columns]
+                cells = [number, *wanted.variants[number], row.exit_code, row.message, *found, row.id]
+                cells += f"{row.seconds:.4f}", row.worker
+                writer.writerow([own if type(own) in _WRITTEN else _cell(own) for own in cells])
         write_whole(self.table, text.getvalue(), "the table ")
 
 
@@ -209,16 +214,6 @@ def _lines(file: Path) -> Iterator[Row]:
             continue
 
 
-def _cell(value: Cell | Sequence[Any]) -> str:
-    """A value as text: a float with the digits that give the same bits again, an array as JSON."""
-    match value:
-        case None:
-            return ""
-        case bool():
-            return "true" if value else "false"
-        case float():
-            return repr(value)
-        case str() | int():
-            return str(value)
-        case _:
-            return json.dumps(value)
+def _cell(value: object) -> str:
+    """A value as text that `csv` does not write as we do: `true` or `false`, and an array as JSON."""
+    return value if isinstance(value, str) else json.dumps(value)
