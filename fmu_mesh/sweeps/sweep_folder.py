@@ -21,7 +21,6 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from types import NoneType
 from typing import Any, Final
 
 import msgspec
@@ -37,8 +36,6 @@ _WANTED: Final = "sweep.json"
 _ROWS: Final = "rows"
 _TABLE: Final = "table.csv"
 _CURVES: Final = "runs"
-_WRITTEN: Final = frozenset({float, int, str, NoneType})
-"""What `csv` writes as it is in the table: a float with the digits that give the same bits again."""
 
 
 class Wanted(Common, frozen=True, kw_only=True):
@@ -134,7 +131,8 @@ class SweepFolder:
                 found = [row.values.get(name) for name in columns]
                 cells = [number, *wanted.variants[number], row.exit_code, row.message, *found, row.id]
                 cells += f"{row.seconds:.4f}", row.worker
-                writer.writerow([own if type(own) in _WRITTEN else _cell(own) for own in cells])
+                # All others, `csv` writes as we do: a float with the digits that give the same bits again.
+                writer.writerow([json.dumps(own) if isinstance(own, bool | list) else own for own in cells])
         write_whole(self.table, text.getvalue(), "the table ")
 
 
@@ -212,8 +210,3 @@ def _lines(file: Path) -> Iterator[Row]:
             yield msgspec.convert(json.loads(line), Row)
         except (ValueError, msgspec.MsgspecError, RecursionError):
             continue
-
-
-def _cell(value: object) -> str:
-    """A value as text that `csv` does not write as we do: `true` or `false`, and an array as JSON."""
-    return value if isinstance(value, str) else json.dumps(value)
