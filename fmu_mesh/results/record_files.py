@@ -236,7 +236,7 @@ class _RecordFile:
         rows = self._record.rows_within(first, end)
         if (first, end) != self._rows:  # in short runs one after another, these are the same
             self._rows, self._times = (first, end), self._grid.times(first, end)[rows]
-            self._times.flags.writeable = False
+            self._times.setflags(write=False)
         if len(times := self._times):
             if self._noted is None:
                 self._note_kept(Kept())
