@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Final, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..rings.ring import Ring
 
 __all__ = [
+    "SOLVER",
     "BeginsAgain",
     "ChangesProcess",
     "Instance",
@@ -41,6 +42,10 @@ __all__ = [
 ]
 
 Section = TypeVar("Section", bound=InstanceSection)
+
+
+SOLVER: Final = "solver"
+"""The category of the message with which a solver says, once, that its model is stiff."""
 
 
 class LogMessage(msgspec.Struct, frozen=True):

@@ -130,7 +130,7 @@ class MasterServer:
         self.show("log", lambda: [*self._newest_lines])
         post = self._inbox.post
         # On the thread that reads the link: a line is taken before the report of its node, which came after it.
-        take = Callback(lambda sample: post(lambda: self._log(sample)), indirect=False)
+        take: Callback[zenoh.Sample] = Callback(lambda sample: post(lambda: self._log(sample)), indirect=False)
         self._entities.append(self._session.declare_subscriber(f"{self._keys.root}/*/log", take))
 
     def _log(self, sample: zenoh.Sample) -> None:

@@ -55,9 +55,11 @@ from ..wire.messages import (
     PROGRESS,
     RESET,
     SET,
+    STIFF,
     NewStart,
     NodeReport,
     SetValue,
+    Stiff,
     decode_json,
     encode_json,
 )
@@ -166,7 +168,7 @@ class Node:
         self._keeper: StreamKeeper | None = None
         self._profiler: Profiler | None = None
         self._activity = Activity(plan, self._inbox.refusals)
-        self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self._tell_set)
+        self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self.tell_recorder)
 
     @property
     def finished(self) -> bool:
@@ -215,6 +217,15 @@ class Node:
             raise Interrupted(reason)
 
         self._inbox.post(end, first=True)
+
+    def tell_recorder(self, news: SetValue | Stiff | Sequence[KeyValue]) -> None:
+        """On the main thread: what the metadata of results get, such as a value that another program has set."""
+        if RECORDER in dict(self._plan.windows):
+            if isinstance(news, SetValue | Stiff):
+                kind, point = (SET if isinstance(news, SetValue) else STIFF), news.point
+            else:
+                kind, point = KEYS, news[-1][1]
+            self._put_set(encode_json(kind, news, point))
 
     def report_hang(self, error: FmuError) -> bool:
         """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""
@@ -566,12 +577,6 @@ class Node:
         report = NodeReport(self._plan.node, point, error.report() if error is not None else None, profile)
         # After the last samples: the master routes them to clients, and ends when it has all reports.
         self._membership.report(report, timeout_s, self._is_cut_off, priority=PRIORITY)
-
-    def _tell_set(self, value: SetValue | Sequence[KeyValue]) -> None:
-        """Tell the recorder which value another program has set, or which have come by keys."""
-        if RECORDER in dict(self._plan.windows):
-            kind, point = (SET, value.point) if isinstance(value, SetValue) else (KEYS, value[-1][1])
-            self._put_set(encode_json(kind, value, point))
 
     def _is_cut_off(self) -> bool:
         """Whether no answer of the master can come: it is gone, or the link to its host has been silent too long."""

@@ -39,6 +39,7 @@ from typing import Self
 import numpy as np
 import zenoh
 from msgspec import to_builtins
+from msgspec.structs import astuple
 
 from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, RunReset
 from ..results.growth import GrowthWatch, ReadColumn
@@ -56,6 +57,7 @@ from ..wire.membership import Membership
 from ..wire.messages import (
     ABORT,
     FINISH,
+    FOR_METADATA,
     FRAME,
     GRANT,
     HEADER,
@@ -65,8 +67,10 @@ from ..wire.messages import (
     PROGRESS,
     RESET,
     SET,
+    STIFF,
     NodeReport,
     SetValue,
+    Stiff,
     decode_json,
 )
 from ..wire.router_link import RouterLink
@@ -186,7 +190,7 @@ class Recorder:
         """All nodes have reported: what they have told before, faster rows may have overtaken."""
         self._inbox.settle(_LAST_S)
         while (message := self._inbox.poll()) is not None:
-            if message[1] in (SET, KEYS):
+            if message[1] in FOR_METADATA:
                 self._take(message)
 
     def _end(self, cause: BaseException | None) -> None:
@@ -278,6 +282,9 @@ class Recorder:
         if kind == SET:
             self._files.note(to_builtins(decode_json(data[HEADER.size :], SetValue)))
             return
+        if kind == STIFF:
+            self._files.note_stiff(*astuple(decode_json(data[HEADER.size :], Stiff)))
+            return
         if kind == KEYS:
             self._files.keep(decode_json(data[HEADER.size :], list[KeyValue], _MOST_KEYS))
             return
@@ -348,7 +355,7 @@ class Recorder:
                 if left <= 0 or not self._rows_are_missing():
                     return
                 message = self._inbox.wait(left)
-            if message is not None and message[1] in (FRAME, LAST, SET, KEYS):
+            if message is not None and message[1] in (FRAME, LAST, *FOR_METADATA):
                 self._take(message)
 
     def _rows_are_missing(self) -> bool:

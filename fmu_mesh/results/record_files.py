@@ -104,9 +104,10 @@ class RecordFiles:
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)
             for number, file in enumerate(files)
         ]
-        self._look_at_files()
+        self._begin_files()
 
-    def _look_at_files(self) -> None:
+    def _begin_files(self) -> None:
+        self._stiff: dict[str, Any] = {}
         paths = [own.file.path for own in self._files]
         self.in_memory = not any(path.name for path in paths)
         self._keys = KeysFile(paths[0]) if paths and paths[0].name else None
@@ -136,7 +137,7 @@ class RecordFiles:
         """Another run begins, with as many files for the same columns."""
         for own, file in zip(self._files, files, strict=True):
             own.begin_again(file)
-        self._look_at_files()
+        self._begin_files()
         if self._growth is not None:
             self._growth.begin_again()
 
@@ -155,6 +156,11 @@ class RecordFiles:
     def note(self, entry: Mapping[str, Any]) -> None:
         """Add what happened to the metadata of all files; the errors are those of `write`."""
         self._each(lambda own: own.file.note(entry))
+
+    def note_stiff(self, instance: str, point: int, message: str) -> None:
+        """Add to the metadata at which point a model was found to be stiff; the errors are those of `write`."""
+        self._stiff = {**self._stiff, instance: {"point": point, "message": message}}
+        self.note({"stiff": self._stiff})
 
     def keep(self, values: Sequence[KeyValue]) -> None:
         """Keep values that have come by keys, beside the first file; the errors are those of `write`."""

@@ -28,7 +28,7 @@ from msgspec.structs import replace
 from ..config.mesh import TimeoutsConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, TerminationRequested
 from ..instances.call_guard import CallWatch
-from ..instances.contract import Instance, LogMessage
+from ..instances.contract import SOLVER, Instance, LogMessage
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
@@ -100,7 +100,8 @@ class RepeatedRuns:
         open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
         models = KeptModels(folder, resets=reset)
-        self._around = _Surroundings(folder / _SCRATCH, models, log, progress, open_instance, before_close)
+        given = log, progress, open_instance, before_close, threading.Event()
+        self._around = _Surroundings(folder / _SCRATCH, models, *given)
         self._on_hang, self._alone = on_hang, alone
         self._threads = LimitedThreads()
         self._process = OneProcess()
@@ -112,7 +113,6 @@ class RepeatedRuns:
         self._writer: RowWriter | None = None
         self._slices = _Slices()
         self._stop: str | None = None
-        self._stopping = threading.Event()
 
     def run(
         self,
@@ -142,8 +142,8 @@ class RepeatedRuns:
                 writer.begin_again(files)
             with closing(writer):
                 system = system or self._new_system(*made_for)
-                self._stopping.clear()
-                self._run = current = _Run(system, writer, self._around, self._slices, self._stopping)
+                self._around.stopping.clear()
+                self._run = current = _Run(system, writer, self._around, self._slices)
                 if self._stop is not None:
                     current.interrupt(self._stop)
                 return current.run(start_values, watch, self._threads)
@@ -216,12 +216,17 @@ class RepeatedRuns:
             if around.open_instance is not None:
                 return around.open_instance(name)
             around.scratch.mkdir(mode=0o700, exist_ok=True)
-            opening = opening_of(plan, name, around.scratch, around.log, run.showing)
+            opening = opening_of(plan, name, around.scratch, self._log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
         self._slices, self._made_for = _Slices(), (run, files, watch)
-        self._system = HostedSystem(plan, watch, opened, around.log, alone=self._alone)
+        self._system = HostedSystem(plan, watch, opened, self._log, alone=self._alone)
         return self._system
+
+    def _log(self, message: LogMessage) -> None:
+        self._around.log(message)
+        if message.category == SOLVER and self._run is not None:
+            self._run.note_stiff(message)
 
     def _remove_scratch(self) -> None:
         shutil.rmtree(self._around.scratch, ignore_errors=True)
@@ -247,6 +252,7 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         scratch: a folder for files that are removed after each run.
+        stopping: ends a wait of the run under way.
     """
 
     scratch: Path
@@ -255,6 +261,7 @@ class _Surroundings(NamedTuple):
     progress: Callable[[int], None]
     open_instance: Callable[[str], Instance] | None
     before_close: Callable[[Outcome | BaseException], None] | None
+    stopping: threading.Event
 
 
 class _Slices:
@@ -283,14 +290,7 @@ class _Run:
         writer: writes its rows.
     """
 
-    def __init__(
-        self,
-        system: HostedSystem,
-        writer: RowWriter,
-        surroundings: _Surroundings,
-        slices: _Slices,
-        stopping: threading.Event,
-    ) -> None:
+    def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings, slices: _Slices) -> None:
         self.point = 0
         self._slices = slices
         self._system, self._plan = system, system.plan
@@ -298,7 +298,7 @@ class _Run:
         self.writer = writer
         self._around = surroundings
         self._stop: str | None = None
-        self._stopping = stopping
+        self._stopping = surroundings.stopping
         self._seconds = 0.0
         self._engine: Engine | None = None
         self._asked: TerminationRequested | None = None
@@ -380,6 +380,11 @@ class _Run:
         self._stopping.set()
         if (engine := self._engine) is not None:
             engine.ring_bell()
+
+    def note_stiff(self, message: LogMessage) -> None:
+        """A solver has found that its model is stiff."""
+        step_points = self._plan.system.instances[message.instance].step_points
+        self.writer.note_stiff(message.instance, message.step * step_points, message.message)
 
     def _step_to_the_end(self, engine: Engine) -> None:
         """Take steps and write rows; rows that are not written yet are never overwritten."""

@@ -19,7 +19,7 @@ from setproctitle import setproctitle
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
-from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
+from ..instances.contract import SOLVER, Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
 from ..master.master import Master
 from ..master.mesh_server import MasterSettings
@@ -32,7 +32,7 @@ from ..system.plan import MASTER, RECORDER, Plan
 from ..variables.value_types import PlainValue
 from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
-from ..wire.messages import NewStart
+from ..wire.messages import NewStart, Stiff
 from ..wire.router_link import RouterLink
 from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import Wiring, close_session, is_socket, open_session, own_endpoints
@@ -205,7 +205,10 @@ class _NodeProcess:
 
     def _log(self, message: LogMessage) -> None:
         if self._node is not None:
-            self._node.server.log_message(log_line(message, self._run.plan.instance(message.instance).step_points))
+            line = log_line(message, self._run.plan.instance(message.instance).step_points)
+            self._node.server.log_message(line)
+            if message.category == SOLVER:
+                self._node.tell_recorder(Stiff(line.instance, line.point, line.message))
             if message.status in ("error", "fatal"):  # the FMU may end the process next
                 self._node.server.say_everything(heard=True)
 

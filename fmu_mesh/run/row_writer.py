@@ -106,6 +106,11 @@ class RowWriter:
                 self._files.flush()
             self._flushed = now if is_late else self._flushed
 
+    def note_stiff(self, instance: str, point: int, message: str) -> None:
+        """Add to the metadata at which point a model was found to be stiff; the errors are those of `write`."""
+        with self._writing:
+            self._files.note_stiff(instance, point, message)
+
     def close(self) -> None:
         """Close the files; from any thread, and nothing happens if they are closed.
 

@@ -2,9 +2,9 @@
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
 four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), and in these as JSON: in an ABORT an
-`ErrorReport`, in a RESET a `NewStart`, and for the recorder in a SET a `SetValue`, and in a KEYS values that have come
-by keys. LAST says that no more rows of a link come, because the run has ended early. Every decoder checks sizes before
-it reads anything, and raises only `MessageRefused`.
+`ErrorReport`, in a RESET a `NewStart`, and for the recorder (`FOR_METADATA`) in a SET a `SetValue`, in a STIFF a
+`Stiff`, and in a KEYS values that have come by keys. LAST says that no more rows of a link come, because the run has
+ended early. Every decoder checks sizes before it reads anything, and raises only `MessageRefused`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ __all__ = [
     "ABORT",
     "ALIVE",
     "FINISH",
+    "FOR_METADATA",
     "FRAME",
     "GRANT",
     "HEADER",
@@ -37,9 +38,11 @@ __all__ = [
     "PROGRESS",
     "RESET",
     "SET",
+    "STIFF",
     "NewStart",
     "NodeReport",
     "SetValue",
+    "Stiff",
     "decode_json",
     "encode_json",
     "sealed",
@@ -59,6 +62,8 @@ ALIVE: Final = 10
 
 RESET: Final = 11
 KEYS: Final = 12
+STIFF: Final = 13
+FOR_METADATA: Final = (SET, KEYS, STIFF)
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 
@@ -100,6 +105,14 @@ class SetValue(msgspec.Struct, frozen=True):
     who: str
 
 
+class Stiff(msgspec.Struct, frozen=True):
+    """A model that has turned out to be stiff in the step from a point, and what its solver says."""
+
+    instance: str
+    point: int
+    message: str
+
+
 class NewStart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a node needs to begin again at the first point, beside its plan.
 
@@ -121,8 +134,10 @@ def sealed(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-def encode_json(kind: int, content: ErrorReport | NewStart | SetValue | Sequence[KeyValue], point: int = 0) -> bytes:
-    """An ABORT, RESET, SET or KEYS message."""
+def encode_json(
+    kind: int, content: ErrorReport | NewStart | SetValue | Stiff | Sequence[KeyValue], point: int = 0
+) -> bytes:
+    """An ABORT, RESET, SET, STIFF or KEYS message."""
     return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
 
 

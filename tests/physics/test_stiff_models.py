@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import pytest
 
+import fmu_mesh
 from fmu_mesh.errors import StepFailed
 from fmu_mesh.instances.contract import LogMessage
 from fmu_mesh.instances.fmi.archive.reading import read_description
@@ -120,6 +121,22 @@ def test_a_model_that_turns_out_to_be_stiff_goes_on_with_cvode(
     assert message.endswith(" s to stay stable. cvode goes on from here")
     assert first == pytest.approx(exact, rel=1e-3, abs=1e-4)  # a tolerance of 1e-6 for each of some hundred steps
     assert 10 * completed[0] < others[0] or case == "as it moves"  # type: ignore[operator]  # integers
+
+
+@pytest.mark.parametrize("way", ["processes", "a group", "one process", "zenoh"])
+def test_metadata_say_at_which_point_a_model_was_stiff(event_fmu: EventFmu, tmp_path: Path, way: str) -> None:
+    mesh = fmu_mesh.Mesh("heaters", step_size=0.1, stop_time=6.0)
+    heater, group = str(event_fmu("Heater", 2)), "both" if way == "a group" else None
+    mesh.add("early", fmu=heater, kind="model_exchange", group=group)
+    mesh.add("late", fmu=heater, kind="model_exchange", start_values={"late": 3.05}, step_size=0.2, group=group)
+    mesh.add("calm", fmu=str(event_fmu("Winding", 2)), kind="model_exchange")
+    if way == "zenoh":
+        mesh.configure(zenoh={"shared_memory": False, "row_streams": False})
+    file = tmp_path / "heaters.csv"
+    mesh.run(output=file, processes=way != "one process")
+    found = fmu_mesh.Result.read(file).metadata["stiff"]
+    assert {name: own["point"] for name, own in found.items()} == {"early": 0, "late": 30}
+    assert all(own["message"].endswith("cvode goes on from here") for own in found.values())
 
 
 @pytest.mark.parametrize(("step_size", "leaves"), [(0.01, False), (0.1, True)])
