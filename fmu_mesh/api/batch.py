@@ -340,13 +340,13 @@ class Batch:
             self._recorded.take(self._copies.points, self.get)
 
     def save(self) -> BatchState:
-        """Save the state of all copies: every instance, and the values between them (FMI 2.0, 2.1.8).
+        """Save the state of all copies: every instance, the values between them, and what was set (FMI 2.0, 2.1.8).
 
         Returns:
             The state. It is freed with the object, with its `close`, or with the batch.
 
         Raises:
-            CallRefused: an FMU cannot get and set its state, or inputs follow a scenario; or see `close`.
+            CallRefused: an FMU cannot get and set its state; or see `close`.
             FmuError: an FMU failed.
         """
         self._demand("save")

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system.schedule import between
 from ..variables.model_description import Value
 
-__all__ = ["Trajectory"]
+__all__ = ["SavedTrajectory", "Trajectory"]
+
+
+class SavedTrajectory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A `Trajectory`: its values and their times, and that from which no line leads to the next one, in s."""
+
+    linear: bool
+    held: float | None
+    times: tuple[float, ...]
+    values: tuple[Any, ...]
 
 
 class Trajectory:
@@ -23,17 +34,23 @@ class Trajectory:
         >>> trajectory.value(1.0, resolution=1e-9)
         2.0
 
-    ``linear`` says whether the input is linear between two times, or constant from each time on.
+    Args:
+        linear: whether the input is linear between two times, or constant from each time on.
+        saved: values that another one had.
     """
 
-    def __init__(self, *, linear: bool) -> None:
+    def __init__(self, *, linear: bool, saved: SavedTrajectory | None = None) -> None:
         self.linear = linear
-        self._held: float | None = None
-        self._times: list[float] = []
-        self._values: list[Value] = []
+        self._held = saved.held if saved is not None else None
+        self._times: list[float] = [*saved.times] if saved is not None else []
+        self._values: list[Value] = [*saved.values] if saved is not None else []
 
     def __len__(self) -> int:
         return len(self._times)
+
+    def save(self) -> SavedTrajectory:
+        """What it has now."""
+        return SavedTrajectory(self.linear, self._held, tuple(self._times), tuple(self._values))
 
     def add(self, time: float, value: Value, *, holds: bool = False) -> None:
         """The input has this value from ``time`` (s) on; it replaces the value for the same time.

@@ -8,23 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FmuError
 from ..instances.call_guard import Guarded
 from ..instances.contract import Instance, KeepsState, LogMessage
-from ..instances.input_trajectory import Trajectory
-from ..instances.instance_wrapper import AroundNativeSteps
+from ..instances.input_trajectory import SavedTrajectory, Trajectory
+from ..instances.instance_wrapper import AroundNativeSteps, of_kind, packed, unpacked
 from ..results.keys_file import recorded_values
+from ..rings.native import CopyCall
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.input_timeouts import InputTimeout, LastValues
 from ..system.plan import InstancePlan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
+from ..text import listed
 from ..variables.model_description import Value
 from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
@@ -47,12 +50,40 @@ class TooManyWait(ValueRefused):
     """A value is refused only because too many others of its variable wait for their times."""
 
 
+class _OverTime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Inputs over time between two own steps; what a scenario prescribes follows from the step.
+
+    Attributes:
+        step: the own step after the last one that `do_step` has taken.
+        sent: see `LastValues`; ``late``: see `TimedInputs`.
+        used: the values of ``trajectories`` that are set.
+        unwarned: the inputs of which no fallback was told yet.
+    """
+
+    step: int
+    trajectories: dict[str, SavedTrajectory]
+    used: dict[str, Any]
+    sent: dict[str, list[int]]
+    late: dict[str, int]
+    unwarned: tuple[str, ...]
+
+
+class _TimedState(msgspec.Struct, frozen=True):
+    """A state of the inner instance, and its inputs over time."""
+
+    inner: object
+    over_time: _OverTime
+
+
 class TimedInputs(AroundNativeSteps):
     """An `Instance` whose inputs and parameters may follow trajectories; all other calls go to the inner instance.
 
     The step from t sets each of these variables to its value at t. A value without a time holds from the next step on.
     So does a value with a past time, unless a value with a later time is already used. What a scenario prescribes is
     set in the steps in which it changes, and then replaces any other value. The instance may be of any kind.
+
+    A state has all values that were sent; but values of keys of Zenoh have no past, and there is no state then. After a
+    state is restored, the next step is one that `do_step` takes.
 
     Args:
         interpolation: linear between two times for inputs of type Real, or constant from each time on.
@@ -83,7 +114,8 @@ class TimedInputs(AroundNativeSteps):
         self._recorded = iter(recorded)
         self._next = next(self._recorded, None)
         self._last = LastValues(timeouts, courses, instance.description)
-        self._warn, self._unwarned = warn, {own.variable: own for own in timeouts}
+        self._warn, self._timeouts = warn, {own.variable: own for own in timeouts}
+        self._unwarned = {*self._timeouts}
         self.late: dict[str, int] = {}
         self.python_at = 0
         self.tracks: list[tuple[int, NDArray[np.float64]]] = []
@@ -215,8 +247,9 @@ class TimedInputs(AroundNativeSteps):
             if own.linear and own.after(time + self._grid.rounding(time)) is not None:
                 self._last.came(name, step)  # a line to a later value
         values, self.late = self._last.fall_back(step), self._last.late(step)
-        for name in [name for name in self._unwarned if name in self.late]:
-            timeout, point = self._unwarned.pop(name), self.late[name] * self._points
+        for name in [name for name in self._timeouts if name in self._unwarned and name in self.late]:
+            self._unwarned.remove(name)
+            timeout, point = self._timeouts[name], self.late[name] * self._points
             text = f"input '{name}' has had no value since point {point}: it {timeout}"
             self._warn(LogMessage(timeout.instance, "warning", "timeout", text, step))
         return values
@@ -266,9 +299,57 @@ class TimedInputs(AroundNativeSteps):
                 steps[name] = step if own.linear else max(step, self._grid.step_at(later, self._points))
         return steps
 
+    # --- states
+
+    def get_state(self) -> object:
+        """See `KeepsState`.
+
+        Raises:
+            FmuError: the inputs get values of keys, or the inner instance has no states.
+        """
+        trajectories = {name: own.save() for name, own in self._trajectories.items()}
+        sent = {name: [*steps] for name, steps in self._last.sent.items()}
+        unwarned = tuple(sorted(self._unwarned))
+        own = _OverTime(self._step, trajectories, dict(self._used), sent, dict(self.late), unwarned)
+        return _TimedState(super().get_state(), own)
+
+    def set_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        saved = of_kind(_TimedState, state)
+        super().set_state(saved.inner)
+        own = saved.over_time
+        self._trajectories = {
+            name: Trajectory(linear=kept.linear, saved=kept) for name, kept in own.trajectories.items()
+        }
+        self._used, self.late, self._unwarned = dict(own.used), dict(own.late), {*own.unwarned}
+        self._last.sent.update((name, [*steps]) for name, steps in own.sent.items())
+        self._step = self.python_at = own.step
+        self.tracks, self._tracked = [], []
+
+    def free_state(self, state: object) -> None:
+        """See `KeepsState`."""
+        super().free_state(of_kind(_TimedState, state).inner)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `KeepsState`."""
+        saved = of_kind(_TimedState, state)
+        return packed(saved.over_time, super().serialize_state(saved.inner))
+
+    def deserialize_state(self, data: bytes) -> object:
+        """See `KeepsState`."""
+        own, rest = unpacked(data, _OverTime, getattr(self._instance, "name", None))
+        return _TimedState(super().deserialize_state(rest), own)
+
+    def state_access(self, state: object) -> CopyCall | None:  # noqa: ARG002  as in `AccessedNatively`
+        """See `AccessedNatively`; None, because there is more to do."""
+        return None
+
     def _keeper(self) -> KeepsState:
-        text = "the state of an instance with inputs over time cannot be kept: the values are not part of it"
-        raise FmuError(text, instance=getattr(self._instance, "name", None))
+        if self._keys:
+            inputs = listed([*self._keys])
+            text = f"its state cannot be kept, because keys of Zenoh give values to {inputs}, and these have no past"
+            raise FmuError(text, instance=getattr(self._instance, "name", None))
+        return super()._keeper()
 
     def _time(self, step: int) -> float:
         return self._grid.time(step * self._points)

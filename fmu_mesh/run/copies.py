@@ -296,7 +296,7 @@ class Copies:
         without = [name for name, own in instances.items() if not own.description.can_get_and_set_state]
         if without:
             return f"the model description of {listed(without)} says that it cannot (canGetAndSetFMUstate)"
-        return f"inputs of {listed(self._timed)} follow a scenario, or have a timeout" if self._timed else None
+        return None
 
     def save(self) -> list[SavedCopy]:
         """Save all copies; `free` frees them.
@@ -308,12 +308,15 @@ class Copies:
         for _, models in self._models:
             models.reset_from_now_on()
         try:
-            every = range(len(self._copies))
-            self._threads.each(every, lambda number: saved.append(self._copies[number].save(int(self.points[number]))))
+            self._threads.each(range(len(self._copies)), lambda number: saved.append(self._saved(number)))
         except BaseException:
             self.free(saved)
             raise
         return saved
+
+    def _saved(self, number: int) -> SavedCopy:
+        set_at = {name: int(steps[number]) for name, steps in self._set_at.items()}
+        return self._copies[number].save(int(self.points[number]))._replace(set_at=set_at)
 
     def restore(self, saved: Sequence[SavedCopy], wanted: Truths) -> None:
         """Bring the ``wanted`` copies back to what was saved of them.
@@ -327,6 +330,8 @@ class Copies:
         def one(number: int) -> None:
             self._copies[number].restore(saved[number])
             self._back_at(number, saved[number].point)
+            for name, step in saved[number].set_at.items():
+                self._set_at[name][number] = step
 
         numbers = np.flatnonzero(wanted).tolist()
         self._threads.each(numbers, lambda number: self._end_of(number, partial(one, number)))
@@ -354,6 +359,9 @@ class Copies:
 
     def _reset(self, overrides: Callable[[int], Overrides] | None, number: int) -> None:
         """Make a copy as a new one."""
+        if overrides is None and number not in self.errors and self._first.by_python(number):
+            self._back_at(number, 0)
+            return
         self._first.free(number)
         self._ended[number] = True
         own = overrides(number) if overrides is not None else {}

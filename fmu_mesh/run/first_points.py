@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import FmuError
 from ..rings import native
 from ..rings.native import WorkKind
 from .copy_threads import CopyThreads
@@ -31,8 +32,9 @@ __all__ = ["FirstPoints"]
 class FirstPoints:
     """The first points of copies.
 
-    Call sequence, for a copy: `note` at its first point; then `restore`, and after that it is there; `leave` where its
-    FMUs have failed, and `free` before it is made anew. All but `restore` on the thread of the copy.
+    Call sequence, for a copy: `note` at its first point; then `restore`, and `by_python` where it is left, and after
+    that it is there; `leave` where its FMUs have failed, and `free` before it is made anew. All but `restore` on the
+    thread of the copy.
 
     Args:
         threads: of the copies.
@@ -85,6 +87,17 @@ class FirstPoints:
         saved = self._saved.pop(number, None)
         if saved is not None:
             self._copies[number].free(saved)
+
+    def by_python(self, number: int) -> bool:
+        """Bring a copy that has not failed back to its first point, where the library cannot; whether that worked."""
+        saved = self._saved.get(number)
+        if saved is None:
+            return False
+        try:
+            self._copies[number].restore(saved)
+        except FmuError:
+            return False
+        return True
 
     def restore(self, wanted: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Bring the ``wanted`` copies, shape (count,), back to their first points; which ones are left, if any."""

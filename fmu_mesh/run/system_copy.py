@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, cast
 
 from numpy.typing import NDArray
@@ -31,13 +32,15 @@ Overrides = Mapping[str, Mapping[str, PlainValue]]
 class SavedCopy(NamedTuple):
     """The state of one copy at a point; the states of its instances by name, and its texts by the name "".
 
-    ``instances`` stands for the instances that the states belong to.
+    ``instances`` stands for the instances that the states belong to, ``set_at`` for their own steps at which something
+    was set last.
     """
 
     point: int
     states: Mapping[str, object]
     kept: bytes
     instances: object
+    set_at: Mapping[str, int] = MappingProxyType({})
 
 
 class SystemCopy:
@@ -157,6 +160,8 @@ class SystemCopy:
         parts = (part for runner in self.runners.values() for part in _texts(runner))
         for part, kept in zip(parts, cast("tuple[NDArray[Any], ...]", saved.states[""]), strict=True):
             part[...] = kept
+        for runner in self.runners.values():
+            runner.follow_inputs()
 
     def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep]] | None:
         """What `restore` does, as calls of the library; None if there is more to do. ``saved`` has to be kept.

@@ -68,6 +68,13 @@ READ = {
 Action = tuple[str, Any]
 
 
+class OverTime(NamedTuple):
+    """What a scenario prescribes for variables, and the timeouts of inputs."""
+
+    values: dict[str, dict[str, Any]]
+    timeouts: dict[str, dict[str, Any]]
+
+
 class Pair(NamedTuple):
     """A mesh and a batch of it."""
 
@@ -76,9 +83,16 @@ class Pair(NamedTuple):
     batch: fmu_mesh.Batch
 
 
-def mesh_of(kind: str, folder: Path, event_fmu: Callable[..., Path]) -> fmu_mesh.Mesh:
+def mesh_of(
+    kind: str, folder: Path, event_fmu: Callable[..., Path], over_time: OverTime | None = None
+) -> fmu_mesh.Mesh:
     content = {"native": NATIVE, "mixed": MIXED}[kind]
     instances: dict[str, dict[str, Any]] = {name: dict(own) for name, own in content["instances"].items()}
+    if over_time is not None:
+        content = {**content, "scenario": {"values": over_time.values}}
+        for name, timeout in over_time.timeouts.items():
+            instance, variable = name.split(".")
+            instances[instance]["inputs"] = {variable: {"timeout": timeout}}
     for own in instances.values():
         if "event" in own:
             own["fmu"] = str(event_fmu(*own.pop("event")))
@@ -129,6 +143,29 @@ def actions(kind: str) -> st.SearchStrategy[list[Action]]:
         ),
         max_size=14,
     )
+
+
+def over_times(kind: str) -> st.SearchStrategy[OverTime]:
+    """Lines and values that hold; a parameter has no lines."""
+    times = st.lists(st.integers(1, 90), min_size=1, max_size=8, unique=True)
+    course = st.tuples(times.map(sorted), st.sampled_from(["hold", "linear"]), st.floats(-0.2, 0.2))
+    inputs = [name for name in SETTINGS[kind] if not name.endswith(".k")]
+    timeout = st.fixed_dictionaries(
+        {"after": st.integers(1, 30).map(lambda steps: steps * H), "then": st.sampled_from(["hold", 0.07, -0.05])}
+    )
+
+    def values(courses: dict[str, tuple[list[int], str, float]]) -> dict[str, dict[str, Any]]:
+        return {
+            name: {
+                "times": [H * time for time in points],
+                "values": [first * (1 + 0.1 * number) for number in range(len(points))],
+                "interpolation": way if name in inputs else "hold",
+            }
+            for name, (points, way, first) in courses.items()
+        }
+
+    courses = st.dictionaries(st.sampled_from(SETTINGS[kind]), course, max_size=4).map(values)
+    return st.builds(OverTime, courses, st.dictionaries(st.sampled_from(inputs), timeout, max_size=2))
 
 
 class Driven:
@@ -200,6 +237,33 @@ def test_copies_equal_systems_whatever_is_done_with_them(pair: Pair, data: st.Da
         event(f"{len(drawn) // 5 * 5} actions or more")
 
 
+@pytest.mark.parametrize("kind", ["native", "mixed"])
+@pytest.mark.parametrize(("way", "most"), [("alone", 12), ("threads", 4), ("processes", 3)])
+def test_inputs_over_time_go_on_after_any_restore(
+    kind: str, way: str, most: int, tmp_path: Path, event_fmu: Callable[..., Path]
+) -> None:
+    @given(over_times(kind), st.data())
+    @settings(max_examples=most, deadline=None)
+    def equal(over_time: OverTime, data: st.DataObject) -> None:
+        mesh = mesh_of(kind, tmp_path, event_fmu, over_time)
+        with ExitStack() as stack:
+            batch = stack.enter_context(mesh.batch(COPIES, **WAYS[way]))
+            driven = Driven(Pair(kind, mesh, batch), stack)
+            given = ("set", (data.draw(st.sampled_from(SETTINGS[kind])), [0.11, 0.12, 0.13]))
+            before = [("step", 4), ("save", None), ("step", 3), given, ("step", 6), ("save", None), ("step", 12)]
+            after = [("restore", (number, [True] * COPIES)) for number in (0, 1)]
+            for action, argument in [*before, *data.draw(actions(kind)), *after]:
+                getattr(driven, action)(argument)
+                driven.check()
+                for points in (1, 1, 8, 5, 5, 5, 20) if (action, argument) in after else ():
+                    driven.step(points)
+                    driven.check()
+
+    if (kind, way) == ("mixed", "threads"):
+        pytest.skip("components in Python do not step on several threads")
+    equal()
+
+
 COMPONENT = """
 import fmu_mesh
 
@@ -215,6 +279,15 @@ class Turning(fmu_mesh.Component):
         self.count += 1
         self.word = f"{self.y[0]:.3g}"
 """
+
+
+def step_equally(batch: fmu_mesh.Batch, systems: list[fmu_mesh.System], names: list[str], points: int) -> None:
+    batch.step(points)
+    for own in systems:
+        own.step(points)
+    for name in names:
+        expected = [np.array(own.get(name)).tolist() for own in systems]
+        assert batch.get(name).tolist() == expected, (name, points)
 
 
 @pytest.mark.parametrize(("library", "processes"), [(True, 1), (False, 1), (True, 2)], ids=["C", "Python", "processes"])
@@ -249,27 +322,28 @@ def test_components_arrays_texts_and_scenarios_are_the_same(
     inputs = np.arange(6.0).reshape(2, 3)
     with mesh.batch(2, processes=processes) as batch, mesh.open() as first, mesh.open() as second:
         systems = [first, second]
-        for points in (1, 9, 30, 50, 25):
-            batch.step(points)
-            batch.set({"turning.u": inputs, "gain.u": [3.0, 4.0]} if points == 9 else {})
-            for number, own in enumerate(systems):
-                own.step(points)
-                if points == 9:
-                    own.set("turning.u", inputs[number])
-                    own.set("gain.u", 3.0 + number)
-            for name in names:
-                expected = [np.array(own.get(name)).tolist() for own in systems]
-                assert batch.get(name).tolist() == expected, (name, points)
+        for points in (1, 9, 30):
+            step_equally(batch, systems, names, points)
+            if points == 9:
+                batch.set({"turning.u": inputs, "gain.u": [3.0, 4.0]})
+                for number, own in enumerate(systems):
+                    own.set_many({"turning.u": inputs[number], "gain.u": 3.0 + number})
+        state, states = batch.save(), [own.save() for own in systems]
+        for points in (50, 25):
+            step_equally(batch, systems, names, points)
         with pytest.raises(fmu_mesh.CallRefused, match="cannot be stepped by several threads, where both use"):
             mesh.batch(2, threads=2)
-        with pytest.raises(fmu_mesh.CallRefused, match=r"follow a scenario, or have a timeout|says that it cannot"):
-            batch.save()
+        batch.restore(state)
+        for own, kept in zip(systems, states, strict=True):
+            own.restore(kept)
+        for points in (2, 40, 31):
+            step_equally(batch, systems, names, points)
         batch.reset(np.array([False, True]))
         batch.step(10)
         with mesh.open() as again:
             again.step(10)
             assert batch.get("turning.y")[1].tolist() == again.get("turning.y").tolist()
-    assert batch.point.tolist() == [125, 10]
+    assert batch.point.tolist() == [123, 10]
 
 
 @pytest.mark.parametrize("way", WAYS)

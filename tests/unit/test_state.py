@@ -161,11 +161,11 @@ def test_what_is_no_state_is_refused(event_fmu: EventFmu, tmp_path: Path) -> Non
             one.instance.deserialize_state(b"no state")
 
 
-def test_inputs_over_time_are_no_part_of_state_so_there_is_none(tmp_path: Path) -> None:
+def test_values_of_keys_have_no_past_so_there_is_no_state(tmp_path: Path) -> None:
     path = FMUS / "Gain.fmu"
-    timed = TimedInputs(Fmi2Instance(path, "gain", read_description(path), tmp_path), "hold")
+    timed = TimedInputs(Fmi2Instance(path, "gain", read_description(path), tmp_path), "hold", keys={"u": False})
 
-    with pytest.raises(FmuError, match="the state of an instance with inputs over time cannot be kept"):
+    with pytest.raises(FmuError, match="keys of Zenoh give values to u, and these have no past"):
         timed.get_state()
     timed.close()
 

@@ -233,6 +233,37 @@ def test_a_line_to_a_later_value_is_a_value_in_each_step(quiet: Steps) -> None:
     assert quiet.go(10) == pytest.approx([5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 11.0, 11.0, 9.0])
 
 
+@pytest.mark.parametrize("serialized", [False, True])
+@pytest.mark.parametrize("quiet", ["hold", "linear"], indirect=True)
+def test_a_state_has_what_was_sent_until_then_and_no_more(
+    quiet: Steps,
+    serialized: bool,  # noqa: FBT001 a parameter of tests
+) -> None:
+    inputs = quiet.inputs
+    inputs.add("u", 3.0, 1.1)
+    inputs.add("u", 7.0, 1.8)
+    quiet.go(4)
+    state = inputs.get_state()
+    kept = inputs.deserialize_state(inputs.serialize_state(state)) if serialized else state
+    expected = quiet.go(9)
+    warned = len(quiet.warnings)
+    inputs.add("u", 4.0, None)
+    quiet.go(2)
+
+    for _ in range(2):
+        inputs.set_state(kept)
+        quiet.step = 4
+        assert quiet.go(9) == expected
+    assert (expected[-1], warned, len(quiet.warnings)) == (9.0, 1, 3)
+    for _ in range(2):  # what was set after the state was saved counts no more
+        inputs.set_state(kept)
+        quiet.step = 4
+        inputs.add("u", 4.0, None)
+        assert quiet.go(1) == [4.0]
+    for own in {id(state): state, id(kept): kept}.values():
+        inputs.free_state(own)
+
+
 def test_an_input_that_says_stop_ends_the_run(tmp_path: Path) -> None:
     steps = Steps(tmp_path, "hold", InputTimeout("gain", "u", 0.3, 3, 1, stops=True))
     steps.bind()
