@@ -119,8 +119,16 @@ def plain(put: Put, back: Returned, orders: dict[str, Any]) -> dict[str, Any]:
 def timed(put: Put, back: Returned, orders: dict[str, Any]) -> dict[str, Any]:
     """See the top of this file."""
     count, step_s = orders["count"], orders["step_s"]
+    lead = round(orders["ahead_s"] / step_s)
     assert back.wait(lambda: back.point >= 0), "the mesh publishes nothing"
-    first = back.point + round(orders["ahead_s"] / step_s)
+
+    def is_back() -> bool:
+        """What comes to a bridge before it knows the subscription of the mesh is lost."""
+        put(b'{"value": -1.0, "t": %.6f}' % ((back.point + lead) * step_s))
+        return back.wait(lambda: -1.0 in back.at, 0.1)
+
+    assert any(is_back() for _ in range(int(10 * _DEADLINE_S))), "nothing comes back"
+    first = back.point + lead
     paced(orders["rate_hz"], count, lambda n: put(b'{"value": %d.0, "t": %.6f}' % (n + 1, (first + n) * step_s)))
     assert back.wait(lambda: back.point > first + count), "the mesh does not go on"
     return {"first": first}
@@ -155,7 +163,7 @@ def main() -> None:
         back = Returned(session, orders["back"], orders["step_s"])
         role = _ROLES[orders["role"]]
         if orders.get("mqtt"):
-            command = ["mosquitto_pub", "-p", str(orders["mqtt"]), "-t", orders["key"], "-l"]
+            command = ["mosquitto_pub", "-p", str(orders["mqtt"]), "-q", "1", "-t", orders["key"], "-l"]
             with subprocess.Popen(command, stdin=subprocess.PIPE, bufsize=0) as mosquitto:
                 assert mosquitto.stdin is not None
                 write = mosquitto.stdin.write

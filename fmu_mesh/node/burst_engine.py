@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable, Sequence
 from itertools import chain
 from time import perf_counter
-from typing import NamedTuple, cast
+from typing import cast
 
 from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.contract import StepsNatively
@@ -15,7 +15,6 @@ from ..rings import native
 from ..rings.host_memory import HostMemory
 from ..rings.native import NEVER, OUT_OF_RANGE, STAGE_BITS, BurstEnd, RowBase, Stage, StepKind, table
 from ..rings.row_streams import RowStreams
-from ..rings.transfer import Transfer
 from ..system.plan import NodePlan
 from .engine import SLICE_S, STATE_CHECK_S, Engine, PlainEngine, Windows
 from .inputs import TimedInputs
@@ -39,19 +38,6 @@ def make_engine(  # noqa: PLR0913  one node and how it is connected
     return BurstEngine(plan, units, memory, windows, spins=spins, streams=streams)
 
 
-class _ByPython(NamedTuple):
-    """How Python takes a step of a runner.
-
-    Attributes:
-        texts: what moves texts into its inputs.
-        timed: whether its inputs follow times.
-    """
-
-    do_step: Callable[[int], None]
-    texts: Sequence[Transfer]
-    timed: bool
-
-
 class BurstEngine(Engine):
     """Steps with the burst in C."""
 
@@ -71,7 +57,7 @@ class BurstEngine(Engine):
         self._library = native.library
         self._kept: dict[str, list[object]] = {}
         self._tracks: dict[str, list[object]] = {}
-        self._by_python: dict[str, _ByPython] = {}
+        self._by_python: dict[str, Callable[[int], None]] = {}
         self._spent_s = [0.0] * len(units)  # by Python
         self._peers = table(native.Peer, [native.Peer(counter.address, window) for _, counter, window in self._windows])
         self._node = native.NodeTable(
@@ -106,10 +92,7 @@ class BurstEngine(Engine):
         most_s = STATE_CHECK_S if quiet else SLICE_S
         node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
         started, before, waited_ns = perf_counter(), self._ticks, node.waited_ns
-        while True:
-            result = library.run(self._address)
-            if result < BurstEnd.PYTHON:
-                break
+        while (result := self._run(None, most_s)) >= BurstEnd.PYTHON:
             self.complete(result)
             if perf_counter() - started > most_s:
                 library.attend(self._address)  # so it returns after this tick
@@ -118,36 +101,44 @@ class BurstEngine(Engine):
         self.note_wait((node.waited_ns - waited_ns) / 1e9)
         return self._ticks != before
 
+    def _run(self, copy: int | None, most_s: float) -> int:
+        """Step, in Python, too; with the address of a copy as one of many systems."""
+        try:
+            return int(self._library.run(self._address, copy, int(most_s * 1e9)))
+        except FmuMeshError as error:
+            self._note_failed(error)
+            raise
+
     def complete(self, result: int) -> None:
         """Let Python take or complete the step with which a burst has ended, or raise what it has ended with."""
         node, began = self._node, perf_counter()
-        unit, index = node.unit, node.member
-        runner = self.units[unit][index]
+        runner = self.units[node.unit][node.member]
+        member = runner.table
         if result == BurstEnd.FORGED:
             raise self._forged(runner)
         if result == BurstEnd.BLOCKED:
             raise ProtocolBroken("an instance cannot step, although all instances before it have stepped")
-        member, (do_step, texts, timed) = runner.table, self._by_python[runner.name]
         try:
             if result == BurstEnd.PYTHON:
-                step = member.step
-                for transfer in texts:
-                    transfer.step_text(step)
-                do_step(step)
-                if timed:
-                    self.follow_inputs(runner)
+                self._by_python[runner.name](member.step)
             else:
                 self._complete(runner, result)
         except FmuMeshError as error:
-            self._units[unit].stopped = 1
-            runner.is_finite.explain(error)
-            if isinstance(error, TerminationRequested):
-                member.stage = Stage.WAITING
+            self._note_failed(error)
             raise
         if floating_point_changed():
             restore_floating_point()
         member.stage = Stage.STEPPED
-        self._spent_s[unit] += perf_counter() - began
+        self._spent_s[node.unit] += perf_counter() - began
+
+    def _note_failed(self, error: FmuMeshError) -> None:
+        """Python has not been able to take or complete a step."""
+        unit, index = self._node.unit, self._node.member
+        runner = self.units[unit][index]
+        self._units[unit].stopped = 1
+        runner.is_finite.explain(error)
+        if isinstance(error, TerminationRequested):
+            runner.table.note(stage=Stage.WAITING)
 
     @property
     def copy(self) -> native.CopyTable:
@@ -160,9 +151,9 @@ class BurstEngine(Engine):
         return int(self._copy.point)
 
     def _step_to(self, point: int) -> None:
-        copy, step, address = self._copy, self._library.step_copy, ctypes.addressof(self._copy)
+        copy, address = self._copy, ctypes.addressof(self._copy)
         copy.goal = point
-        while (end := step(address)) != BurstEnd.DONE:
+        while (end := self._run(address, 0.0)) != BurstEnd.DONE:
             if end == BurstEnd.ATTENTION:
                 self._library.attended(self._address)
                 return
@@ -213,6 +204,7 @@ class BurstEngine(Engine):
         rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
         names = ("kind", "component", "do_step", "said") if own is not None else ()  # without them, BY_PYTHON is 0
         calls = {name: getattr(own, name) for name in names}
+        by_python = self._step_of(runner)
         made = native.MemberTable(
             **calls,
             start_time=grid.start_time,
@@ -228,6 +220,7 @@ class BurstEngine(Engine):
             step=before.step,
             stage=before.stage,
             outcome=before.outcome,
+            by_python=id(by_python),
         )
         loads = list(chain(*moves))
         if own is not None:
@@ -235,12 +228,25 @@ class BurstEngine(Engine):
             loads += own.loads
         made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
         self._kept[runner.name] = [made, bases, own]  # what the table points to
-        texts = [source.transfer for source in runner.sources if source.transfer.has_text]
-        self._by_python[runner.name] = _ByPython(
-            runner.instance.do_step, texts, isinstance(runner.instance, TimedInputs)
-        )
         ctypes.pointer(before)[0] = made
+        self._by_python[runner.name] = by_python  # now the table has no other one any more
         self.follow_inputs(runner)
+
+    def _step_of(self, runner: Runner) -> Callable[[int], None]:
+        """How Python takes a step of a runner, whose inputs that are no texts are there."""
+        do_step, is_timed = runner.instance.do_step, isinstance(runner.instance, TimedInputs)
+        texts = [source.transfer for source in runner.sources if source.transfer.has_text]
+        if not texts and not is_timed:
+            return do_step
+
+        def step_all(step: int) -> None:
+            for transfer in texts:
+                transfer.step_text(step)
+            do_step(step)
+            if is_timed:
+                self.follow_inputs(runner)
+
+        return step_all
 
     def follow_inputs(self, runner: Runner) -> None:
         """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""

@@ -39,10 +39,13 @@ __all__ = ["SLICE_S", "STATE_CHECK_S", "Engine", "PlainEngine", "Windows"]
 #   as that is two additions; all else every 50 ms (`STATE_CHECK_S`), as that is 10 us.
 # * Python writes a table while the burst uses it: it cannot, because `refit` and `follow_inputs` run on the main
 #   thread, between two calls of `node_run`, or for a member whose step the burst has just given to Python.
+# * A step of Python raises: the call of the library raises it, with the tables as they were in that step. The library
+#   has the interpreter's lock in such a step only, and calls the object that `_kept` holds; a `refit` within the step
+#   may replace that one.
 #
-# Tried and given up: one call from Python for each step (as much time as a small FMU takes), loops that llvmlite
-# compiled (170 MB, up to 20 ms for each node, and no faster; ADR 57), a grant that is asked for at each window (ADR
-# 58).
+# Tried and given up: one call from Python for each step (as much time as a small FMU takes), a return to Python for
+# each of its own steps (twice the time of such a step), loops that llvmlite compiled (170 MB, up to 20 ms for each node,
+# and no faster; ADR 57), a grant that is asked for at each window (ADR 58).
 
 SLICE_S: Final = 0.001
 """A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""

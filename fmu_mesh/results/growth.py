@@ -40,13 +40,14 @@ class GrowthWatch:
     Attributes:
         warnings: at most one.
 
-    Call sequence: `begin`, then `look` for consecutive points.
+    Call sequence: `begin`, then `look` for consecutive points; `begin_again` before those of another run of the plan.
     """
 
     def __init__(self, plan: Plan) -> None:
         self.warnings: tuple[str, ...] = ()
         self._plan = plan
         self._columns: list[tuple[str, str, ReadColumn]] = []
+        self._given, self._harmless = np.zeros(0), 0.0
         self._crossings: dict[int, list[tuple[int, float]]] = {}  # points and values above each of the steps so far
         last = plan.grid.last_point
         self._normal = _FIRST_POINTS if last >= ENDLESS else max(1, math.ceil(_FIRST_PART * (last + 1)))
@@ -61,25 +62,38 @@ class GrowthWatch:
                 given = [abs(bound) for bound in bounds if bound is not None and math.isfinite(bound)]
                 scales.append(max([0.0 if variable.nominal else 1.0, *given]))
                 self._columns.append((instance, name, read))
-        self._scales = np.array(scales)
-        self._limits = self._scales.copy()
+        self._given = np.array(scales)
+        self._harmless = _STEPS[-1] * min(scales, default=0.0)
+        self.begin_again()
+
+    def begin_again(self) -> None:
+        """Another run begins, whose values are read in the same way."""
+        self.warnings = ()
+        self._crossings.clear()
+        self._scales, self._limits = self._given.copy(), self._given.copy()
 
     def look(self, first: int, end: int) -> None:
         """Look at the points first to end - 1."""
         if self.warnings:
             return
-        normal = min(max(self._normal, first), end)
+        normal, is_whole_run = min(max(self._normal, first), end), first == 0 and end > self._plan.grid.last_point
         for part, sizes in self._blocks(first, end):
+            if is_whole_run and np.maximum.reduce(sizes, axis=None) <= self._harmless:
+                continue  # no scale is less than the one that is given, and nobody looks at the scales again
+            scales, limits = self._scales[part], self._limits[part]
             if normal > first:
                 usual = sizes[:, : normal - first]
-                most = usual.max(axis=1)
-                if not np.isfinite(most).all():
+                most = np.maximum.reduce(usual, axis=1)
+                if not np.add.reduce(most) < math.inf:  # one is not finite, or nearly so
                     most = np.where(np.isfinite(usual), usual, 0.0).max(axis=1)
-                self._scales[part] = self._limits[part] = np.maximum(self._scales[part], most)
+                limits[:] = np.maximum(scales, most, out=scales)
             if normal < end:
                 later = sizes[:, normal - first :]
-                for row in np.flatnonzero(later.max(axis=1) > self._limits[part]).tolist():
+                above = np.maximum.reduce(later, axis=1) > limits
+                for row in np.flatnonzero(above).tolist() if above.any() else ():
                     self._take(part.start + row, normal, later[row])
+        if not self._crossings:
+            return
         reached = {column: own for column, own in self._crossings.items() if len(own) == len(_STEPS)}
         if reached:
             column = min(reached, key=lambda own: (reached[own][-1][0], own))

@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from msgspec import to_builtins
 from msgspec.structs import replace
 
@@ -83,7 +84,8 @@ class RecordFiles:
     """The open result files of a run.
 
     Call sequence: `begin`, then `write` and `flush` from one thread at a time; at the end, and after any exception,
-    `close`. A file that cannot be written is only closed then; all others get their rows as before.
+    `close`. A file that cannot be written is only closed then; all others get their rows as before. `begin_again` is
+    for another run whose values are read in the same way.
 
     Args:
         files: the files, in the order of their plans.
@@ -98,13 +100,17 @@ class RecordFiles:
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
-        self._stiff: dict[str, Any] = {}
-        self.in_memory = not any(file.path.name for file in files)
-        self._keys = KeysFile(files[0].path) if files and files[0].path.name else None
         self._files = [
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)
             for number, file in enumerate(files)
         ]
+        self._begin_files()
+
+    def _begin_files(self) -> None:
+        self._stiff: dict[str, Any] = {}
+        paths = [own.file.path for own in self._files]
+        self.in_memory = not any(path.name for path in paths)
+        self._keys = KeysFile(paths[0]) if paths and paths[0].name else None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -126,6 +132,14 @@ class RecordFiles:
             own.begin(grid, record, [columns[key] for key in record.variables])
         if self._growth is not None:
             self._growth.begin(columns)
+
+    def begin_again(self, files: Sequence[ResultFile]) -> None:
+        """Another run begins, with as many files for the same columns."""
+        for own, file in zip(self._files, files, strict=True):
+            own.begin_again(file)
+        self._begin_files()
+        if self._growth is not None:
+            self._growth.begin_again()
 
     def write(self, first: int, end: int) -> None:
         """Write the rows of the points first to end - 1, as far as they are not written yet.
@@ -175,7 +189,8 @@ class RecordFiles:
 
     def _each(self, call: Callable[[_RecordFile], None]) -> None:
         """Do something with each file that can be written; then raise the first error."""
-        self._raise_first([(own, own.tried(call)) for own in self._files])
+        if any(errors := [own.tried(call) for own in self._files]):
+            self._raise_first([*zip(self._files, errors, strict=True)])
 
     @staticmethod
     def _raise_first(done: Sequence[tuple[_RecordFile, OSError | None]]) -> None:
@@ -193,6 +208,7 @@ class _RecordFile:
         self._is_open = True
         self._next = 0
         self._columns: Sequence[ReadColumn] = ()
+        self._rows, self._times = (0, 0), np.zeros(0)
         # Opening is slow, so not with the first row. After a reset, the note of the run before is there.
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
         self._note = os.open(note, flags, 0o600) if note is not None else None
@@ -202,6 +218,10 @@ class _RecordFile:
         """See `RecordFiles.begin`."""
         self._grid, self._record, self._columns = grid, record, columns
         self._has_all_points = (record.first, record.every) == (0, 1)
+
+    def begin_again(self, file: ResultFile) -> None:
+        """See `RecordFiles.begin_again`."""
+        self.file, self._failed, self._is_open, self._next, self._noted = file, False, True, 0, None
 
     def tried(self, call: Callable[[_RecordFile], None]) -> OSError | None:
         """The error of a call that writes; nothing is called after the first error, or after the end."""
@@ -220,8 +240,10 @@ class _RecordFile:
         if first >= end or not self._columns:
             return
         rows = self._record.rows_within(first, end)
-        times = self._grid.times(first, end)[rows]
-        if len(times):
+        if (first, end) != self._rows:  # in short runs one after another, these are the same
+            self._rows, self._times = (first, end), self._grid.times(first, end)[rows]
+            self._times.setflags(write=False)
+        if len(times := self._times):
             if self._noted is None:
                 self._note_kept(Kept())
             columns = [column(first, end) for column in self._columns]

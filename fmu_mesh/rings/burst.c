@@ -12,6 +12,7 @@
  *   counter_raise                       the one thread that raises this counter
  *   counter_value, bell_seen, sleep_for each participant for itself: one thread that sleeps
  *   grant_withdraw                      the master
+ *   run_with_python                     as node_run, by a thread that has the lock: it lets go of it, except in calls of Python
  *   copies_work, copies_serve           the thread of these copies, which alone calls their FMUs (see Worker)
  *
  * What may go wrong: a peer writes garbage into the memory (a value never comes of it, see Rows), a peer is killed
@@ -690,7 +691,7 @@ PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
 
 /* Step a copy to its goal. All instances are members of one unit, in the order of the plan: so a copy ends at an event as
  * if each of them had been called in its turn. Returns a BurstEnd. */
-PUBLIC int64_t step_copy(Copy *copy) {
+static int64_t step_copy(Copy *copy) {
   if (copy->point >= copy->goal) return DONE; /* it may have ended, and have no node any more */
   Unit *unit = copy->node->units;
   unit->last_tick = unit->burst = copy->goal / unit->tick_points;
@@ -704,6 +705,51 @@ PUBLIC int64_t step_copy(Copy *copy) {
   }
   copy->point = copy->goal;
   return DONE;
+}
+
+/* Functions of CPython, all of its stable ABI; library.py gives their addresses in this order. */
+typedef struct {
+  void *(*save_thread)(void);
+  void (*restore_thread)(void *);
+  void *(*make_integer)(long long);
+  void *(*call)(void *callable, ...);
+  void (*hold)(void *);
+  void (*release)(void *);
+} Interpreter;
+
+/* Call Python for the step of a member. Whether it has raised nothing. */
+static inline int called_python(const Interpreter *python, const Member *member) {
+  void *const callable = member->by_python, *const step = python->make_integer(member->step);
+  if (step == NULL) return 0;
+  python->hold(callable); /* the call may give the member another one */
+  void *const result = python->call(callable, step, NULL);
+  python->release(callable);
+  python->release(step);
+  if (result == NULL) return 0;
+  python->release(result);
+  return 1;
+}
+
+/* As `step_copy` if there is a copy, and otherwise as `node_run`; and steps that are Python's are taken, too, so that each
+ * of them costs one call. After `most_ns`, a node leaves at the end of the tick. With RAISED, an exception is set, and the
+ * step is that of the node's `unit` and `member`. */
+PUBLIC int64_t run_with_python(const Interpreter *python, Node *node, Copy *copy, int64_t most_ns) {
+  const int64_t start = now();
+  for (;;) {
+    void *const thread = python->save_thread();
+    const int64_t result = copy != NULL ? step_copy(copy) : node_run(node);
+    python->restore_thread(thread);
+    if (result != PYTHON) return result;
+    Unit *unit = &node->units[node->unit];
+    Member *member = &unit->members[node->member];
+    const int64_t begin = now();
+    if (!called_python(python, member)) return RAISED;
+    if (mode_changed()) fesetenv(FE_DFL_ENV);
+    member->stage = STEPPED;
+    const int64_t end = now();
+    unit->spent_ns += end - begin;
+    if (copy == NULL && end - start > most_ns) node_attend(node);
+  }
 }
 
 /* Whether a getter, a setter or a function that sets a state could be called. */

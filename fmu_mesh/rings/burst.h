@@ -117,6 +117,7 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   char **bases;      /* room for the rows of the gates */
   int64_t step, stage;
   int64_t outcome;   /* stage and status of a call that Python has to look at */
+  void *by_python;   /* an object of Python, which is called with the number of an own step that Python takes */
 } Member;
 
 /* ---- model exchange: see model_exchange.c */
@@ -322,6 +323,6 @@ typedef struct { /* a thread of copies: it calls the FMUs of those from `first` 
   int64_t left; /* how many copies of the last one need Python */
 } Worker;
 
-enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE }; /* why node_run returns */
+enum BurstEnd { SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE, RAISED }; /* why node_run returns */
 
 #endif

@@ -12,6 +12,7 @@ import os
 import platform
 import sys
 from ctypes import CFUNCTYPE, PYFUNCTYPE, c_double, c_int64, c_uint32, c_void_p
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -31,13 +32,27 @@ _COULD_BE: Final = ("linux-x86_64", "linux-aarch64")
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 
 
+_CALLED: Final = (
+    "PyEval_SaveThread",
+    "PyEval_RestoreThread",
+    "PyLong_FromLongLong",
+    "PyObject_CallFunctionObjArgs",
+    "Py_IncRef",
+    "Py_DecRef",
+)
+"""What the library calls of Python, in the order of `Interpreter` in `burst.c`."""
+
+
 class LibraryFunctions:
     """The functions of the library at ``path``. Those that may take long release the interpreter's lock."""
 
     def __init__(self, path: str) -> None:
         quick, slow = ctypes.PyDLL(path), ctypes.CDLL(path)
         address = c_void_p
-        self.run = CFUNCTYPE(c_int64, address)(("node_run", slow))
+        functions = (ctypes.cast(getattr(ctypes.pythonapi, name), address) for name in _CALLED)
+        self._interpreter = (address * len(_CALLED))(*functions)
+        run = PYFUNCTYPE(c_int64, address, address, address, c_int64)(("run_with_python", quick))
+        self.run = partial(run, ctypes.addressof(self._interpreter))  # releases the lock itself
         self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
         self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
         self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
@@ -46,7 +61,6 @@ class LibraryFunctions:
         by_cvode = CFUNCTYPE(ctypes.c_int, c_double, address, address, address)
         self.equations_derivatives = by_cvode(("equations_derivatives", slow))
         self.equations_indicators = by_cvode(("equations_indicators", slow))
-        self.step_copy = CFUNCTYPE(c_int64, address)(("step_copy", slow))
         self.copies_work = CFUNCTYPE(c_int64, address, c_int64)(("copies_work", slow))
         self.copies_serve = CFUNCTYPE(None, address)(("copies_serve", slow))
         self.attend = PYFUNCTYPE(None, address)(("node_attend", quick))

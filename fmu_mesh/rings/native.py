@@ -120,7 +120,7 @@ class Last(IntEnum):
 class BurstEnd(IntEnum):
     """Why `node_run` returned."""
 
-    SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE = range(8)
+    SLICE, DONE, ATTENTION, BLOCKED, PYTHON, STATUS, FORGED, NOT_FINITE, RAISED = range(9)
 
 
 class WorkKind(IntEnum):

@@ -17,7 +17,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, suppress
 from operator import is_
 from pathlib import Path
 from types import MappingProxyType
@@ -100,7 +100,8 @@ class RepeatedRuns:
         open_instance: Callable[[str], Instance] | None = None,
     ) -> None:
         models = KeptModels(folder, resets=reset)
-        self._around = _Surroundings(folder / _SCRATCH, models, log, progress, open_instance, before_close)
+        given = log, progress, open_instance, before_close, threading.Event()
+        self._around = _Surroundings(folder / _SCRATCH, models, *given)
         self._on_hang, self._alone = on_hang, alone
         self._threads = LimitedThreads()
         self._process = OneProcess()
@@ -109,6 +110,7 @@ class RepeatedRuns:
         self._run: _Run | None = None
         self._system: HostedSystem | None = None
         self._made_for: tuple[object, ...] = ()
+        self._writer: RowWriter | None = None
         self._slices = _Slices()
         self._stop: str | None = None
 
@@ -131,12 +133,20 @@ class RepeatedRuns:
                 that were recorded before are kept.
         """
         try:
-            with closing(RowWriter(open_files(), GrowthWatch(run.plan))) as writer:
-                system = self._system_for(run, len(writer.counted))
+            watch = self._watch_here()
+            made_for = run, len(files := open_files()), watch
+            system = self._system if all(map(is_, made_for, self._made_for)) else None
+            if system is None or system.loads or (writer := self._writer) is None:
+                system, self._writer = None, (writer := RowWriter(files, GrowthWatch(run.plan)))
+            else:
+                writer.begin_again(files)
+            with closing(writer):
+                system = system or self._new_system(*made_for)
+                self._around.stopping.clear()
                 self._run = current = _Run(system, writer, self._around, self._slices)
                 if self._stop is not None:
                     current.interrupt(self._stop)
-                return current.run(start_values, self._watch_here(), self._threads)
+                return current.run(start_values, watch, self._threads)
         finally:
             self._stop = None
             if self._system is None or self._system.loads:
@@ -190,14 +200,11 @@ class RepeatedRuns:
         self._remove_scratch()
         self._threads.close()
 
-    def _system_for(self, run: RunPlan, files: int) -> HostedSystem:
-        """That of the run before, if it can begin again with this plan."""
-        watch, system, around = self._watch_here(), self._system, self._around
-        made_for = run, files, watch
-        if system is not None and not system.loads and all(map(is_, made_for, self._made_for)):
-            return system
-        if system is not None:
-            system.close()
+    def _new_system(self, run: RunPlan, files: int, watch: CallWatch) -> HostedSystem:
+        """In the place of that of the run before, which cannot begin again with this plan."""
+        around = self._around
+        if self._system is not None:
+            self._system.close()
         self._system = None
         _check_keys(run.plan)
         if around.open_instance is None:
@@ -212,8 +219,8 @@ class RepeatedRuns:
             opening = opening_of(plan, name, around.scratch, self._log, run.showing)
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
-        self._slices = _Slices()
-        self._system, self._made_for = HostedSystem(plan, watch, opened, self._log, alone=self._alone), made_for
+        self._slices, self._made_for = _Slices(), (run, files, watch)
+        self._system = HostedSystem(plan, watch, opened, self._log, alone=self._alone)
         return self._system
 
     def _log(self, message: LogMessage) -> None:
@@ -245,6 +252,7 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         scratch: a folder for files that are removed after each run.
+        stopping: ends a wait of the run under way.
     """
 
     scratch: Path
@@ -253,6 +261,7 @@ class _Surroundings(NamedTuple):
     progress: Callable[[int], None]
     open_instance: Callable[[str], Instance] | None
     before_close: Callable[[Outcome | BaseException], None] | None
+    stopping: threading.Event
 
 
 class _Slices:
@@ -289,7 +298,7 @@ class _Run:
         self.writer = writer
         self._around = surroundings
         self._stop: str | None = None
-        self._stopping = threading.Event()
+        self._stopping = surroundings.stopping
         self._seconds = 0.0
         self._engine: Engine | None = None
         self._asked: TerminationRequested | None = None
@@ -309,25 +318,38 @@ class _Run:
         self, start_values: Mapping[str, Mapping[str, PlainValue]], watch: CallWatch, threads: LimitedThreads
     ) -> Outcome:
         """See `RepeatedRuns.run`."""
-        system = self._system
-        with ExitStack() as stack:
-            stack.push(self._leave)
+        try:
             threads.limit(self._around.models.loads)
-            system.open()
-            stack.push(self._tell_end)
-            threads.limit(self._around.models.loads)  # with the libraries that a component has imported
-            stack.callback(self.writer.close)  # before the instances are closed
-            self._engine = engine = system.begin(start_values)
-            self.writer.begin(self._plan, system.runners)
-            stack.callback(self._write_rest, engine)
+            self._system.open()
+            try:
+                threads.limit(self._around.models.loads)  # with the libraries that a component has imported
+                self._write_steps(start_values, watch)
+            except BaseException as error:
+                self._tell_end(error)
+                raise
+            self._tell_end(None)
+        except BaseException:
+            self._leave(failed=True)
+            raise
+        self._leave(failed=False)
+        return self._outcome()
+
+    def _write_steps(self, start_values: Mapping[str, Mapping[str, PlainValue]], watch: CallWatch) -> None:
+        """From Initialization Mode to the last point; then the files are closed, and the instances are not."""
+        try:
+            self._engine = engine = self._system.begin(start_values)
+            self.writer.begin(self._plan, self._system.runners)
             started = time.perf_counter()
             try:
                 with watch.stepping(self._position, self.timeouts.step):
                     self._step_to_the_end(engine)
             except TerminationRequested as asked:
                 self._asked = asked
-            self._seconds = time.perf_counter() - started
-        return self._outcome()
+            finally:
+                self._seconds = time.perf_counter() - started
+                self._write_rest(engine)
+        finally:
+            self.writer.close()
 
     def _outcome(self) -> Outcome:
         """How a run ended that did not fail."""
@@ -338,15 +360,15 @@ class _Run:
         self._end = outcome_at(*own, seconds=self._seconds, warnings=warnings)
         return self._end
 
-    def _leave(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
+    def _leave(self, *, failed: bool) -> None:
         """Keep the system for the next run, if this one has come to its last point."""
         try:
-            if error is not None or self._asked is not None or not self._system.end():
+            if failed or self._asked is not None or not self._system.end():
                 self._system.close()
         finally:
             self._engine = None  # not before: an FMU that does not return even now is told with the point
 
-    def _tell_end(self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
+    def _tell_end(self, error: BaseException | None) -> None:
         if isinstance(error, FmuMeshError):
             error.with_hint(self.writer.kept())
         if self._around.before_close is not None:

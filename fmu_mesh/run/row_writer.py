@@ -31,6 +31,9 @@ _OTHER_WRITER_S = 0.5
 class RowWriter:
     """Writes the rows of a run, from its rings into the result files.
 
+    Call sequence: `begin`, then `write`; at the end `close`. `begin_again` before another `begin` is for another run of
+    the same instances.
+
     Args:
         files: the files; empty: nothing is recorded.
         growth: looks at all rows.
@@ -46,14 +49,20 @@ class RowWriter:
         self._rows = 1
         self._flushed = 0.0
         self._writing = threading.Lock()
+        self._runners: Mapping[str, Runner] | None = None
+
+    def begin_again(self, files: Sequence[ResultFile]) -> None:
+        """Write another run, into as many other files."""
+        self.written, self._flushed = 0, 0.0
+        self._files.begin_again(files)
 
     def begin(self, plan: Plan, runners: Mapping[str, Runner]) -> None:
         """All instances are at point 0."""
         if self._files.in_memory:
             self._flushed = time.monotonic()  # nobody can look into memory: the first row waits for others
-        if RECORDER not in plan.nodes:
+        if RECORDER not in plan.nodes or runners is self._runners:
             return
-        node = plan.nodes[RECORDER]
+        self._runners, node = runners, plan.nodes[RECORDER]
         sources = {}
         for link in node.links_in:
             rows = SourceRows(runners[link.source].outputs, runners[link.source].counter)

@@ -27,7 +27,7 @@ import msgspec
 
 from ..errors import ConfigurationError
 from ..files import decoded_json, is_file, replaced, write_whole
-from .variant_run import Cell, Common, Row, path_of
+from .variant_run import Common, Row, path_of
 from .variants import Parameters
 
 __all__ = ["RowFile", "SweepFolder", "Wanted", "cells_of", "identity_of", "is_sweep"]
@@ -128,8 +128,11 @@ class SweepFolder:
         writer.writerow(["variant", *wanted.names, "exit_code", "message", *columns, "id", "seconds", "worker"])
         for number, row in enumerate(rows):
             if row is not None:
-                cells = cells_of(wanted, number, row, columns) | {"seconds": f"{row.seconds:.4f}"}
-                writer.writerow(map(_cell, cells.values()))
+                found = [row.values.get(name) for name in columns]
+                cells = [number, *wanted.variants[number], row.exit_code, row.message, *found, row.id]
+                cells += f"{row.seconds:.4f}", row.worker
+                # All others, `csv` writes as we do: a float with the digits that give the same bits again.
+                writer.writerow([json.dumps(own) if isinstance(own, bool | list) else own for own in cells])
         write_whole(self.table, text.getvalue(), "the table ")
 
 
@@ -207,18 +210,3 @@ def _lines(file: Path) -> Iterator[Row]:
             yield msgspec.convert(json.loads(line), Row)
         except (ValueError, msgspec.MsgspecError, RecursionError):
             continue
-
-
-def _cell(value: Cell | Sequence[Any]) -> str:
-    """A value as text: a float with the digits that give the same bits again, an array as JSON."""
-    match value:
-        case None:
-            return ""
-        case bool():
-            return "true" if value else "false"
-        case float():
-            return repr(value)
-        case str() | int():
-            return str(value)
-        case _:
-            return json.dumps(value)

@@ -18,6 +18,7 @@ What schedules is the executor: processes of this host by default, or any `concu
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
@@ -275,6 +276,8 @@ class ExecutorSweep(Sweep):
         try:
             with self._planned.folder.writing(part) as rows, self._table() if part is None else nullcontext():
                 self._run_variants(rows)
+                if self._is_ours:  # they end while the table is written
+                    self._executor.shutdown(wait=False, cancel_futures=bool(self._left))
         finally:
             if self._is_ours:
                 self._executor.shutdown(cancel_futures=bool(self._left))
@@ -387,5 +390,11 @@ def sweep(
         raise CallRefused(text, hint=_GUARD)
     if options.executor is None:
         prepare_workers()
-    planned = planned_sweep(mesh, vary, **options.given())
+    collects = gc.isenabled()
+    gc.disable()  # what the imports of a plan make stays, and each collection would look at all of it
+    try:
+        planned = planned_sweep(mesh, vary, **options.given())
+    finally:
+        if collects:
+            gc.enable()
     return ExecutorSweep(planned, executor=options.executor, workers=options.workers)

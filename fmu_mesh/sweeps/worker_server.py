@@ -216,7 +216,9 @@ def serve(control: int) -> None:
         control: the descriptor of its socket.
     """
     _forget(control)
+    gc.disable()  # what an import makes stays, and each collection would look at all of it
     importlib.import_module(_PRELOADED)
+    gc.enable()
     gc.freeze()  # the memory of all that is there stays shared
     own, running = socket.socket(fileno=control), dict[int, int]()
     while True:

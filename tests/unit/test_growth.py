@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.results.growth import GrowthWatch
+from fmu_mesh.results.growth import GrowthWatch, ReadColumn
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.variables.model_description import Variable
@@ -21,20 +21,27 @@ POINTS = 2000
 DOUBLING = np.concatenate([np.ones(500), 2.0 ** np.arange(1, 1000), np.full(POINTS - 1499, 1e300)])
 
 
-def warnings_of(
-    values: np.ndarray[Any, Any], *, block: int = 512, last: int | None = None, step: int = 1, **given: float
-) -> tuple[str, ...]:
-    """What is told about a variable with these values; ``given`` are fields of its model description."""
-    kind = cast("Any", "Float32" if values.dtype == np.float32 else "Float64")
-    variable = Variable("y", 0, kind, "output", "continuous", **cast("Any", given))
+def watch_of(read: ReadColumn, last: int, kind: str = "Float64", **given: float) -> GrowthWatch:
+    """What watches one variable; ``given`` are fields of its model description."""
+    variable = Variable("y", 0, cast("Any", kind), "output", "continuous", **cast("Any", given))
     description = SimpleNamespace(variable_of=lambda _name: variable)
     plan = SimpleNamespace(
-        grid=TimeGrid(0.0, 0.5, len(values) - 1 if last is None else last),
+        grid=TimeGrid(0.0, 0.5, last),
         system=SimpleNamespace(instances={"a": SimpleNamespace(description=description)}),
         cycles=(("a", "b"),),
     )
     watch = GrowthWatch(cast("Plan", plan))
-    watch.begin({("a", "y"): lambda first, end: values[first:end:step]})
+    watch.begin({("a", "y"): read})
+    return watch
+
+
+def warnings_of(
+    values: np.ndarray[Any, Any], *, block: int = 512, last: int | None = None, step: int = 1, **given: float
+) -> tuple[str, ...]:
+    """What is told about a variable with these values; ``given`` are fields of its model description."""
+    kind = "Float32" if values.dtype == np.float32 else "Float64"
+    last = len(values) - 1 if last is None else last
+    watch = watch_of(lambda first, end: values[first:end:step], last, kind, **given)
     for first in range(0, len(values), block):
         watch.look(first, min(first + block, len(values)))
     return watch.warnings
@@ -106,3 +113,30 @@ def test_the_nominal_value_of_fmi_3_is_read(tmp_path: Path) -> None:
 
     found = {variable.name: variable.nominal for variable in read_description(fmu).variables}
     assert (found["float64_in"], found["float32_in"], found["float64_out"]) == (1e5, 1e5, None)
+
+
+@pytest.mark.parametrize(("start", "factor", "is_told"), [(1.0, 1.5, True), (1e300, 1.5, True), (1.0, 1.2, False)])
+def test_one_look_at_the_whole_run_tells_what_many_tell(start: float, factor: float, is_told: bool) -> None:  # noqa: FBT001  a column of the table
+    values = np.concatenate([np.full(200, start), start * factor ** np.arange(1, 41), np.full(POINTS - 240, 1.0)])
+
+    told = warnings_of(values, block=POINTS)
+
+    assert told == warnings_of(values, block=7)
+    assert bool(told) == is_told
+
+
+def test_a_watch_that_begins_again_knows_nothing_of_the_run_before() -> None:
+    first, again = DOUBLING, np.full(POINTS, 2.0)
+    watched = [first]
+    watch = watch_of(lambda begin, end: watched[0][begin:end], len(first) - 1)
+    watch.look(0, 500)
+    watch.look(500, POINTS)
+    before = watch.warnings
+
+    watched[0] = again
+    watch.begin_again()
+    watch.look(0, 500)
+    watch.look(500, POINTS)
+
+    assert before
+    assert watch.warnings == ()

@@ -124,3 +124,20 @@ def test_files_of_a_run_that_has_not_begun_are_only_closed() -> None:
     record.close()
 
     assert file.calls == ["close"]
+
+
+def test_files_of_another_run_get_their_own_rows_and_notes() -> None:
+    first, second = ListFile("first.csv"), ListFile("second.csv")
+    record = begun([first], [RecordPlan("first.csv", (("a", "x"),))])
+    record.note_stiff("a", 1, "stiff")
+    record.write(0, 5)
+    record.close()
+
+    record.begin_again([second])
+    record.note_stiff("b", 2, "stiff")
+    record.write(0, 3)
+    record.close()
+
+    assert (first.rows, second.rows) == (5, 3)
+    assert record.counted == (("second.csv", 3),)
+    assert second.calls[0] == "note {'stiff': {'b': {'point': 2, 'message': 'stiff'}}}"
