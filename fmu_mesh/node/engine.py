@@ -44,8 +44,8 @@ __all__ = ["SLICE_S", "STATE_CHECK_S", "Engine", "PlainEngine", "Windows"]
 #   may replace that one.
 #
 # Tried and given up: one call from Python for each step (as much time as a small FMU takes), a return to Python for
-# each of its own steps (twice the time of such a step), loops that llvmlite compiled (170 MB, up to 20 ms for each node,
-# and no faster; ADR 57), a grant that is asked for at each window (ADR 58).
+# each of its own steps (twice the time of such a step), loops that llvmlite compiled (170 MB, up to 20 ms for each
+# node, and no faster; ADR 57), a grant that is asked for at each window (ADR 58).
 
 SLICE_S: Final = 0.001
 """A burst of steps ends after about this time in s, so that its rows are sent and messages are handled."""
