@@ -84,7 +84,7 @@ class GrowthWatch:
             if normal > first:
                 usual = sizes[:, : normal - first]
                 most = np.maximum.reduce(usual, axis=1)
-                if not np.add.reduce(most) < math.inf:  # one is not finite, or nearly so
+                if not np.isfinite(most).all():
                     most = np.where(np.isfinite(usual), usual, 0.0).max(axis=1)
                 limits[:] = np.maximum(scales, most, out=scales)
             if normal < end:
