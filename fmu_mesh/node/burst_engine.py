@@ -106,7 +106,7 @@ class BurstEngine(Engine):
         try:
             return int(self._library.run(self._address, copy, int(most_s * 1e9)))
         except FmuMeshError as error:
-            self._note_failed(error)
+            self._failed(asks_to_end=isinstance(error, TerminationRequested)).is_finite.explain(error)
             raise
 
     def complete(self, result: int) -> None:
@@ -124,21 +124,21 @@ class BurstEngine(Engine):
             else:
                 self._complete(runner, result)
         except FmuMeshError as error:
-            self._note_failed(error)
+            self._failed(asks_to_end=isinstance(error, TerminationRequested)).is_finite.explain(error)
             raise
         if floating_point_changed():
             restore_floating_point()
         member.stage = Stage.STEPPED
         self._spent_s[node.unit] += perf_counter() - began
 
-    def _note_failed(self, error: FmuMeshError) -> None:
-        """Python has not been able to take or complete a step."""
+    def _failed(self, *, asks_to_end: bool) -> Runner:
+        """Note that Python has not been able to take or complete a step; whose step it is."""
         unit, index = self._node.unit, self._node.member
         runner = self.units[unit][index]
         self._units[unit].stopped = 1
-        runner.is_finite.explain(error)
-        if isinstance(error, TerminationRequested):
+        if asks_to_end:
             runner.table.note(stage=Stage.WAITING)
+        return runner
 
     @property
     def copy(self) -> native.CopyTable:
