@@ -149,6 +149,7 @@ def test_tokens_tell_ros_the_quality_of_service(
         return {chunks[at[0]]: chunks[at[1]].partition(":typehash")[0] for chunks in tokens}
 
     wait_until(lambda: expected.items() <= told().items(), f"the tokens, which are {told()}")
+    assert place.run("wait", "lab").wait() == 0  # the tokens are there before it runs
     place.run("stop", "lab").wait()
     assert launched.wait() == 130, launched.errors  # stopped by a command
 
