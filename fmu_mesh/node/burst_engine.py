@@ -134,7 +134,7 @@ class BurstEngine(Engine):
     def _failed(self, *, asks_to_end: bool) -> Runner:
         """Note that Python has not been able to take or complete a step; whose step it is."""
         unit, index = self._node.unit, self._node.member
-        runner = self.units[unit][index]
+        runner: Runner = self.units[unit][index]
         self._units[unit].stopped = 1
         if asks_to_end:
             runner.table.note(stage=Stage.WAITING)
