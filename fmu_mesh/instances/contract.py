@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..rings.ring import Ring
 
 __all__ = [
-    "SOLVER",
     "BeginsAgain",
     "ChangesProcess",
     "Instance",
@@ -44,10 +43,6 @@ __all__ = [
 Section = TypeVar("Section", bound=InstanceSection)
 
 
-SOLVER: Final = "solver"
-"""The category of the message with which a solver says, once, that its model is stiff."""
-
-
 class LogMessage(msgspec.Struct, frozen=True):
     """One message of a model or its engine (for an FMU: FMI 2.0, 2.1.5; FMI 3.0, 2.3.1).
 
@@ -55,6 +50,7 @@ class LogMessage(msgspec.Struct, frozen=True):
         instance: instance name.
         status: `OK`, `Warning`, `Error`, ... in the words of FMI.
         step: the own step of the instance in which the message came; -1 before the first step.
+        is_stiff: whether our solver says with it, once, that the model is stiff; the category may be one of an FMU.
     """
 
     instance: str
@@ -62,6 +58,7 @@ class LogMessage(msgspec.Struct, frozen=True):
     category: str
     message: str
     step: int
+    is_stiff: bool = False
 
 
 class Showing(msgspec.Struct, frozen=True):

@@ -28,7 +28,7 @@ from msgspec.structs import replace
 from ..config.mesh import TimeoutsConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, TerminationRequested
 from ..instances.call_guard import CallWatch
-from ..instances.contract import SOLVER, Instance, LogMessage
+from ..instances.contract import Instance, LogMessage
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
@@ -225,7 +225,7 @@ class RepeatedRuns:
 
     def _log(self, message: LogMessage) -> None:
         self._around.log(message)
-        if message.category == SOLVER and self._run is not None:
+        if message.is_stiff and self._run is not None:
             self._run.note_stiff(message)
 
     def _remove_scratch(self) -> None:

@@ -19,7 +19,7 @@ from setproctitle import setproctitle
 
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
-from ..instances.contract import SOLVER, Instance, KeepsFiles, LogMessage, Opening
+from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
 from ..master.master import Master
 from ..master.mesh_server import MasterSettings
@@ -207,7 +207,7 @@ class _NodeProcess:
         if self._node is not None:
             line = log_line(message, self._run.plan.instance(message.instance).step_points)
             self._node.server.log_message(line)
-            if message.category == SOLVER:
+            if message.is_stiff:
                 self._node.tell_recorder(Stiff(line.instance, line.point, line.message))
             if message.status in ("error", "fatal"):  # the FMU may end the process next
                 self._node.server.say_everything(heard=True)

@@ -23,6 +23,7 @@ from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.run_metadata import metadata_of
 from fmu_mesh.variables.value_types import Value
+from tests.fmus.chatty_fmus import chatty_fmu
 from tests.fmus.event_fmus import Version
 from tests.helpers import write_config
 from tests.planning import plan_run
@@ -137,6 +138,16 @@ def test_metadata_say_at_which_point_a_model_was_stiff(event_fmu: EventFmu, tmp_
     found = fmu_mesh.Result.read(file).metadata["stiff"]
     assert {name: own["point"] for name, own in found.items()} == {"early": 0, "late": 30}
     assert all(own["message"].endswith("cvode goes on from here") for own in found.values())
+
+
+@pytest.mark.parametrize("processes", [True, False])
+def test_what_an_fmu_calls_its_solver_makes_it_not_stiff(tmp_path: Path, *, processes: bool) -> None:
+    logs = 'instance->logger(instance->environment, instance->name, fmi2Warning, "solver", "slow");'
+    once = f'if (strcmp(function, "fmi2DoStep") == 0) {{ {logs} }}'
+    mesh = fmu_mesh.Mesh("own", step_size=0.1, stop_time=1.0)
+    mesh.add("stairs", fmu=str(chatty_fmu(2, tmp_path, "co_simulation", once)))
+    mesh.run(output=tmp_path / "own.csv", processes=processes)
+    assert "stiff" not in fmu_mesh.Result.read(tmp_path / "own.csv").metadata
 
 
 @pytest.mark.parametrize(("step_size", "leaves"), [(0.01, False), (0.1, True)])

@@ -23,7 +23,7 @@ from ....rings.native import NativeStep, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
-from ...contract import SOLVER, LogMessage
+from ...contract import LogMessage
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
 from ..fmu_instance import Bookkeeping
@@ -214,7 +214,7 @@ class ContinuousInstance(NativeInstance):
     def _tell_doubt(self) -> None:
         """Tell once that another solver would be better."""
         if (doubt := self._event_loop().solver.doubt()) is not None:
-            self._log(LogMessage(self.name, "warning", SOLVER, doubt, self._said.step))
+            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, is_stiff=True))
 
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.
