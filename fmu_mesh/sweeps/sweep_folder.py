@@ -128,11 +128,9 @@ class SweepFolder:
         writer.writerow(["variant", *wanted.names, "exit_code", "message", *columns, "id", "seconds", "worker"])
         for number, row in enumerate(rows):
             if row is not None:
-                found = [row.values.get(name) for name in columns]
-                cells = [number, *wanted.variants[number], row.exit_code, row.message, *found, row.id]
-                cells += f"{row.seconds:.4f}", row.worker
+                cells = cells_of(wanted, number, row, columns) | {"seconds": f"{row.seconds:.4f}"}
                 # All others, `csv` writes as we do: a float with the digits that give the same bits again.
-                writer.writerow([json.dumps(own) if isinstance(own, bool | list) else own for own in cells])
+                writer.writerow([json.dumps(own) if isinstance(own, bool | list) else own for own in cells.values()])
         write_whole(self.table, text.getvalue(), "the table ")
 
 
