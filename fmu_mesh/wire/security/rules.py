@@ -12,7 +12,9 @@ from typing import Any, Final, NamedTuple
 
 from .identity import LOCAL, Role
 
-__all__ = ["ACTIONS", "Action", "access_control"]
+__all__ = ["ACTIONS", "ROLE_NAMES", "Action", "access_control"]
+
+ROLE_NAMES: Final[tuple[Role, ...]] = ("observer", "operator", "node")
 
 _READS: Final = ("query", "declare_subscriber")
 _ANSWERS: Final = ("put", "delete", "reply")
@@ -52,22 +54,27 @@ class Action(NamedTuple):
     goes: tuple[str, ...]
 
 
-_EVERYBODY: Final[tuple[Role, ...]] = ("observer", "operator", "node")
 _WHO_ACTS: Final[tuple[Role, ...]] = ("operator", "node")
 
 ACTIONS: Final = (
-    Action("see which meshes and instances run", _EVERYBODY, ("{mesh}/*", "{mesh}/mesh"), _TOKENS_IN, _TOKENS_OUT),
+    Action("see which meshes and instances run", ROLE_NAMES, ("{mesh}/*", "{mesh}/mesh"), _TOKENS_IN, _TOKENS_OUT),
     Action(
         "read values: outputs, inputs, parameters, local variables",
-        _EVERYBODY,
+        ROLE_NAMES,
         tuple(f"{{mesh}}/*/{kind}/**" for kind in ("out", "in", "param", "local")),
         _READS,
         _ANSWERS,
     ),
-    Action("read what an instance is, its state and its log", _EVERYBODY, ("{mesh}/*/info", "{mesh}/*/status", "{mesh}/*/log"), _READS, _ANSWERS),
+    Action(
+        "read what an instance is, its state and its log",
+        ROLE_NAMES,
+        ("{mesh}/*/info", "{mesh}/*/status", "{mesh}/*/log"),
+        _READS,
+        _ANSWERS,
+    ),
     Action(
         "read the plan, the state, the log and the audit of the mesh",
-        _EVERYBODY,
+        ROLE_NAMES,
         tuple(f"{{mesh}}/mesh/{what}" for what in ("info", "status", "plan", "log", "audit", "hello", "role/{role}")),
         _READS,
         _ANSWERS,
@@ -101,8 +108,18 @@ def access_control(root: str, roles: Mapping[str, Role], ends: Iterable[str] = (
                 )
                 policies.append({"id": rule, "rules": [rule], "subjects": [*names]})
     if own_ends:
-        rules.append({"id": "ends", "permission": "allow", "flows": ["ingress", "egress"], "messages": [*_ALL], "key_exprs": [*own_ends]})
-        policies.append({"id": "ends", "rules": ["ends"], "subjects": [name for name, role in named.items() if role != "observer"]})
+        rules.append(
+            {
+                "id": "ends",
+                "permission": "allow",
+                "flows": ["ingress", "egress"],
+                "messages": [*_ALL],
+                "key_exprs": [*own_ends],
+            }
+        )
+        policies.append(
+            {"id": "ends", "rules": ["ends"], "subjects": [name for name, role in named.items() if role != "observer"]}
+        )
     subjects: list[dict[str, Any]] = [{"id": name, "cert_common_names": [name]} for name in roles]
     subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
     return {
