@@ -5,7 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from .arguments import PACKAGE, QUIET, SSD, Parsers, argument, group, json_switch, reaching, switch, tolerance
+from .arguments import (
+    PACKAGE,
+    QUIET,
+    SSD,
+    Parsers,
+    argument,
+    group,
+    json_switch,
+    positive_seconds,
+    reaching,
+    switch,
+    tolerance,
+)
 from .run_options import options
 
 __all__ = ["CONFIGURATION", "PARSERS", "SHELLS", "TIMES"]
@@ -103,6 +115,31 @@ PARSERS: Parsers = {
         argument("--plot", "FILE.png", "draw both and their difference: the variables that differ most", type=Path),
         QUIET,
         json_switch("JSON: one object with all differences"),
+    ),
+    "security": (
+        argument(
+            "what", "init|add|renew|remove|show", "what to do", choices=("init", "add", "renew", "remove", "show")
+        ),
+        argument("folder", "DIR", "the folder of the authority", type=Path),
+        argument("name", "NAME", "a person or a host; not for init and show", nargs="?"),
+        argument("--role", "ROLE", "of NAME: observer, operator or node", choices=("observer", "operator", "node")),
+        argument(
+            "--days",
+            "N",
+            "how long the certificate lasts (90); a part of a day is possible",
+            type=positive_seconds,
+            default=90.0,
+        ),
+        argument(
+            "--host",
+            "HOST",
+            "a name or an address at which a node listens; repeatable; default: this host's",
+            action="append",
+            default=[],
+        ),
+        switch("--table", text="show: what each role may do"),
+        switch("--zenohd", text="show: the rules for a router of your own, as JSON"),
+        json_switch("show: JSON, one object for each name"),
     ),
     "recover": (
         argument("results", "FILE", "the result file, as the run was given it", type=Path),

@@ -67,6 +67,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
     "master": ("run", "running", "start the master and the recorder manually"),
     "gateway": ("run", "running", "start the gateway to ROS manually"),
     "router": ("run", "running", "run a Zenoh router"),
+    "security": ("file", "security_command", "certify who may do what, and show it"),
     "completion": ("file", "completion", "print the script that completes commands in a shell"),
 }
 """All commands in the order of the help: the module that has it in `PARSERS`, that in `RUNS`, and one line about it."""
