@@ -138,7 +138,7 @@ class Authority:
             raise ConfigurationError(f"'{name}' cannot be a name: {wrong}")
         taken = next((own for own in self.members if own.lower() == name.lower()), None)
         if taken is not None or (self.folder / name).exists():
-            hint = f"`fmu-mesh security renew` renews it, `security remove` takes it away."
+            hint = "`fmu-mesh security renew` renews it, `security remove` takes it away."
             raise ConfigurationError(f"'{taken or name}' is in '{short_path(self.folder)}' already", hint=hint)
         hosts = tuple(dict.fromkeys(hosts)) or (names_of_this_host() if role == "node" else ())
         return self._certify(name, Member(role, "", hosts), days)
@@ -254,5 +254,5 @@ def _key_text(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def _write_private(file: Path, content: bytes) -> None:
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE)
-    with open(descriptor, "wb") as stream:
+    with os.fdopen(descriptor, "wb") as stream:
         stream.write(content)

@@ -87,7 +87,7 @@ def _context(own: Identity | None) -> ssl.SSLContext:
 
 def _wait_for_verdict(secured: ssl.SSLSocket, end: float) -> None:
     """Read until the other end has sent an alert, which raises, or a ticket."""
-    secured.setblocking(False)
+    secured.settimeout(0.0)
     while (left := end - time.monotonic()) > 0:
         try:
             if not secured.recv(1):
