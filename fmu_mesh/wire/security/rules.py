@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from .identity import LOCAL, Role
 
-__all__ = ["ACTIONS", "ROLE_NAMES", "Action", "access_control"]
+__all__ = ["ACTIONS", "HELLO", "ROLE_NAMES", "Action", "access_control"]
 
 ROLE_NAMES: Final[tuple[Role, ...]] = ("observer", "operator", "node")
 
@@ -37,6 +37,10 @@ _ALL: Final = (
 )
 
 
+HELLO: Final = "**/mesh/hello"
+"""What meshes answer to every certificate."""
+
+
 class Action(NamedTuple):
     """Something that a role may do.
 
@@ -57,7 +61,8 @@ class Action(NamedTuple):
 _WHO_ACTS: Final[tuple[Role, ...]] = ("operator", "node")
 
 ACTIONS: Final = (
-    Action("see which meshes and instances run", ROLE_NAMES, ("{mesh}/*", "{mesh}/mesh"), _TOKENS_IN, _TOKENS_OUT),
+    # A tool that knows neither the prefix nor the name of a mesh asks for all of them.
+    Action("see which meshes and instances run", ROLE_NAMES, ("**/mesh", "{mesh}/*"), _TOKENS_IN, _TOKENS_OUT),
     Action(
         "read values: outputs, inputs, parameters, local variables",
         ROLE_NAMES,
@@ -75,7 +80,7 @@ ACTIONS: Final = (
     Action(
         "read the plan, the state, the log and the audit of the mesh",
         ROLE_NAMES,
-        tuple(f"{{mesh}}/mesh/{what}" for what in ("info", "status", "plan", "log", "audit", "hello", "role/{role}")),
+        tuple(f"{{mesh}}/mesh/{what}" for what in ("info", "status", "plan", "log", "audit", "role/{role}")),
         _READS,
         _ANSWERS,
     ),
@@ -120,7 +125,15 @@ def access_control(root: str, roles: Mapping[str, Role], ends: Iterable[str] = (
         policies.append(
             {"id": "ends", "rules": ["ends"], "subjects": [name for name, role in named.items() if role != "observer"]}
         )
+    # So a client with a certificate and without a role learns that it has none.
+    for flow, messages in (("ingress", _READS), ("egress", _ANSWERS)):
+        rule, keys = f"hello {flow}", [HELLO]
+        rules.append(
+            {"id": rule, "permission": "allow", "flows": [flow], "messages": [*messages], "key_exprs": keys}
+        )
+        policies.append({"id": rule, "rules": [rule], "subjects": ["anybody"]})
     subjects: list[dict[str, Any]] = [{"id": name, "cert_common_names": [name]} for name in roles]
+    subjects.append({"id": "anybody"})  # without names: everybody
     subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
     return {
         "enabled": True,
