@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from ..api.mesh_builder import Mesh
 from ..api.result import Result, result_of
 from ..api.run_handle import Run
-from ..config.access import given_folder, has_tls, why_open
+from ..config.access_sections import given_folder, has_tls, why_open
 from ..errors import ConfigurationError, FmuMeshError
 from ..run.events import Event, Reachable
 from ..run.options import RerunOptions

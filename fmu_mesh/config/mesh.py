@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 from msgspec import Meta
 
-from fmu_mesh.config.access import RuntimeConfig, SecurityConfig
+from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig
 from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection
 from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig

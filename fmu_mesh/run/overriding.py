@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..config.access import SECURITY_VARIABLE, given_folder, has_tls
+from ..config.access_sections import SECURITY_VARIABLE, given_folder, has_tls
 from ..config.call_options import option_fields
 from ..config.findings import Findings
 from ..config.loading import PlainConfig

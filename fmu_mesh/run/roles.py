@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 from setproctitle import setproctitle
 
-from ..config.access import is_socket
+from ..config.access_sections import is_socket
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening

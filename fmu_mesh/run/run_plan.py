@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from ..config.access import SecurityConfig
+from ..config.access_sections import SecurityConfig
 from ..config.loading import LoadedConfig
 from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError, UnknownName

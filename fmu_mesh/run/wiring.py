@@ -12,7 +12,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from ..config.access import SecurityConfig, is_socket
+from ..config.access_sections import SecurityConfig, is_socket
 from ..config.mesh import TimeoutsConfig, ZenohConfig
 from ..errors import ConfigurationError
 from ..files import beside

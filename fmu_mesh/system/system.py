@@ -16,7 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh import files
-from fmu_mesh.config.access import check_access
+from fmu_mesh.config.access_sections import check_access
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.key_sections import KEY, KeyView

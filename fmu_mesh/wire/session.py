@@ -20,7 +20,7 @@ import zenoh
 from msgspec.structs import replace
 from zenoh.handlers import Callback
 
-from ..config.access import host_of, is_socket, why_closed
+from ..config.access_sections import host_of, is_socket, why_closed
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 from .values import json_encoding
 

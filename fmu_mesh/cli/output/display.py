@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
-from ...config.access import is_socket
+from ...config.access_sections import is_socket
 from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
 from ...printing import paragraph, printable

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 import zenoh
 from msgspec.structs import replace
 
-from ...config.access import given_folder, has_tls, is_socket
+from ...config.access_sections import given_folder, has_tls, is_socket
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ...text import did_you_mean, listed
 from ..keys import Keys

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, get_args
 
 import msgspec
 
-from ...config.access import Role
+from ...config.access_sections import Role
 from ...errors import ConfigurationError
 from ...files import decoded_json
 from ...installing import importing

@@ -128,9 +128,7 @@ def access_control(root: str, roles: Mapping[str, Role], ends: Iterable[str] = (
     # So a client with a certificate and without a role learns that it has none.
     for flow, messages in (("ingress", _READS), ("egress", _ANSWERS)):
         rule, keys = f"hello {flow}", [HELLO]
-        rules.append(
-            {"id": rule, "permission": "allow", "flows": [flow], "messages": [*messages], "key_exprs": keys}
-        )
+        rules.append({"id": rule, "permission": "allow", "flows": [flow], "messages": [*messages], "key_exprs": keys})
         policies.append({"id": rule, "rules": [rule], "subjects": ["anybody"]})
     subjects: list[dict[str, Any]] = [{"id": name, "cert_common_names": [name]} for name in roles]
     subjects.append({"id": "anybody"})  # without names: everybody
