@@ -217,7 +217,8 @@ class MeshClient:
             payload = encode_value(cast("Any", plain))
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
-        return self._view(target.key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
+        key = self.keys.setting(target.instance, target.variable.name)
+        return self._view(key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
@@ -360,7 +361,7 @@ class MeshClient:
 
     @cached_property
     def _command_key(self) -> zenoh.KeyExpr:
-        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.mesh_key("command"))
+        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.command)
         return key
 
     def _view(
