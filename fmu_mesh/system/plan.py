@@ -342,7 +342,8 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             records=system.records if node == RECORDER else (),
             limits=config.limits,
             shared_memory=config.zenoh.shared_memory,
-            row_streams=config.zenoh.row_streams,
+            row_streams=config.row_streams,
+            secured=config.security is not None,
         )
     return nodes
 

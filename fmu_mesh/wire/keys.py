@@ -11,7 +11,7 @@ import msgspec
 
 from ..system.memory_map import MASTER, RECORDER
 
-__all__ = ["BY", "RUN_ID_BYTES", "SUBSCRIBED", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
+__all__ = ["BY", "LOCAL", "RUN_ID_BYTES", "SUBSCRIBED", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
@@ -25,6 +25,9 @@ SUBSCRIBED = "subscribed"
 BY = "@by"
 """The chunk before the name of who sets or commands, where there is security. A rule lets each name use its own keys;
 wildcards do not match such a chunk."""
+
+LOCAL = "local"
+"""Who comes by the Unix socket of a mesh: an operator and node that no certificate can name."""
 
 RUN_ID_BYTES = 8
 """Hexadecimal digits of a run's id. So the id never begins with `@`: wildcards do not match such a chunk."""

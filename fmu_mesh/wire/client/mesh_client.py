@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -45,6 +45,9 @@ from ..views import (
 from .following import Follower
 from .readings import Reading, Target, reading_among
 
+if TYPE_CHECKING:  # most meshes need no certificate
+    from ..security.identity import Identity
+
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
@@ -62,19 +65,21 @@ class MeshClient:
         session: a session that reaches the mesh; the caller closes it.
         endpoints: where the session reaches the mesh, for messages.
         over: raises `MeshLost` if the mesh has ended, where the caller knows it; otherwise returns False.
+        own: the certificate with which the session reaches it; None: it comes by a socket, or there is no security.
 
     Raises:
         ConfigurationError: (every method) a name is unknown, or the mesh refused; the message has the reason.
         DeadlineExceeded: (every method) there was no answer in time.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one mesh, and how it is reached
         self,
         session: zenoh.Session,
         keys: Keys,
         endpoints: Sequence[str],
         timeout_s: float,
         over: Callable[[], bool] = lambda: False,
+        own: Identity | None = None,
     ) -> None:
         self.keys = keys
         self.endpoints = tuple(endpoints)
@@ -82,6 +87,7 @@ class MeshClient:
         self._who = f"mesh '{keys.mesh}'"
         self._timeout_s = timeout_s
         self._over = over
+        self._own = own
         self._lost = threading.Event()
         self._known: dict[str, dict[str, Target]] = {}
         self._known_run = ""

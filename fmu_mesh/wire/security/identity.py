@@ -9,17 +9,19 @@ from __future__ import annotations
 import base64
 import re
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast, get_args
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast, get_args
 
 import msgspec
 
+from ...config.access import Role
 from ...errors import ConfigurationError
 from ...files import decoded_json
 from ...installing import importing
 from ...text import listed, short_path, shown
+from ..keys import LOCAL
 
 if TYPE_CHECKING:
     from cryptography.x509 import Certificate
@@ -29,7 +31,6 @@ __all__ = [
     "CA_KEY",
     "CERTIFICATE",
     "KEY",
-    "LOCAL",
     "ROLES",
     "Identity",
     "Role",
@@ -39,8 +40,6 @@ __all__ = [
     "wrong_name",
 ]
 
-Role = Literal["observer", "operator", "node"]
-
 CA: Final = "ca.pem"
 CA_KEY: Final = "ca.key"
 """Only in the folder of the authority."""
@@ -48,9 +47,6 @@ CA_KEY: Final = "ca.key"
 CERTIFICATE: Final = "certificate.pem"
 KEY: Final = "key.pem"
 ROLES: Final = "roles.json"
-
-LOCAL: Final = "local"
-"""Who comes by the Unix socket of a mesh: an operator and node that no certificate can name."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _USER: Final = "certificates"
@@ -121,8 +117,12 @@ def wrong_name(name: str) -> str | None:
     return f"'{LOCAL}' is who comes by the Unix socket of a mesh" if name.lower() == LOCAL else None
 
 
-def identity_in(folder: Path) -> Identity:
+def identity_in(folder: Path, roles: Mapping[str, Role] | None = None) -> Identity:
     """Read a folder, and check all of it.
+
+    Args:
+        folder: DIR/NAME.
+        roles: who has which role, instead of what `roles.json` of the folder says.
 
     Raises:
         ConfigurationError: it is no such folder, something in it is wrong, or a certificate is not valid now.
@@ -145,10 +145,10 @@ def identity_in(folder: Path) -> Identity:
         hint = f"`chmod 600 {short_path(folder / KEY)}` closes it."
         raise ConfigurationError(f"others can read '{short_path(folder / KEY)}' (mode {mode & 0o777:o})", hint=hint)
     with importing("cryptography", _USER):
-        return _checked(folder)
+        return _checked(folder, roles)
 
 
-def _checked(folder: Path) -> Identity:
+def _checked(folder: Path, roles: Mapping[str, Role] | None) -> Identity:
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415  an optional library, and 60 ms
     from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415  as above
 
@@ -170,7 +170,7 @@ def _checked(folder: Path) -> Identity:
         raise ConfigurationError(f"the key '{short_path(folder / KEY)}' does not belong to '{place}'")
     _check_dates(own, place, name)
     _check_dates(authority, short_path(folder / CA), "its authority")
-    table = _table(folder, authority)
+    table = _table(folder, authority) if roles is None else RoleTable(0, "", dict(roles))
     role = table.roles.get(name) if table is not None else _role_in(own)
     if role is None:
         raise ConfigurationError(f"'{name}' of '{short_path(folder)}' has no role")

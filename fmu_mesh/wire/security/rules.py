@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from .identity import LOCAL, Role
+from ..keys import LOCAL
+from .identity import Role
 
 __all__ = ["ACTIONS", "HELLO", "ROLE_NAMES", "Action", "access_control"]
 
