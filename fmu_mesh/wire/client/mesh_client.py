@@ -203,9 +203,11 @@ class MeshClient:
     def get(self, targets: Sequence[Target]) -> list[Reading]:
         """The current values with their points, in the order of the targets."""
         readings: dict[str, Reading] = {}
-        for instance in dict.fromkeys(target.instance for target in targets):
-            own = {target.key: target for target in targets if target.instance == instance}
-            key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
+        for root in dict.fromkeys(target.root for target in targets):
+            own = {target.key: target for target in targets if target.root == root}
+            instance = next(iter(own.values())).instance
+            # A wider key lies in no rule of a mesh with security.
+            key = next(iter(own)) if len(own) == 1 else f"{root}/*"
             # An answer may be lost where this process reads too slowly; it is asked for again.
             for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
                 for sample in self._ask(Question(asked, f"the values of instance '{instance}'", self._timeout_s)):
@@ -275,7 +277,7 @@ class MeshClient:
                 by_instance.setdefault(target.instance, {})[target.key] = target
             for name, own in by_instance.items():
                 every = len(own) == len(self._known.get(name, ()))
-                through = f"{self.keys.instance(name)}/*/*" if every else None
+                through = {f"{target.root}/*" for target in own.values()} if every else None
                 follower.subscribe(own.keys(), partial(reading_among, own), through)
                 subscribed[name] = None if every else [target.variable.name for target in own.values()]
             there = self._is_there(follower, self._timeout_s)
