@@ -40,7 +40,7 @@ from ..run.options import StartOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan, numbered
-from ..run.wiring import certified
+from ..run.wiring import certified, name_of
 from ..simtime import ENDLESS
 from ..wire.client.mesh_client import MeshClient
 from ..wire.keys import Keys
@@ -150,6 +150,7 @@ class RunThread:
                     raise DeadlineExceeded(f"mesh '{name}' does not answer at {self.endpoints[0]}") from error
             else:
                 way.callback(close_session, session)
+                keys = replace(keys, by=name_of(ends, config.security))
                 return MeshClient(session, keys, self.endpoints[:1], timeout_s, self.over, ends.identity)
 
     def end_by_keyboard(self) -> FmuMeshError:

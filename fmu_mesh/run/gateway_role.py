@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec.structs import replace
+
 from ..errors import ConfigurationError, Interrupted
 from ..ros.gateway.gateway import Gateway
 from ..ros.gateway.link import RosLink, open_profiles, open_ros
@@ -16,7 +18,7 @@ from ..wire.session import Wiring, close_session, open_session
 from .events import Event, Reachable
 from .process import RunProcess
 from .run_plan import RunPlan
-from .wiring import certified
+from .wiring import certified, name_of
 
 __all__ = ["run_gateway"]
 
@@ -47,6 +49,7 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
         keys, insecure = Keys(config.zenoh.key_prefix, config.mesh), config.zenoh.insecure
         client = Wiring("client", connect=at, patience_s=patience_s, lease_s=lease_s, insecure=insecure)
         client = certified(client, config.security, keys.root)
+        keys = replace(keys, by=name_of(client, config.security))
         # Two, because answers would queue behind the samples of a fast mesh.
         mesh, asking = open_session(client), open_session(client)
         stack.callback(close_session, mesh)

@@ -17,10 +17,11 @@ from ..config.mesh import TimeoutsConfig, ZenohConfig
 from ..errors import ConfigurationError
 from ..files import beside
 from ..system.plan import MASTER
+from ..wire.keys import LOCAL
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
 
-__all__ = ["certified", "patient", "wiring"]
+__all__ = ["certified", "name_of", "patient", "wiring"]
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
@@ -78,6 +79,13 @@ def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tu
         text = f"'{own.name}' of '{security.folder}' is {own.role}, and who runs a mesh at a network has the role node"
         raise ConfigurationError(text, hint="Each host has a certificate of its own: `security add ... --role node`.")
     return replace(made, identity=own, root=root, ends=ends)
+
+
+def name_of(made: Wiring, security: SecurityConfig | None) -> str | None:
+    """In whose name a process of a run sets values and gives commands; None: it needs none."""
+    if made.identity is not None:
+        return made.identity.name
+    return LOCAL if security is not None else None
 
 
 def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:

@@ -203,9 +203,11 @@ class MeshClient:
     def get(self, targets: Sequence[Target]) -> list[Reading]:
         """The current values with their points, in the order of the targets."""
         readings: dict[str, Reading] = {}
-        for instance in dict.fromkeys(target.instance for target in targets):
-            own = {target.key: target for target in targets if target.instance == instance}
-            key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
+        for root in dict.fromkeys(target.root for target in targets):
+            own = {target.key: target for target in targets if target.root == root}
+            instance = next(iter(own.values())).instance
+            # A wider key lies in no rule of a mesh with security.
+            key = next(iter(own)) if len(own) == 1 else f"{root}/*"
             # An answer may be lost where this process reads too slowly; it is asked for again.
             for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
                 for sample in self._ask(Question(asked, f"the values of instance '{instance}'", self._timeout_s)):
@@ -223,7 +225,8 @@ class MeshClient:
             payload = encode_value(cast("Any", plain))
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
-        return self._view(target.key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
+        key = self.keys.setting(target.instance, target.variable.name)
+        return self._view(key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
@@ -274,7 +277,7 @@ class MeshClient:
                 by_instance.setdefault(target.instance, {})[target.key] = target
             for name, own in by_instance.items():
                 every = len(own) == len(self._known.get(name, ()))
-                through = f"{self.keys.instance(name)}/*/*" if every else None
+                through = {f"{target.root}/*" for target in own.values()} if every else None
                 follower.subscribe(own.keys(), partial(reading_among, own), through)
                 subscribed[name] = None if every else [target.variable.name for target in own.values()]
             there = self._is_there(follower, self._timeout_s)
@@ -366,7 +369,7 @@ class MeshClient:
 
     @cached_property
     def _command_key(self) -> zenoh.KeyExpr:
-        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.mesh_key("command"))
+        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.command)
         return key
 
     def _view(

@@ -20,8 +20,8 @@ from msgspec.structs import replace
 from ...config.access_sections import given_folder, has_tls, is_socket
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ...text import did_you_mean, listed
-from ..keys import Keys
-from ..runtime import meshes
+from ..keys import LOCAL, Keys
+from ..runtime import MeshNote, meshes
 from ..session import Wiring, close_session, open_session, tokens
 from .mesh_client import MeshClient, is_key, key_expression
 
@@ -186,15 +186,16 @@ class Meshes:
             ends = tuple(filter(is_socket, note.endpoints)) or note.endpoints
             nobody = f"mesh '{note.mesh}' did not answer"
             opening = self._open(ends, nobody, note.security or None, insecure=note.insecure)
-            yield _Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening)
+            yield _Found(Keys(note.key_prefix, note.mesh, _by(note)), note.endpoints, opening)
 
     def _shown(self) -> Iterator[_Found]:
         """Every mesh whose master can be reached at the endpoints."""
         opening = self._open(self._endpoints, _NOBODY)
+        by = next((_by(note) for note in meshes() if {*note.endpoints} & {*self._endpoints}), None)
         for key in tokens(opening.session(), _TOKENS, self._timeout_s):
             *prefix, mesh, _ = key.split("/")
             if prefix:  # otherwise it is not a token of a mesh
-                yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
+                yield _Found(Keys("/".join(prefix), mesh, by), self._endpoints, opening)
 
     def _open(
         self, endpoints: tuple[str, ...], else_: str, security: str | None = None, *, insecure: bool = False
@@ -215,7 +216,9 @@ class Meshes:
 
     def _client(self, found: _Found) -> MeshClient:
         session = found.opening.session()
-        return MeshClient(session, found.keys, found.endpoints, self._timeout_s, own=found.opening.identity)
+        own, keys = found.opening.identity, found.keys
+        keys = keys if own is None else replace(keys, by=own.name)
+        return MeshClient(session, keys, found.endpoints, self._timeout_s, own=own)
 
     def _close(self) -> None:
         for opening in self._openings.values():
@@ -294,6 +297,11 @@ class _Found(NamedTuple):
     def names(self) -> tuple[str, str]:
         """What the mesh may be called: its name and its key."""
         return self.keys.mesh, self.keys.root
+
+
+def _by(note: MeshNote) -> str | None:
+    """In whose name a tool comes to the socket of a mesh; None: it needs none."""
+    return LOCAL if note.security else None
 
 
 def _means(keys: Keys, reference: str) -> bool:

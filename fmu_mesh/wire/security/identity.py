@@ -21,6 +21,7 @@ from ...errors import ConfigurationError
 from ...files import decoded_json
 from ...installing import importing
 from ...text import listed, short_path, shown
+from ..keys import LOCAL
 
 if TYPE_CHECKING:
     from cryptography.x509 import Certificate
@@ -30,7 +31,6 @@ __all__ = [
     "CA_KEY",
     "CERTIFICATE",
     "KEY",
-    "LOCAL",
     "ROLES",
     "Identity",
     "Role",
@@ -47,9 +47,6 @@ CA_KEY: Final = "ca.key"
 CERTIFICATE: Final = "certificate.pem"
 KEY: Final = "key.pem"
 ROLES: Final = "roles.json"
-
-LOCAL: Final = "local"
-"""Who comes by the Unix socket of a mesh: an operator and node that no certificate can name."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _USER: Final = "certificates"
