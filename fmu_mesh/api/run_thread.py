@@ -151,7 +151,7 @@ class RunThread:
             else:
                 way.callback(close_session, session)
                 keys = replace(keys, by=name_of(ends, config.security))
-                return MeshClient(session, keys, self.endpoints[:1], timeout_s, self.over, ends.identity)
+                return MeshClient(session, keys, self.endpoints[:1], timeout_s, self.over)
 
     def end_by_keyboard(self) -> FmuMeshError:
         """End the run on Ctrl-C, and return its error; a second Ctrl-C does not wait for its processes."""

@@ -83,9 +83,13 @@ class Keys(msgspec.Struct, frozen=True):
     def _by(self, key: str) -> str:
         return f"{key}/{BY}/{self.by}" if self.by is not None else key
 
-    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros", "audit"]) -> str:
+    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros", "audit", "hello"]) -> str:
         """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
+
+    def role(self, role: str) -> str:
+        """A queryable of the master that the rules let only one role ask."""
+        return f"{self.root}/mesh/role/{role}"
 
     @property
     def master(self) -> str:

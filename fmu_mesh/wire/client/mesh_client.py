@@ -18,13 +18,14 @@ from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
 import zenoh
 from msgspec.structs import replace
 
+from ...config.access_sections import Role
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
 from ...text import did_you_mean, is_pattern, listed, matching, shown
 from ..keys import SUBSCRIBED, Keys
@@ -45,9 +46,6 @@ from ..views import (
 from .following import Follower
 from .readings import Reading, Target, reading_among
 
-if TYPE_CHECKING:  # most meshes need no certificate
-    from ..security.identity import Identity
-
 __all__ = ["MeshClient", "is_key", "key_expression"]
 
 View = TypeVar("View")
@@ -65,7 +63,7 @@ class MeshClient:
         session: a session that reaches the mesh; the caller closes it.
         endpoints: where the session reaches the mesh, for messages.
         over: raises `MeshLost` if the mesh has ended, where the caller knows it; otherwise returns False.
-        own: the certificate with which the session reaches it; None: it comes by a socket, or there is no security.
+        role: what the certificate of this process may do; None: it comes by a socket, or there is no security.
 
     Raises:
         ConfigurationError: (every method) a name is unknown, or the mesh refused; the message has the reason.
@@ -79,7 +77,7 @@ class MeshClient:
         endpoints: Sequence[str],
         timeout_s: float,
         over: Callable[[], bool] = lambda: False,
-        own: Identity | None = None,
+        role: Role | None = None,
     ) -> None:
         self.keys = keys
         self.endpoints = tuple(endpoints)
@@ -87,7 +85,7 @@ class MeshClient:
         self._who = f"mesh '{keys.mesh}'"
         self._timeout_s = timeout_s
         self._over = over
-        self._own = own
+        self._role = role
         self._lost = threading.Event()
         self._known: dict[str, dict[str, Target]] = {}
         self._known_run = ""
@@ -220,6 +218,7 @@ class MeshClient:
 
         That is the next one, or the one ``at`` a simulation time in s.
         """
+        self.check_may("setting a value")
         plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         try:
             payload = encode_value(cast("Any", plain))
@@ -230,9 +229,19 @@ class MeshClient:
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
+        self.check_may(f"'{command.command}'")
         payload = msgspec.json.encode(command)
         question = Question(self._command_key, self._who, timeout_s or self._timeout_s, payload, once=True)
         return _understood(self._ask(question)[0], CommandAnswer, self._who)
+
+    def check_may(self, what: str) -> None:
+        """Check that the role of this process may set and command: what is not allowed would vanish without an answer.
+
+        Raises:
+            ConfigurationError: it may only read.
+        """
+        if self._role == "observer":
+            raise ConfigurationError(f"you are observer '{self.keys.by}'; {what} needs operator.")
 
     def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause or step the mesh; the answer comes when it has paused, and has the point at which it has.

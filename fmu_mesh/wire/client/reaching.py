@@ -12,17 +12,19 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar, cast, get_args
 
 import zenoh
 from msgspec.structs import replace
 
-from ...config.access_sections import given_folder, has_tls, is_socket
+from ...config.access_sections import Role, given_folder, has_tls, is_socket
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ...text import did_you_mean, listed
 from ..keys import LOCAL, Keys
+from ..messages import decode_json
 from ..runtime import MeshNote, meshes
 from ..session import Wiring, close_session, open_session, tokens
+from ..views import Hello
 from .mesh_client import MeshClient, is_key, key_expression
 
 if TYPE_CHECKING:  # as above
@@ -44,7 +46,10 @@ _GRACE_S = 1.0
 _NOTE_CHECK_S = 0.05
 _AGAIN_S = 1.0
 _TOKENS = "**/mesh"
+_HELLO = f"{_TOKENS}/hello"
 _NOBODY = "nobody answered"
+_HELLO_S = 1.0
+"""How long in s a mesh may need to say which role a certificate has."""
 
 
 class Meshes:
@@ -174,6 +179,9 @@ class Meshes:
         if self._found:
             return None
         if self._endpoints:
+            opening = self._open(self._endpoints, _NOBODY)
+            if (own := opening.identity) is not None and (hello := _greeted(opening.session(), _HELLO, _HELLO_S)):
+                return _without_role(own, hello)
             return ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
         return ConfigurationError(
             "no mesh is running here.",
@@ -216,9 +224,11 @@ class Meshes:
 
     def _client(self, found: _Found) -> MeshClient:
         session = found.opening.session()
-        own, keys = found.opening.identity, found.keys
-        keys = keys if own is None else replace(keys, by=own.name)
-        return MeshClient(session, keys, found.endpoints, self._timeout_s, own=own)
+        own, reached = found.opening.identity, (found.endpoints, self._timeout_s)
+        if own is None:
+            return MeshClient(session, found.keys, *reached)
+        role = _role(session, found.keys, own, self._timeout_s)
+        return MeshClient(session, replace(found.keys, by=own.name), *reached, role=role)
 
     def _close(self) -> None:
         for opening in self._openings.values():
@@ -302,6 +312,41 @@ class _Found(NamedTuple):
 def _by(note: MeshNote) -> str | None:
     """In whose name a tool comes to the socket of a mesh; None: it needs none."""
     return LOCAL if note.security else None
+
+
+def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> Hello | None:
+    """What a master answers to a certificate at once; None if it does not, or may not."""
+    for reply in session.get(key, timeout=timeout_s):
+        if reply.ok is not None:
+            return decode_json(reply.ok.payload.to_bytes(), Hello)
+    return None
+
+
+def _role(session: zenoh.Session, keys: Keys, own: Identity, timeout_s: float) -> Role:
+    """The role that a mesh knows of a certificate, which may have another one in it.
+
+    Raises:
+        ConfigurationError: it has none there.
+        DeadlineExceeded: the mesh does not answer.
+    """
+    end, never = time.monotonic() + min(timeout_s, _HELLO_S), threading.Event()
+    while True:
+        for role in sorted(get_args(Role), key=lambda one: one != own.role):
+            if _greeted(session, keys.role(role), _HELLO_S) is not None:
+                return cast("Role", role)
+        # A query that comes before its queryable is known has no answer.
+        if (left_s := end - time.monotonic()) <= 0:
+            break
+        never.wait(min(left_s, _NOTE_CHECK_S))
+    if (hello := _greeted(session, keys.mesh_key("hello"), _HELLO_S)) is not None:
+        raise _without_role(own, hello)
+    raise DeadlineExceeded(f"mesh '{keys.mesh}' does not say which role '{own.name}' has", hint="Has it `security`?")
+
+
+def _without_role(own: Identity, hello: Hello) -> ConfigurationError:
+    table = f"table {hello.table} of roles" if hello.table else "its roles"
+    hint = f"The mesh has {table}. Whoever has the authority can add the name; the next start of the mesh knows it."
+    return ConfigurationError(f"'{own.name}' has no role in mesh '{hello.mesh}'.", hint=hint)
 
 
 def _means(keys: Keys, reference: str) -> bool:
