@@ -7,6 +7,8 @@ import hmac
 import ipaddress
 import socket
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -22,6 +24,8 @@ class ServedMesh(msgspec.Struct, frozen=True):
         mesh: name or key of the only mesh; None: all that can be reached, or the only one of them.
         connect: Zenoh endpoints of the mesh or of a router; none: the meshes of this user on this host.
         timeout: deadline of every question to a mesh in s.
+        security: folder with the certificate for it; None: that of this host.
+        insecure: whether a network without TLS is used.
         host: the address to listen at.
         port: 0 for a free one.
         read_only: whether nothing can be set or steered.
@@ -30,9 +34,21 @@ class ServedMesh(msgspec.Struct, frozen=True):
     mesh: str | None
     connect: Sequence[str]
     timeout: float
+    security: Path | None
+    insecure: bool
     host: str
     port: int
     read_only: bool
+
+    @property
+    def reach(self) -> dict[str, Any]:
+        """How the meshes are reached, as `attach` takes it."""
+        return {
+            "connect": self.connect,
+            "timeout": self.timeout,
+            "security": self.security,
+            "insecure": self.insecure,
+        }
 
 
 def listening(host: str, port: int, who: str) -> socket.socket:

@@ -67,7 +67,7 @@ class HeldMesh:
         """Set inputs, take one step, return outputs; all named `instance.variable`."""
         for name, value in inputs.items():
             instance, _, variable = name.partition(".")
-            self._ask(f"{instance}/in/{variable}", json.dumps(value))
+            self._ask(f"{instance}/set/{variable}", json.dumps(value))
         answer, _ = self._ask("mesh/command", '{"command":"step","points":1}')
         self.point = int(answer["hold"])
         return [self._output(name) for name in outputs]

@@ -37,6 +37,8 @@ _SET = "set"
 _ALONE: Mapping[str, Any] = {
     "zenoh": {"mode": "peer", "listen": [], "connect": [], "rows_address": None, "config": None},
     "ros": None,
+    "security": None,
+    "runtime": {},
 }
 """What a rerun has of its own: nobody else reaches it or sends anything to it."""
 

@@ -40,6 +40,7 @@ from ..run.options import StartOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan, numbered
+from ..run.wiring import certified, name_of
 from ..simtime import ENDLESS
 from ..wire.client.mesh_client import MeshClient
 from ..wire.keys import Keys
@@ -135,18 +136,21 @@ class RunThread:
             raise CallRefused(f"the run of mesh '{name}' is in this process, where nobody can reach it", hint=hint)
         if not self.reached.wait(config.timeouts.start):
             raise DeadlineExceeded(f"mesh '{name}' cannot be reached within {config.timeouts.start:g} s")
+        keys = Keys(config.zenoh.key_prefix, name)
+        reached = Wiring("client", waits=False, insecure=config.zenoh.insecure)
         patience_s = _TRY_S  # Zenoh tries for all of it, also if the mesh ends meanwhile
         while True:
             self.over()
             try:
-                session = open_session(Wiring(mode="client", connect=self.endpoints[:1], patience_s=patience_s))
-            except ConfigurationError as error:
+                ends = replace(reached, connect=self.endpoints[:1], patience_s=patience_s)
+                session = open_session(ends := certified(ends, config.security, keys.root))
+            except (ConfigurationError, MeshLost) as error:
                 patience_s *= 2
                 if patience_s > timeout_s:
                     raise DeadlineExceeded(f"mesh '{name}' does not answer at {self.endpoints[0]}") from error
             else:
                 way.callback(close_session, session)
-                keys = Keys(config.zenoh.key_prefix, name)
+                keys = replace(keys, by=name_of(ends, config.security))
                 return MeshClient(session, keys, self.endpoints[:1], timeout_s, self.over)
 
     def end_by_keyboard(self) -> FmuMeshError:

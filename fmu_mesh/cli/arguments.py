@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
 from ..config.base import ENDPOINT_PATTERN
@@ -17,6 +18,7 @@ from ..errors import ConfigurationError
 from ..text import listed, meant, nearest
 
 __all__ = [
+    "ACCESS",
     "PACKAGE",
     "QUIET",
     "SSD",
@@ -32,6 +34,7 @@ __all__ = [
     "number",
     "port_number",
     "positive_seconds",
+    "reach",
     "reaching",
     "switch",
     "tolerance",
@@ -126,7 +129,14 @@ def json_switch(text: str = "JSON, one object per line") -> ArgumentPart:
     return switch("--json", text=text)
 
 
-def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ArgumentPart]:
+ACCESS: tuple[ArgumentPart, ...] = (
+    argument("--security", "DIR/NAME", "folder with your certificate; default: that of FMU_MESH_SECURITY", type=Path),
+    switch("--insecure", text="also use a network without TLS, where everybody can set values and end runs"),
+)
+"""How a command reaches others at a network."""
+
+
+def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ...]:
     """The flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
     where = "Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host"
     return (
@@ -134,7 +144,13 @@ def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ArgumentPart]
         argument(
             "--timeout", "S", f"deadline of every query in s ({timeout_s:g})", type=positive_seconds, default=timeout_s
         ),
+        *ACCESS,
     )
+
+
+def reach(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The flags of `reaching`, as the library takes them."""
+    return {name: getattr(arguments, name) for name in ("connect", "timeout", "security", "insecure")}
 
 
 def _finite(text: str, *, least: float = -math.inf, above: float = -math.inf, what: str) -> float:

@@ -19,7 +19,7 @@ from tempfile import NamedTemporaryFile
 from ..dashboard.dashboard_server import serve
 from ..errors import Interrupted
 from ..web_server import ServedMesh, is_loopback
-from .arguments import Runs
+from .arguments import Runs, reach
 
 __all__ = ["RUNS"]
 
@@ -27,8 +27,7 @@ __all__ = ["RUNS"]
 def _dashboard(arguments: argparse.Namespace) -> int:
     options = ServedMesh(
         mesh=arguments.mesh,
-        connect=arguments.connect,
-        timeout=arguments.timeout,
+        **reach(arguments),
         host=arguments.host,
         port=arguments.port,
         read_only=arguments.read_only,

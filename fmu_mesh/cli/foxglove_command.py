@@ -7,7 +7,7 @@ import sys
 
 from ..installing import importing
 from ..web_server import is_loopback
-from .arguments import Runs
+from .arguments import Runs, reach
 
 __all__ = ["RUNS"]
 
@@ -17,8 +17,7 @@ def _foxglove(arguments: argparse.Namespace) -> int:
         from ..foxglove.serving import Serving, serve  # noqa: PLC0415  an extra
     serving = Serving(
         mesh=arguments.mesh,
-        connect=tuple(arguments.connect),
-        timeout=arguments.timeout,
+        **reach(arguments),
         variables=tuple(arguments.variables),
         host=arguments.host,
         port=arguments.port,

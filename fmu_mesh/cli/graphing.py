@@ -13,7 +13,7 @@ from ..pictures.drawing import draw
 from ..pictures.system_graph import SystemGraph
 from ..run.options import VariantOptions
 from ..ssp.configuration_files import names_package
-from .arguments import Runs
+from .arguments import Runs, reach
 from .output.json_output import print_json
 from .run_options import given_options
 
@@ -48,7 +48,7 @@ def _graph_of(arguments: argparse.Namespace) -> SystemGraph:
     if of is not None and (chooses or is_configuration):
         given = given_options(arguments, VariantOptions)
         return load(of, ssd=arguments.ssd, ssv=arguments.ssv).graph(**given)
-    with attach(of, connect=arguments.connect, timeout=arguments.timeout) as run:
+    with attach(of, **reach(arguments)) as run:
         return run.graph()
 
 

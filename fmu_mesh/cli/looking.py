@@ -22,7 +22,7 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.reaching import Meshes
 from ..wire.client.readings import Target
 from ..wire.views import InstanceInfo, InstanceStatus, MeshInfo, MeshStatus, RosView
-from .arguments import Runs
+from .arguments import Runs, reach
 from .output.json_output import print_json
 from .output.pages import (
     cells,
@@ -42,7 +42,7 @@ Run = Callable[[argparse.Namespace, Meshes], int]
 
 
 def _with_meshes(run: Run, arguments: argparse.Namespace) -> int:
-    with Meshes(arguments.connect, arguments.timeout) as meshes:
+    with Meshes(**reach(arguments)) as meshes:
         code = run(arguments, meshes)
         for error in meshes.silent:  # others have answered
             print(f"fmu-mesh: {error}", file=sys.stderr)

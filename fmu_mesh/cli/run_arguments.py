@@ -9,6 +9,7 @@ from ..config.call_options import option_fields
 from ..run.options import SimulateOptions
 from ..sweeps.sweep_options import SweepOptions
 from .arguments import (
+    ACCESS,
     PACKAGE,
     QUIET,
     ArgumentPart,
@@ -90,6 +91,20 @@ PARSERS: Parsers = {
             type=endpoint,
             action="append",
         ),
+        *ACCESS,
+        argument(
+            "--key-prefix",
+            "PREFIX",
+            "with a certificate: what the keys of the meshes begin with (fmu_mesh)",
+            default="fmu_mesh",
+        ),
+        argument(
+            "--end",
+            "KEY",
+            "with a certificate: a key of other programs at an end of a connection; repeatable",
+            action="append",
+            default=[],
+        ),
         QUIET,
     ),
     "simulate": (_FMU, _add_simulate, _PLOT, *_OUTPUT, _OUTCOME),
@@ -117,6 +132,8 @@ PARSERS: Parsers = {
             "output",
             "listen",
             "connect",
+            "security",
+            "insecure",
             defaults={
                 "step_size": "that of the FMU",
                 "stop_time": "none, it runs until it is stopped",

@@ -87,6 +87,8 @@ CONFIGURED = (
             "output",
             "listen",
             "connect",
+            "security",
+            "insecure",
         ),
     ),
     options("keys_from", "allow_code"),

@@ -21,18 +21,19 @@ from msgspec.structs import replace
 from ..api.mesh_builder import Mesh
 from ..api.result import Result, result_of
 from ..api.run_handle import Run
+from ..config.access_sections import given_folder, has_tls, why_open
 from ..errors import ConfigurationError, FmuMeshError
 from ..run.events import Event, Reachable
 from ..run.options import RerunOptions
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
 from ..system.plan import Plan
-from ..wire.session import run_router
+from ..wire.session import Wiring, run_router
 from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
-from .output.terminal import stdout_as_stderr
+from .output.terminal import say, stdout_as_stderr
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .run_options import given_options, mesh_of
 
@@ -176,12 +177,29 @@ def _gateway(arguments: argparse.Namespace) -> int:
 
 def _router(arguments: argparse.Namespace) -> int:
     stop = threading.Event()
-    endpoints = arguments.listen or ["tcp/127.0.0.1:7447"]
-    with ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False), run_router(endpoints) as where:
+    wiring = _router_wiring(arguments)
+    with ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False), run_router(wiring) as where:
         print(f"router at {', '.join(where)}", flush=True)
         stop.wait()
     sys.stdout.flush()
     return 0
+
+
+def _router_wiring(arguments: argparse.Namespace) -> Wiring:
+    """Where a router listens, and who may do what there; warns of what is open to others."""
+    if arguments.insecure and arguments.security is not None:
+        raise ConfigurationError("--security and --insecure do not go together", hint="Leave one of them out.")
+    listen = tuple(arguments.listen or ["tcp/127.0.0.1:7447"])
+    folder = given_folder(arguments.security) if arguments.security or any(map(has_tls, listen)) else None
+    own = None
+    if folder is not None and not arguments.insecure:
+        from ..wire.security.certificates import identity_in  # noqa: PLC0415  most routers have no certificate
+
+        own = identity_in(folder)
+    for _, text in why_open({"--listen": listen}, secured=own is not None):
+        say(f"warning: {text}")
+    root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)
+    return Wiring(listen=listen, insecure=arguments.insecure, identity=own, root=root, ends=ends)
 
 
 def _rerun(arguments: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ from ..ros.bags.play_options import PlayOptions
 from ..run.options import ResetOptions
 from ..text import did_you_mean, listed
 from ..wire.views import CommandAnswer
-from .arguments import Runs, whole
+from .arguments import Runs, reach, whole
 from .mesh_arguments import LEVELS
 from .output.json_output import print_json
 from .run_options import given_options
@@ -33,7 +33,7 @@ def _command(arguments: argparse.Namespace) -> int:
     number = whole(points) if points is not None else 1
     if number < 1:
         raise ConfigurationError(f"N: '{points}' is not a whole number of 1 or more")
-    with attach(name, connect=arguments.connect, timeout=arguments.timeout) as run:
+    with attach(name, **reach(arguments)) as run:
         match arguments.command:
             case "step":
                 answer: CommandAnswer | None = run.step(number)
@@ -58,7 +58,7 @@ def _wait(arguments: argparse.Namespace) -> int:
     # A mesh with a note is running or about to end; an endpoint may appear later.
     patience_s = arguments.timeout if arguments.connect else min(arguments.timeout, _TIMEOUT_S)
     end = time.monotonic() + arguments.timeout
-    with attach(arguments.mesh, connect=arguments.connect, timeout=patience_s, wait=arguments.timeout) as run:
+    with attach(arguments.mesh, **{**reach(arguments), "timeout": patience_s}, wait=arguments.timeout) as run:
         status = run.wait_for(arguments.state, end - time.monotonic())
     if arguments.json:
         print_json(status)
@@ -68,7 +68,7 @@ def _wait(arguments: argparse.Namespace) -> int:
 
 
 def _logs(arguments: argparse.Namespace) -> int:
-    with attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run:
+    with attach(arguments.mesh, **reach(arguments)) as run:
         if arguments.instance is not None and arguments.instance not in (names := run.info().instances):
             hint = did_you_mean(arguments.instance, names, f"There are: {listed(names)}.")
             raise ConfigurationError(f"mesh '{run.name}' has no instance '{arguments.instance}'.", hint=hint)
@@ -96,7 +96,7 @@ def _play(arguments: argparse.Namespace) -> int:
 
     with (
         Bag(arguments.bag) as bag,  # first: what is wrong with it is told before anything about meshes
-        attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run,
+        attach(arguments.mesh, **reach(arguments)) as run,
     ):
         played = run.play(bag, **given_options(arguments, PlayOptions))
     names = ", ".join(played.topics)

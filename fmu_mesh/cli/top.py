@@ -24,7 +24,7 @@ from ..api.run_handle import Run
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost
 from ..pictures.tables import shortened, table, wrapped
 from ..wire.views import InstanceStatus, MeshStatus
-from .arguments import Runs
+from .arguments import Runs, reach
 from .output.json_output import print_json
 from .output.pages import keys, progress, seconds
 from .output.screen import Screen
@@ -48,7 +48,7 @@ Look = tuple[MeshStatus, dict[str, InstanceStatus]]
 
 def _top(arguments: argparse.Namespace) -> int:
     with (
-        attach(arguments.mesh, connect=arguments.connect, timeout=arguments.timeout) as run,
+        attach(arguments.mesh, **reach(arguments)) as run,
         _Courses(run, arguments.watch, arguments.interval) as courses,
     ):
         if arguments.once:

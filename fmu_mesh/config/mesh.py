@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 from msgspec import Meta
 
+from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig
 from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection
 from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig
@@ -32,6 +33,8 @@ __all__ = [
     "RosConfig",
     "RosProfile",
     "RosTopicConfig",
+    "RuntimeConfig",
+    "SecurityConfig",
     "SimulationConfig",
     "TimeoutsConfig",
     "ZenohConfig",
@@ -242,14 +245,21 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
     listen: Annotated[
         list[Endpoint],
         Meta(
-            description="Where other hosts and users can connect to the master, such as tcp/0.0.0.0:7447, besides the "
-            "Unix socket in the user's runtime folder."
+            description="Where other hosts and users can connect to the master, such as tls/0.0.0.0:7447, besides the "
+            "Unix socket in the user's runtime folder. tls/ needs `security`; tcp/ beyond this host, `insecure`."
         ),
     ] = []
     connect: Annotated[
         list[Endpoint],
-        Meta(description="Where to connect to a router or to the mesh of another host, such as tcp/192.168.1.2:7447."),
+        Meta(description="Where to connect to a router or to the mesh of another host, such as tls/192.168.1.2:7447."),
     ] = []
+    insecure: Annotated[
+        bool,
+        Meta(
+            description="true: there may be endpoints without TLS at a network, and everybody there can read and set "
+            "values and end runs."
+        ),
+    ] = False
     shared_memory: Annotated[
         bool,
         Meta(
@@ -258,12 +268,13 @@ class ZenohConfig(Base, frozen=True, kw_only=True):
         ),
     ] = True
     row_streams: Annotated[
-        bool,
+        bool | None,
         Meta(
             description="true: processes that share no memory exchange values, grants and progress through sockets of "
-            "their own, where they can reach each other; false: through Zenoh."
+            "their own, where they can reach each other; false: through Zenoh. null: true, and with `security` false, "
+            "because those sockets have no TLS."
         ),
-    ] = True
+    ] = None
     rows_address: Annotated[
         Annotated[str, Meta(min_length=1)] | None,
         Meta(
@@ -350,6 +361,11 @@ class Config(Base, frozen=True, kw_only=True):
         ),
     ] = None
     zenoh: ZenohConfig = ZenohConfig()
+    security: Annotated[
+        SecurityConfig | None,
+        Meta(description="Certificates and roles for endpoints at a network; null: there are none."),
+    ] = None
+    runtime: RuntimeConfig = RuntimeConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     limits: LimitsConfig = LimitsConfig()
     strict: Annotated[
@@ -368,6 +384,17 @@ class Config(Base, frozen=True, kw_only=True):
         if isinstance(self.record, RecordConfig):
             return {"record": self.record}
         return {f"record[{index}]": section for index, section in enumerate(self.record)}
+
+    @property
+    def row_streams(self) -> bool:
+        """Whether processes that share no memory exchange rows through sockets of their own."""
+        return self.zenoh.row_streams if self.zenoh.row_streams is not None else self.security is None
+
+    @property
+    def ends(self) -> tuple[str, ...]:
+        """The keys of other programs at ends of connections."""
+        keyed = (one.key for one in self.connections if isinstance(one, KeyInputConfig | KeyOutputConfig))
+        return tuple(dict.fromkeys(keyed))
 
     @property
     def engines(self) -> dict[str, PhysicsSection]:

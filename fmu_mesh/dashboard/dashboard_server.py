@@ -52,7 +52,7 @@ def serve(options: ServedMesh, ready: Callable[[str], None]) -> None:
     require("nicegui", "dashboards")
     with (
         listening(options.host, options.port, "the dashboard") as listener,
-        MeshDirectory(options.mesh, options.connect, options.timeout) as directory,
+        MeshDirectory(options.mesh, options.reach) as directory,
     ):
         port, token = listener.getsockname()[1], secrets.token_urlsafe(24)
         server = _server(options, port, token, directory)

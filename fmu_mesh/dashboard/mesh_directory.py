@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from ..errors import FmuMeshError
 from ..wire.client.reaching import Meshes
@@ -23,12 +23,11 @@ _MOST_MESHES: Final = 32
 
 
 class MeshDirectory:
-    """Followers of meshes by key, as long as the `with` block lasts."""
+    """Followers of meshes by key, as long as the `with` block lasts; ``reach`` is what `attach` takes."""
 
-    def __init__(self, mesh: str | None, connect: Sequence[str], timeout: float) -> None:
+    def __init__(self, mesh: str | None, reach: Mapping[str, Any]) -> None:
         self._mesh = mesh
-        self._connect = tuple(connect)
-        self._timeout = timeout
+        self._reach = reach
         self._followers: dict[str, MeshFollower] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._live, name="meshes", daemon=True)
@@ -40,10 +39,10 @@ class MeshDirectory:
             ConfigurationError: the mesh with the name does not run, or there are several.
             DeadlineExceeded: an endpoint does not answer.
         """
-        with Meshes(self._connect, self._timeout) as found:
+        with Meshes(**self._reach) as found:
             if self._mesh is not None:
                 key = found.named(self._mesh).keys.root
-                self._followers = {key: MeshFollower(key, self._connect, self._timeout)}
+                self._followers = {key: MeshFollower(key, self._reach)}
                 return self
             self._add(found.roots)
         self._thread.start()
@@ -63,7 +62,7 @@ class MeshDirectory:
 
     def _live(self) -> None:
         while not self._closing.is_set():
-            with suppress(FmuMeshError), Meshes(self._connect, self._timeout) as found:
+            with suppress(FmuMeshError), Meshes(**self._reach) as found:
                 while not self._closing.wait(_MESHES_S):
                     found.look()
                     self._add(found.roots)
@@ -78,6 +77,6 @@ class MeshDirectory:
         gone = ended[: max(0, len(self._followers) + len(new) - _MOST_MESHES)]
         closed = [self._followers[key] for key in gone]
         kept = {key: follower for key, follower in self._followers.items() if key not in gone}
-        self._followers = kept | {key: MeshFollower(key, self._connect, self._timeout) for key in new}
+        self._followers = kept | {key: MeshFollower(key, self._reach) for key in new}
         for follower in closed:
             follower.close()

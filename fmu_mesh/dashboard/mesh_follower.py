@@ -31,7 +31,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -121,10 +121,9 @@ class CurveQuestion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MeshFollower:
     """Follows a mesh, also through its end and its next run, until it is closed."""
 
-    def __init__(self, key: str, connect: Sequence[str], timeout: float) -> None:
+    def __init__(self, key: str, reach: Mapping[str, Any]) -> None:
         self._key = key
-        self._connect = tuple(connect)
-        self._timeout = timeout
+        self._reach = reach
         self._lock = threading.Lock()
         self._view = MeshView(key)
         self._run: Run | None = None
@@ -207,7 +206,7 @@ class MeshFollower:
     def _live(self) -> None:
         while not self._closing.is_set():
             try:
-                with attach(self._key, connect=self._connect, timeout=self._timeout) as run:
+                with attach(self._key, **self._reach) as run:
                     self._follow(run)
             except FmuMeshError as error:
                 ended = self._view.ended or self._view.info is not None

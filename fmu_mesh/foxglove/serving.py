@@ -72,7 +72,7 @@ def serve(serving: Serving, say: Callable[[str], None], stop: threading.Event | 
                 say(f"waiting for {which} to start")
                 is_reported = True
             try:
-                with Meshes(serving.connect, serving.timeout) as meshes:
+                with Meshes(**serving.reach) as meshes:
                     client = meshes.appearance(mesh, _START_S)
                     try:
                         _show(serving, client, server, say)

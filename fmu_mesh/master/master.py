@@ -162,6 +162,10 @@ class Master:
     def _shares(self) -> bool:
         return can_share() and self._states.plan.system.config.zenoh.shared_memory
 
+    @property
+    def _is_secured(self) -> bool:
+        return next(iter(self._first_plan.nodes.values())).secured
+
     def claim(self) -> None:
         """Become the visible master of this mesh; from now on queries wait until `run` answers them.
 
@@ -182,7 +186,10 @@ class Master:
         server.show("info", self._info)
         server.show("status", self.last_status)
         server.show("plan", lambda: self._states.plan.nodes)
-        server.serve(self._keys.mesh_key("command"), self._command)
+        for key in (self._keys.command, *([replace(self._keys, by="*").command] if self._is_secured else ())):
+            server.serve(key, self._command)
+        if self._settings.table is not None:
+            server.greet(self._settings.table)
         server.hand_on_logs()
         self._token = self._session.liveliness().declare_token(self._keys.master)
 
@@ -373,11 +380,13 @@ class Master:
         query.drop()
 
     def _command(self, query: zenoh.Query) -> None:
-        key = self._keys.mesh_key("command")
-        if query.payload is None and str(query.key_expr) != key:
+        if query.payload is None and "*" in str(query.key_expr):
             query.drop()  # a query for all keys
             return
         data = payload_of(query)
+        if self._is_secured and str(query.key_expr) == self._keys.command:
+            named = replace(self._keys, by="NAME").command
+            raise MessageRefused(f"this mesh has security: '{named}' takes commands, with your name")
         try:
             command = decode_json(data, Command)
         except MessageRefused as error:
@@ -402,8 +411,8 @@ class Master:
             query.drop()
 
     def _answer(self, query: zenoh.Query, answer: CommandAnswer) -> None:
-        key = self._keys.mesh_key("command")
-        with self._inbox.refusals.guard(key):  # the client may be gone
+        key = query.key_expr
+        with self._inbox.refusals.guard(str(key)):  # the client may be gone
             query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
             query.drop()
 

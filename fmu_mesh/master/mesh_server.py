@@ -9,20 +9,21 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 
 import msgspec
 import zenoh
 from msgspec.structs import replace
 from zenoh.handlers import Callback
 
+from ..config.access_sections import Role
 from ..errors import MessageRefused
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import LogLine, MeshStatus
+from ..wire.views import Hello, LogLine, MeshStatus
 
 __all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
 
@@ -56,6 +57,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         launch: the launcher that started this process; None if it was started manually.
         profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
+        table: number of the table of roles; None: it listens to nobody with a certificate.
     """
 
     endpoints: tuple[str, ...] = ()
@@ -63,6 +65,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     launch: str | None = None
     profile: bool = False
     paused: bool = False
+    table: int | None = None
 
 
 class MasterServer:
@@ -110,6 +113,20 @@ class MasterServer:
             query.drop()
 
         self.serve(key, reply)
+
+    def greet(self, table: int) -> None:
+        """From now on a client with a certificate learns that the mesh is there, and which role it has.
+
+        The rules let it ask only for its own role; so an answer is all that it needs.
+        """
+        answer = msgspec.json.encode(Hello(self._keys.mesh, table))
+
+        def reply(key: str, query: zenoh.Query) -> None:
+            query.reply(key, answer, encoding=json_encoding)
+            query.drop()
+
+        for key in (self._keys.mesh_key("hello"), *map(self._keys.role, get_args(Role))):
+            self._entities.append(self._session.declare_queryable(key, partial(reply, key)))
 
     def watch(self, tokens: str, changed: Callable[[zenoh.Sample], None], *, of_run: bool = False) -> None:
         """From now on ``changed`` gets every change of these liveliness tokens; ``of_run`` as in `serve`."""

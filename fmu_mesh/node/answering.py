@@ -11,9 +11,11 @@ import socket
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Final
 
 import msgspec
 import zenoh
+from msgspec.structs import replace
 
 from ..errors import MessageRefused
 from ..system.live_keys import key_views
@@ -23,7 +25,7 @@ from ..variables.model_description import Value, Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import is_text
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, escape, unescape
+from ..wire.keys import BY, Keys, VariableKind, escape, unescape
 from ..wire.messages import SetValue, decode_json
 from ..wire.values import (
     NO_ORIGIN,
@@ -47,6 +49,9 @@ __all__ = ["Answers", "Job"]
 _ANSWER_S = 2.0
 _BEFORE_VALUES = ("waiting for the mesh", "initializing")
 """States of a node that has its FMUs and no values yet. A mesh can be running for others already."""
+
+_OLD_KINDS: Final[tuple[VariableKind, ...]] = ("in", "param")
+"""On the keys of such values they could be set, before there was a key for it; for two more minor versions."""
 
 _LOOKS = 3
 _MOST_WARNED = 100
@@ -94,6 +99,7 @@ class Answers:
         self._pending: list[_Pending] = []
         self._early: list[_Pending] = []
         self._without_time: set[str] = set()
+        self._old: set[str] = set()
 
     def begin(self) -> None:
         """On the main thread, at point 0: set the values that came before; the initialization is as without them."""
@@ -149,6 +155,12 @@ class Answers:
             self._post(partial(pending.finish, reply))
 
         self._inbox.post(read)
+
+    def setting_keys(self, name: str) -> tuple[str, ...]:
+        """The keys on which values for an instance are put."""
+        keys = self._keys
+        own = *(keys.variables(name, kind) for kind in _OLD_KINDS), keys.setting(name)
+        return tuple(f"{key}/**" for key in (*own, *([f"{own[-1]}/{BY}"] if self._plan.secured else ())))
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh: accept a value that was put; if it is refused, the reason is logged."""
@@ -216,7 +228,7 @@ class Answers:
             try:
                 for own, (name, value) in values.items():
                     step = set_input(runner, name, value, when)
-                    self._tell(SetValue(runner.name, name, to_plain(value), at, when, own, origin.who))
+                    self._tell(SetValue(runner.name, name, to_plain(value), at, when, own, origin.who, by))
             except ValueRefused as refused:
                 self._post(partial(refuse, str(refused)))
             else:
@@ -225,7 +237,7 @@ class Answers:
 
         key = str(sent.key_expr)
         try:
-            values, origin = self._checked_settings(runner, key, sent.payload, sent.attachment)
+            values, origin, by = self._checked_settings(runner, key, sent.payload, sent.attachment)
         except ValueRefused as refused:
             refuse(str(refused))
             return
@@ -248,15 +260,19 @@ class Answers:
 
     def _checked_settings(
         self, runner: Runner, key: str, payload: zenoh.ZBytes | None, attachment: zenoh.ZBytes | None
-    ) -> tuple[dict[str, tuple[str, Value]], Origin]:
-        """What arrived for one variable or several: by key, name and value; and when they hold and who sent them.
+    ) -> tuple[dict[str, tuple[str, Value]], Origin, str]:
+        """What arrived for one variable or several: by key, name and value; when they hold, who sent them, his name.
 
         Raises:
             ValueRefused: one of them is not allowed.
         """
         kind, *names = key.removeprefix(f"{self._keys.instance(runner.name)}/").split("/")
+        is_named = kind == "set" and names[:1] == [BY] and len(names) > 1
+        by, names = (names[1], names[2:]) if is_named else ("", names)
         if len(names) > 1 or "*" in key:
             raise ValueRefused(f"'{key}' is not the key of one variable")
+        if kind in _OLD_KINDS or bool(by) != self._plan.secured:
+            self._look_at_old_key(runner, key, kind, names)
         data = payload.to_bytes() if payload is not None else b""
         try:
             sent = {unescape(names[0]): data} if names else decode_json(data, dict[str, msgspec.Raw])
@@ -264,23 +280,39 @@ class Answers:
             raise ValueRefused(f"'{key}' takes an object with a value for each variable ({error})") from error
         values = {}
         for name, value in sent.items():
-            variable = self._settable(runner, kind, name)
+            variable = self._settable(runner, kind if kind != "set" else None, name)
             try:
                 own = decode_value(bytes(value), variable, finite=runner.plan.not_finite == "stop")
             except ValueRefused as refused:
                 raise ValueRefused(f"'{runner.name}.{name}': {refused}") from refused
             values[key if names else f"{key}/{escape(name)}"] = name, own
         try:
-            return values, decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN
+            return values, decode_origin(attachment.to_bytes()) if attachment is not None else NO_ORIGIN, by
         except ValueRefused as refused:
             raise ValueRefused(f"'{runner.name}.{', '.join(sent)}': {refused}") from refused
 
-    def _settable(self, runner: Runner, kind: str, name: str) -> Variable:
-        """A variable that may be set, by the part of the key space that it is in."""
+    def _look_at_old_key(self, runner: Runner, key: str, kind: str, names: list[str]) -> None:
+        """Say which key takes the place of an old one, or of one without a name.
+
+        Raises:
+            ValueRefused: the mesh has security, where only keys with a name set something.
+        """
+        new = replace(self._keys, by="NAME" if self._plan.secured else None)
+        new_key = new.setting(runner.name, *map(unescape, names))
+        if self._plan.secured:
+            raise ValueRefused(f"this mesh has security: '{new_key}' sets it, with your name, and not '{key}'")
+        if kind in _OLD_KINDS and key not in self._old and len(self._old) < _MOST_WARNED:
+            self._old.add(key)
+            text = f"'{key}' sets nothing from version 0.6 on: send to '{new_key}'"
+            self._log(LogLine(runner.name, "warning", "set", text, runner.point))
+
+    def _settable(self, runner: Runner, kind: str | None, name: str) -> Variable:
+        """A variable that may be set; for an old key, by the part of the key space that it is in."""
         variable = runner.instance.description.variable(name)
-        if variable is None or kind_of(variable) != kind:
+        if variable is None or (kind is not None and kind_of(variable) != kind):
             clock = runner.instance.description.clock(name)
-            raise ValueRefused(clock or f"'{runner.name}' has no variable '{name}' under '{kind}'")
+            under = f" under '{kind}'" if kind is not None else ""
+            raise ValueRefused(clock or f"'{runner.name}' has no variable '{name}'{under}")
         try:
             runner.plan.check_settable(variable)
         except ValueRefused as refused:

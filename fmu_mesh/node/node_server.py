@@ -20,7 +20,7 @@ from ..errors import FmuError
 from ..system.live_keys import KeyValue
 from ..system.plan import NodePlan
 from ..wire.inbox import Inbox
-from ..wire.keys import SUBSCRIBED, Keys
+from ..wire.keys import BY, SUBSCRIBED, Keys
 from ..wire.messages import SetValue, decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
@@ -121,8 +121,7 @@ class NodeServer:
             changed = partial(self._jobs.put, self._search)
             grid, declared = self._plan.grid, self._declared
             self._streams.append(InstanceStreams(runner, self._session, self._names, grid, changed, declared))
-            for root in (self._names.variables(runner.name, "in"), self._names.variables(runner.name, "param")):
-                key = f"{root}/**"  # of each variable, and of several at once
+            for key in self._answers.setting_keys(runner.name):
                 # On the thread that reads the link: what is put is a job before a query that came after it.
                 take = Callback(partial(self._answers.put_arrived, runner), indirect=False)
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
@@ -214,7 +213,8 @@ class NodeServer:
                 root = self._names.instance(name)
                 self._entities.append(session.liveliness().declare_token(root))
                 take = self._inbox.refusals.answering(partial(self._answer, name), self._jobs.put)
-                self._entities.append(session.declare_queryable(f"{root}/**", take))
+                for key in (f"{root}/**", *([f"{root}/set/{BY}/**"] if self._plan.secured else ())):
+                    self._entities.append(session.declare_queryable(key, take))
                 publisher = partial(session.declare_publisher, encoding=json_encoding)
                 # A log message must not be lost; the status is published again.
                 drop, block = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK

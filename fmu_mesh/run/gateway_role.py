@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec.structs import replace
+
 from ..errors import ConfigurationError, Interrupted
 from ..ros.gateway.gateway import Gateway
 from ..ros.gateway.link import RosLink, open_profiles, open_ros
@@ -16,6 +18,7 @@ from ..wire.session import Wiring, close_session, open_session
 from .events import Event, Reachable
 from .process import RunProcess
 from .run_plan import RunPlan
+from .wiring import certified, name_of
 
 __all__ = ["run_gateway"]
 
@@ -43,14 +46,16 @@ def run_gateway(run: RunPlan, emit: Callable[[Event], None]) -> None:
     with RunProcess(config.mesh, run.run) as process:
         stack = process.stack
         at, lease_s = _master_at(run, process), config.timeouts.link
-        client = Wiring(mode="client", connect=at, patience_s=patience_s, lease_s=lease_s)
+        keys, insecure = Keys(config.zenoh.key_prefix, config.mesh), config.zenoh.insecure
+        client = Wiring("client", connect=at, patience_s=patience_s, lease_s=lease_s, insecure=insecure)
+        client = certified(client, config.security, keys.root)
+        keys = replace(keys, by=name_of(client, config.security))
         # Two, because answers would queue behind the samples of a fast mesh.
         mesh, asking = open_session(client), open_session(client)
         stack.callback(close_session, mesh)
         stack.callback(close_session, asking)
         as_peer, ros = open_ros(section, process.folder)
         stack.callback(close_session, ros)
-        keys = Keys(config.zenoh.key_prefix, config.mesh)
         gateway = Gateway(ros_plan, mesh, keys, run.plan.grid)
         profiles = stack.enter_context(open_profiles(section, ros, ros_plan, asking, keys, gateway.settle))
         link = RosLink(section, ros, asking, keys, profiles, clock=ros_plan.clock_points is not None, as_peer=as_peer)

@@ -24,7 +24,6 @@ file of the run is left at the end.
 
 from __future__ import annotations
 
-import os
 import queue
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -38,7 +37,7 @@ from ..errors import Interrupted, MeshLost
 from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
-from ..wire.runtime import MeshNote, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
+from ..wire.runtime import remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
 from .child import Child, Process
 from .events import Event, OutputLine, Reachable, WasReset, decode_event
 from .fork_server import ForkServer, executed, fork_server
@@ -178,8 +177,7 @@ class Launcher:
             self._take_output(THE_MASTER, line)
             return
         if isinstance(event, Reachable):
-            prefix, file = self._run.loaded.config.zenoh.key_prefix, str(self._run.config_file)
-            write_note(self._folder, MeshNote(self._run.mesh, prefix, event.endpoints, os.getpid(), file))
+            write_note(self._folder, self._run.note(event.endpoints))
         elif isinstance(event, Outcome):
             self._files = event.files
         elif isinstance(event, WasReset):

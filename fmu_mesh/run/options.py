@@ -103,6 +103,12 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
     ] = None
     listen: Annotated[Sequence[str] | None, Option(None, "--listen", "ENDPOINT", "zenoh.listen")] = None
     connect: Annotated[Sequence[str] | None, Option(None, "--connect", "ENDPOINT", "zenoh.connect")] = None
+    security: Annotated[
+        File, Option("folder with the certificate of this host", "--security", "DIR/NAME", "security.folder")
+    ] = None
+    insecure: Annotated[
+        bool, Option("let everybody at a network read, set and end the mesh", "--insecure", key="zenoh.insecure")
+    ] = False
     paused: Annotated[bool, Option("stay paused at the first point", "--paused")] = False
     view: Annotated[bool, Option("show the world of the physics engine in a window", "--view")] = False
     video: Annotated[File, Option("film that world into a file, .mp4 or .gif", "--video", "FILE.mp4")] = None

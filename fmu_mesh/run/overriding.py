@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..config.access_sections import SECURITY_VARIABLE, given_folder, has_tls
 from ..config.call_options import option_fields
 from ..config.findings import Findings
 from ..config.loading import PlainConfig
@@ -42,9 +43,10 @@ def with_options(plain: PlainConfig, options: PlanOptions) -> PlainConfig:
     findings = Findings(str(plain.file), plain.lines, overrides := {**plain.overrides}, plain.findings, plain.origins)
     findings.explain(plain.explained)
     lines = plain.lines
-    for name, path, value in _replacements(options):
+    for name, path, value in (*_replacements(options), *_of_this_host(data, options)):
         named, keys, records = name == "config_values", path.split("."), data.get("record")
-        option, place = option_text(name, {path: value} if named else getattr(options, name)), path
+        option = option_text(name, {path: value} if named else getattr(options, name, value))
+        place = path
         if keys[0] == "record" and isinstance(records, list) and not named:
             # Of what stays in memory, or of variables that the option names, there is one section.
             others = records[1:] if isinstance(value, str) and not value.endswith(IN_MEMORY) else []
@@ -76,9 +78,20 @@ def _replacements(options: PlanOptions) -> Iterator[tuple[str, str, Any]]:
     keys = {name: field.key for name, field in option_fields(PlanOptions).items() if field.key is not None}
     for name, key in {"scenario": "scenario", "record": "record.variables", **keys}.items():
         value = getattr(options, name)
-        if value is not None and (name, value) != ("record", "memory"):
+        if value is not None and value is not False and (name, value) != ("record", "memory"):
             value = list(value) if isinstance(value, tuple) else value
             yield name, key, str(value.absolute()) if isinstance(value, Path) else value
+
+
+def _of_this_host(data: dict[str, Plain], options: PlanOptions) -> Iterator[tuple[str, str, Any]]:
+    """The folder of the certificate that this host has, where the configuration needs one."""
+    zenoh = own if isinstance(own := data.get("zenoh"), dict) else {}
+    given = options.listen, options.connect, zenoh.get("listen"), zenoh.get("connect")
+    ends = [str(end) for ends in given if isinstance(ends, list | tuple) for end in ends]
+    if options.security is None and (data.get("security") is not None or any(map(has_tls, ends))):
+        folder = given_folder(None)
+        if folder is not None and not (options.insecure or zenoh.get("insecure")):
+            yield SECURITY_VARIABLE, "security.folder", str(folder)
 
 
 def _problem(data: Plain, path: str, value: Plain) -> tuple[str, str, str | None] | None:

@@ -145,7 +145,10 @@ def planned(
     loaded, findings = examine_data(with_options(values, options), dict(options.start_values or {}))
     folder = loaded.file.absolute().parent  # paths become absolute where a section names other files than its model
     located = {name: section.located(folder) for name, section in loaded.config.instances.items()}
-    loaded = replace(loaded, config=replace(loaded.config, instances=located))
+    security = loaded.config.security
+    if security is not None:
+        security = replace(security, folder=str(folder / security.folder))
+    loaded = replace(loaded, config=replace(loaded.config, instances=located, security=security))
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
     check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
     obstacles = loaded.findings()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 from setproctitle import setproctitle
 
+from ..config.access_sections import is_socket
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
@@ -34,15 +34,15 @@ from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Stiff
 from ..wire.router_link import RouterLink
-from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
-from ..wire.session import Wiring, close_session, is_socket, open_session, own_endpoints
+from ..wire.runtime import fmu_folder, run_folder, write_note
+from ..wire.session import Wiring, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
-from .wiring import patient, wiring
+from .wiring import certified, patient, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
     from .preparing import KnownModels
@@ -130,9 +130,10 @@ class _NodeProcess:
         plan = run.plan
         process.cleans_up(self._remove_files)
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
-        publishes = f"{Keys(plan.key_prefix, plan.mesh).root}/**"
+        root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
-        own = replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
+        own = replace(patient(ends, plan.timeouts, is_node=True), publishes=f"{root}/**")
+        own = certified(own, run.security, root)
         session = open_session(own)
         process.stack.callback(close_session, session)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
@@ -250,6 +251,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
+            own = certified(own, config.security, Keys(config.zenoh.key_prefix, config.mesh).root, config.ends)
             runs = _MasterRuns(run, process, own)
             session = runs.session
             ends = own_endpoints(session, own) if zenoh.mode == "peer" else ()
@@ -260,6 +262,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 launch=process.launch,
                 profile=run.profile,
                 paused=run.paused,
+                table=table.number if (table := own.identity and own.identity.table) else None,
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())
@@ -268,10 +271,9 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         except FmuMeshError as error:  # before the first point, such as at a port that is in use
             emit(outcome_at(plan, 0, error=error))
             raise
-        endpoints, file = settings.endpoints, settings.config_file
         if not process.is_child:
-            write_note(process.folder, MeshNote(config.mesh, config.zenoh.key_prefix, endpoints, os.getpid(), file))
-        emit(Reachable(endpoints))
+            write_note(process.folder, run.note(settings.endpoints))
+        emit(Reachable(settings.endpoints))
         process.interruption.goes_to(master.interrupt)
         while True:
             recorder = failure = None
@@ -343,7 +345,7 @@ class _MasterRuns:
         if self._meeting is not None:
             self._meeting.close()
         at = self._process.folder, self._wiring, zenoh.rows_address
-        self._meeting = meeting_of(MASTER, *at) if zenoh.row_streams else None
+        self._meeting = meeting_of(MASTER, *at) if self._first.loaded.config.row_streams else None
         return self._meeting
 
     def recorder(self, master: Master) -> Recorder:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec.structs import replace
 
+from ..config.access_sections import SecurityConfig
 from ..config.loading import LoadedConfig
 from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError, UnknownName
@@ -24,6 +25,7 @@ from ..system.plan import RECORDER, NodePlan, Plan
 from ..system.start_values import why_not_settable
 from ..text import counted, did_you_mean, listed, meant, nearest, shown
 from ..variables.model_description import ModelDescription, Variable
+from ..wire.runtime import MeshNote
 from .limits import ring_problem
 
 __all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "numbered", "opening_in", "read_node", "read_run"]
@@ -59,6 +61,7 @@ class NodeRun(msgspec.Struct, frozen=True):
         showing: whether and how a physics engine shows its world.
         plan: the plan of the node.
         models: the models of its instances, by instance name.
+        security: the certificate of this host.
     """
 
     config_file: Path
@@ -67,6 +70,7 @@ class NodeRun(msgspec.Struct, frozen=True):
     showing: Showing
     plan: NodePlan
     models: Mapping[str, PlannedModel]
+    security: SecurityConfig | None = None
 
 
 class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,6 +128,19 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         own = self.loaded.config.zenoh
         return replace(own, mode="client") if self.run == MANUAL and own.connect and not listen else own
 
+    def note(self, endpoints: tuple[str, ...]) -> MeshNote:
+        """The note of this process about the mesh, for tools of this host."""
+        config = self.loaded.config
+        return MeshNote(
+            config.mesh,
+            config.zenoh.key_prefix,
+            endpoints,
+            os.getpid(),
+            str(self.config_file),
+            security=config.security.folder if config.security is not None else "",
+            insecure=config.zenoh.insecure,
+        )
+
     def check_memory(self) -> None:
         """Check that the rings between the processes of this run fit into the memory of this host.
 
@@ -155,6 +172,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 item.name: PlannedModel(plan.system.instances[item.name].description, self.contents[item.name])
                 for item in plan.nodes[name].instances
             },
+            security=self.loaded.config.security,
         )
 
     def variable(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:

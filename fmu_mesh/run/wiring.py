@@ -7,19 +7,21 @@ reach the master only at the endpoints of `zenoh.listen`.
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Iterable
 from pathlib import Path
 
 from msgspec.structs import replace
 
+from ..config.access_sections import SecurityConfig, is_socket
 from ..config.mesh import TimeoutsConfig, ZenohConfig
+from ..errors import ConfigurationError
 from ..files import beside
 from ..system.plan import MASTER
+from ..wire.keys import LOCAL
 from ..wire.runtime import socket_endpoint
-from ..wire.session import Wiring, host_of, is_socket
+from ..wire.session import Wiring
 
-__all__ = ["is_socket", "leaves_host", "patient", "wiring"]
+__all__ = ["certified", "name_of", "patient", "wiring"]
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
@@ -34,7 +36,7 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
     """
     base = beside(config_file, config.config) if config.config is not None else None
     if config.mode == "client":
-        return Wiring(mode="client", connect=tuple(config.connect), config=base)
+        return Wiring(mode="client", connect=tuple(config.connect), config=base, insecure=config.insecure)
     listen = [socket_endpoint(folder, process)]
     sockets = []
     if process == MASTER:
@@ -52,7 +54,38 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         # Processes of one host start at the same time, so one of two that connect is not there yet. Each waits for the
         # others later: it registers, and says hello.
         waits=bool(config.connect),
+        insecure=config.insecure,
     )
+
+
+def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tuple[str, ...] = ()) -> Wiring:
+    """The wiring of a process of a run with the certificate of this host, if it goes beyond the sockets of its user.
+
+    Args:
+        made: the wiring.
+        security: the section, whose folder is absolute.
+        root: prefix and name of the mesh.
+        ends: the keys of other programs at ends of its connections.
+
+    Raises:
+        ConfigurationError: the certificate cannot be used, or not for this.
+    """
+    if security is None or all(map(is_socket, (*made.listen, *made.connect))):
+        return made
+    from ..wire.security.certificates import identity_in  # noqa: PLC0415  most runs have no certificate
+
+    own = identity_in(Path(security.folder), security.roles or None)
+    if own.role != "node":
+        text = f"'{own.name}' of '{security.folder}' is {own.role}, and who runs a mesh at a network has the role node"
+        raise ConfigurationError(text, hint="Each host has a certificate of its own: `security add ... --role node`.")
+    return replace(made, identity=own, root=root, ends=ends)
+
+
+def name_of(made: Wiring, security: SecurityConfig | None) -> str | None:
+    """In whose name a process of a run sets values and gives commands; None: it needs none."""
+    if made.identity is not None:
+        return made.identity.name
+    return LOCAL if security is not None else None
 
 
 def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
@@ -66,12 +99,3 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
     lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
     waits = is_node or not all(map(is_socket, (*made.listen, *made.connect)))
     return replace(made, lease_s=lease_s, stuck_s=lease_s if waits else made.stuck_s)
-
-
-def leaves_host(endpoint: str) -> bool:
-    """Whether other hosts can connect to a process that listens at this endpoint."""
-    host = host_of(endpoint)
-    try:
-        return not ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return not is_socket(endpoint) and host != "localhost"

@@ -142,6 +142,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shared_memory: whether processes of one host exchange messages through shared memory.
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder.
+        secured: whether those who set values have names.
     """
 
     mesh: str
@@ -167,6 +168,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shared_memory: bool = True
     row_streams: bool = True
     restarts: int = 0
+    secured: bool = False
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -340,7 +342,8 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             records=system.records if node == RECORDER else (),
             limits=config.limits,
             shared_memory=config.zenoh.shared_memory,
-            row_streams=config.zenoh.row_streams,
+            row_streams=config.row_streams,
+            secured=config.security is not None,
         )
     return nodes
 

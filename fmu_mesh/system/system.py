@@ -16,6 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh import files
+from fmu_mesh.config.access_sections import check_access
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.key_sections import KEY, KeyView
@@ -197,6 +198,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     timed = {(name, timeout.variable) for name, own in timeouts.items() for timeout in own}
     prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)
     _check_zenoh(loaded, collected)
+    doors = check_access(loaded, collected)
     if len(collected):
         collected.merge(obstacles or ())
         execution_order([*instances], connections, config.simulation.algorithm, collected)  # for its findings
@@ -229,7 +231,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     warnings.merge(prescribed.warnings)
     _doubts(config, descriptions, warnings)
     record_warnings(loaded, variables, records, warnings)
-    all_warnings = (*loaded.warnings, *warnings)
+    all_warnings = (*doors, *loaded.warnings, *warnings)
     return ResolvedSystem(config, grid, instances, connections, records, all_warnings, prescribed.files)
 
 

@@ -11,7 +11,7 @@ import msgspec
 
 from ..system.memory_map import MASTER, RECORDER
 
-__all__ = ["RUN_ID_BYTES", "SUBSCRIBED", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
+__all__ = ["BY", "LOCAL", "RUN_ID_BYTES", "SUBSCRIBED", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
@@ -21,6 +21,13 @@ _GRANT_CHUNKS = 16
 
 SUBSCRIBED = "subscribed"
 """Parameter of a query for a status: the node first finds what its sender has subscribed to."""
+
+BY = "@by"
+"""The chunk before the name of who sets or commands, where there is security. A rule lets each name use its own keys;
+wildcards do not match such a chunk."""
+
+LOCAL = "local"
+"""Who comes by the Unix socket of a mesh: an operator and node that no certificate can name."""
 
 RUN_ID_BYTES = 8
 """Hexadecimal digits of a run's id. So the id never begins with `@`: wildcards do not match such a chunk."""
@@ -37,10 +44,15 @@ def unescape(chunk: str) -> str:
 
 
 class Keys(msgspec.Struct, frozen=True):
-    """The public keys of one mesh, and the beginning of its internal keys; all begin with ``prefix``."""
+    """The public keys of one mesh, and the beginning of its internal keys; all begin with ``prefix``.
+
+    Attributes:
+        by: who uses them, in a mesh with security: the name in the keys on which it sets and commands.
+    """
 
     prefix: str
     mesh: str
+    by: str | None = None
 
     @property
     def root(self) -> str:
@@ -56,12 +68,28 @@ class Keys(msgspec.Struct, frozen=True):
         return f"{self.variables(instance, kind)}/{escape(variable)}"
 
     def variables(self, instance: str, kind: VariableKind) -> str:
-        """Key on which several variables of an instance are set at one point; their own keys begin with it."""
+        """What the keys of the variables of one kind begin with."""
         return f"{self.root}/{instance}/{kind}"
 
-    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros"]) -> str:
+    def setting(self, instance: str, variable: str | None = None) -> str:
+        """Key on which a variable is set, or without it several at one point."""
+        return self._by(f"{self.root}/{instance}/set") + (f"/{escape(variable)}" if variable is not None else "")
+
+    @property
+    def command(self) -> str:
+        """Key on which the master takes commands."""
+        return self._by(self.mesh_key("command"))
+
+    def _by(self, key: str) -> str:
+        return f"{key}/{BY}/{self.by}" if self.by is not None else key
+
+    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros", "audit", "hello"]) -> str:
         """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
+
+    def role(self, role: str) -> str:
+        """A queryable of the master that the rules let only one role ask."""
+        return f"{self.root}/mesh/role/{role}"
 
     @property
     def master(self) -> str:

@@ -86,7 +86,7 @@ class NodeReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     secret: str = ""
 
 
-class SetValue(msgspec.Struct, frozen=True):
+class SetValue(msgspec.Struct, frozen=True, omit_defaults=True):
     """A value that another program gave to an input or a parameter while the mesh ran.
 
     Attributes:
@@ -94,6 +94,7 @@ class SetValue(msgspec.Struct, frozen=True):
         time: simulation time in s from which on it holds; None: from `point` on.
         key: the Zenoh key under which it was sent.
         who: who sent it, as the sender says: user, host, program and process id, or `ros` and the topic.
+        by: in a mesh with security, the name of who sent it; nobody can send with another one.
     """
 
     instance: str
@@ -103,6 +104,7 @@ class SetValue(msgspec.Struct, frozen=True):
     time: float | None
     key: str
     who: str
+    by: str = ""
 
 
 class Stiff(msgspec.Struct, frozen=True):

@@ -77,6 +77,8 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         endpoints: Zenoh endpoints where the master can be reached, the socket of this user first.
         pid: the process of the note: the launcher, or a master that was started manually.
         host: where it runs; other hosts may share the folder.
+        security: folder of its certificate, where it can only be reached at a network; empty: it has none.
+        insecure: whether its network may have no TLS.
     """
 
     mesh: str
@@ -85,6 +87,8 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     config: str
     host: str = ""
+    security: str = ""
+    insecure: bool = False
 
 
 def runtime_folder() -> Path:

@@ -8,19 +8,24 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import zenoh
+from msgspec.structs import replace
 from zenoh.handlers import Callback
 
+from ..config.access_sections import host_of, is_socket, why_closed
 from ..errors import ConfigurationError, DeadlineExceeded, MeshLost
 from .values import json_encoding
+
+if TYPE_CHECKING:  # most processes have no certificate
+    from .security.identity import Identity
 
 __all__ = [
     "LEASE_S",
@@ -30,7 +35,7 @@ __all__ = [
     "answers",
     "ask",
     "close_session",
-    "is_socket",
+    "is_of_this_host",
     "matches",
     "open_session",
     "own_endpoints",
@@ -109,6 +114,10 @@ class Wiring(msgspec.Struct, frozen=True):
         waits: whether opening the session waits, half a second at most, for the processes that it connects to.
         timestamps: whether samples have timestamps; Zenoh keeps samples for who subscribes later only with them.
         publishes: key expression of many publishers that are declared and undeclared without a message on a link.
+        insecure: whether endpoints at a network may have no TLS, because the user says so.
+        identity: the certificate that links with TLS have, and the roles of others; None: there are none.
+        root: prefix and name of the mesh for which the roles count, with `*` for any.
+        ends: keys beside those of the mesh that operators may read and write.
     """
 
     mode: str = "peer"
@@ -122,22 +131,15 @@ class Wiring(msgspec.Struct, frozen=True):
     stuck_s: float = _STUCK_S
     publishes: str | None = None
     timestamps: bool = False
+    insecure: bool = False
+    identity: Identity | None = None
+    root: str = ""
+    ends: tuple[str, ...] = ()
 
     @property
     def asks_itself(self) -> bool:
         """Whether it listens at addresses of which only the session knows all: a port 0, or all that a host has."""
         return not all(map(is_socket, self.listen))
-
-
-def is_socket(endpoint: str) -> bool:
-    """Whether an endpoint is a Unix socket, which is protected by the permissions of its folder."""
-    return endpoint.startswith("unixsock-stream/")
-
-
-def host_of(endpoint: str) -> str:
-    """The address or the name of the host in an endpoint of a network."""
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    return address.rpartition(":")[0].strip("[]")
 
 
 def is_of_this_host(endpoint: str) -> bool:
@@ -156,8 +158,20 @@ def open_session(wiring: Wiring) -> zenoh.Session:
     """Open a session.
 
     Raises:
-        ConfigurationError: an endpoint or the configuration file cannot be used.
+        ConfigurationError: an endpoint or the configuration file cannot be used, or an endpoint and this process do
+            not take the certificate of each other.
+        MeshLost: a client has a certificate, and nobody listens.
     """
+    for endpoint in (*wiring.listen, *wiring.connect):
+        secured, own_settings = wiring.identity is not None, wiring.config is not None
+        closed = why_closed(endpoint, secured=secured, insecure=wiring.insecure, own_settings=own_settings)
+        if closed is not None:
+            raise ConfigurationError(closed[0], hint=f"Expected {closed[1]}.")
+    if wiring.identity is not None:
+        from .security.handshake import shake_hands  # noqa: PLC0415  most processes have no certificate
+
+        is_client, patience_s = wiring.mode == "client", wiring.patience_s if wiring.waits else 0.0
+        shake_hands(wiring.connect, wiring.identity, patience_s if is_client else None)
     zenoh.init_log_from_env_or("error")
     try:
         return zenoh.open(_configuration(wiring))
@@ -219,11 +233,34 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
     }
     if wiring.timestamps:
         settings["timestamping/enabled"] = True
-    if wiring.asks_itself and json.loads(config.get_json("access_control/enabled")) is not True:
+    if (own := wiring.identity) is not None:
+        settings["transport/link/tls"] = {
+            "root_ca_certificate": str(own.ca),
+            "enable_mtls": True,
+            "connect_certificate": str(own.certificate),
+            "connect_private_key": str(own.key),
+            "listen_certificate": str(own.certificate),
+            "listen_private_key": str(own.key),
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+    if own is not None and wiring.asks_itself:
+        settings |= _rules(own, wiring)
+    elif wiring.asks_itself and json.loads(config.get_json("access_control/enabled")) is not True:
         settings["access_control"] = _ADMIN_SPACE_IS_OURS
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _rules(own: Identity, wiring: Wiring) -> dict[str, Any]:
+    """What Zenoh lets others do who come by a network: the place of all rules and limits for them."""
+    from .security.rules import access_control  # noqa: PLC0415  as above
+
+    if own.table is None:
+        text = f"'{own.name}' cannot listen: there are no roles in '{own.folder}'"
+        raise ConfigurationError(text, hint="`security.roles` in the file, or roles.json in the folder, has them.")
+    return {"access_control": access_control(wiring.root, own.table.roles, wiring.ends)}
 
 
 def close_session(session: zenoh.Session) -> None:
@@ -381,14 +418,14 @@ def _collected(
 
 
 @contextmanager
-def run_router(listen: Sequence[str]) -> Iterator[tuple[str, ...]]:
+def run_router(wiring: Wiring) -> Iterator[tuple[str, ...]]:
     """Run a Zenoh router in this process, for a host without `zenohd`; yields the endpoints on which it listens.
 
     Raises:
         ConfigurationError: an endpoint cannot be used.
     """
     # Peers that connect to it, such as ROS nodes, find each other here and connect directly; it does not route.
-    wiring = Wiring(mode="router", listen=tuple(listen), gossip=True, stuck_s=LEASE_S)
+    wiring = replace(wiring, mode="router", gossip=True, stuck_s=LEASE_S)
     session = open_session(wiring)
     try:
         yield own_endpoints(session, wiring)

@@ -19,6 +19,7 @@ __all__ = [
     "Command",
     "CommandAnswer",
     "ConnectionView",
+    "Hello",
     "InstanceInfo",
     "InstanceStatus",
     "KeyStatus",
@@ -261,6 +262,17 @@ class MeshInfo(msgspec.Struct, frozen=True):
     def is_here(self) -> bool:
         """Whether the master runs on this host, so that its paths are those of this process."""
         return self.host_id == this_host()
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """Answer of `…/mesh/hello` and `…/mesh/role/<role>`, in a mesh with `security`.
+
+    Attributes:
+        table: number of the table of roles that its master has.
+    """
+
+    mesh: str
+    table: int
 
 
 class MeshStatus(msgspec.Struct, frozen=True):

@@ -74,7 +74,7 @@ def test_values_set_at_any_moment_are_set_again_at_the_same_points(folder: Path)
         ("fast.k", "NaN", 107, None),
         ("fast.k", 4.0, 107, None),
     ]
-    assert noted[2]["key"] == "fmu_mesh/steered/slow/in/u"
+    assert noted[2]["key"] == "fmu_mesh/steered/slow/set/u"
     assert f"(pid {os.getpid()})" in noted[0]["who"]
     about = ("point", "instance", "variable", "value", "time")
     assert [[one[name] for name in about] for one in metadata_of(again.file)["set"]] == [
@@ -119,7 +119,7 @@ def test_what_a_killed_run_has_kept_is_run_again(place: Place, folder: Path, win
 def test_a_value_of_an_unknown_program_is_noted_under_its_key(place: Place, folder: Path) -> None:
     with steered(folder).start(paused=True) as run:
         with place.session() as session:
-            publisher = session.declare_publisher("fmu_mesh/steered/fast/in/u")
+            publisher = session.declare_publisher("fmu_mesh/steered/fast/set/u")
             wait_until(lambda: matches(publisher), "the subscriber of the node")
             publisher.put("5.5")
             publisher.put("6.5", attachment='{"who": "joystick"}')
@@ -129,8 +129,8 @@ def test_a_value_of_an_unknown_program_is_noted_under_its_key(place: Place, fold
 
     noted = metadata_of(folder / "first.csv")["set"]
     assert [(one["value"], one["who"], one["key"]) for one in noted] == [
-        (5.5, "unknown", "fmu_mesh/steered/fast/in/u"),
-        (6.5, "joystick", "fmu_mesh/steered/fast/in/u"),
+        (5.5, "unknown", "fmu_mesh/steered/fast/set/u"),
+        (6.5, "joystick", "fmu_mesh/steered/fast/set/u"),
     ]
 
 

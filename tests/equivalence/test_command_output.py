@@ -264,9 +264,9 @@ def test_a_log_is_followed_to_the_end_of_the_mesh(place: Place) -> None:
     assert place.run("wait").wait() == 0
     follower = place.start("logs", "-f", "--json", "--instance", "delay")
     with place.session() as session:
-        session.put("fmu_mesh/pair/delay/in/x", "1")
+        session.put("fmu_mesh/pair/delay/set/x", "1")
         wait_until(lambda: follower.output, "the first message")
-        session.put("fmu_mesh/pair/delay/in/x", "2")
+        session.put("fmu_mesh/pair/delay/set/x", "2")
         wait_until(lambda: follower.output.count("\n") == 2, "the second message")
 
     place.run("stop")

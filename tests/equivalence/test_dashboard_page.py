@@ -254,7 +254,7 @@ def test_a_refusal_is_shown_and_the_log_as_well(place: Place) -> None:
     dashboard = Dashboard(place)
     place.run("wait", "drive")
     with place.session() as session:
-        session.put("fmu_mesh/drive/gain/in/u", "1.0")  # without an answer: only the log says why it is refused
+        session.put("fmu_mesh/drive/gain/set/u", "1.0")  # without an answer: only the log says why it is refused
 
     with browser(place.folder) as page:
         _open(page, dashboard.url)

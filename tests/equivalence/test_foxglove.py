@@ -213,11 +213,11 @@ def test_log_messages_are_shown_also_those_from_before(place: Place) -> None:
 
     with FoxgloveClient(url) as client, place.session() as session:
         client.until(lambda: "/delay/y" in client.channels, "the topics")
-        session.put("fmu_mesh/pair/delay/in/x", "1.0")
+        session.put("fmu_mesh/pair/delay/set/x", "1.0")
         wait_until(lambda: "is connected to" in place.run("logs", "pair").output, "the message in the log")
         client.subscribe("/log")
         client.until(lambda: client.messages["/log"], "the message from before")
-        session.put("fmu_mesh/pair/delay/in/x", "1.0")
+        session.put("fmu_mesh/pair/delay/set/x", "1.0")
         client.until(lambda: len(client.messages["/log"]) == 2, "the next message")
 
     assert client.channels["/log"]["schemaName"] == "foxglove.Log"

@@ -32,7 +32,7 @@ def test_inputs_follow_their_time_stamps_and_run_ends_at_its_stop_time(place: Pl
     with place.session() as session:
         ask(session, "fmu_mesh/amplifier/mesh/command", {"command": "pause"})
         for time, value in ((300.0, 1.0), (302.0, 5.0), (303.0, 5.0), (301.0, 3.0)):
-            answer = ask(session, f"{root}/in/u", value, json.dumps({"time": time}))
+            answer = ask(session, f"{root}/set/u", value, json.dumps({"time": time}))
             assert answer["time"] == time
         ask(session, "fmu_mesh/amplifier/mesh/command", {"command": "resume"})
 
@@ -63,7 +63,7 @@ def test_an_input_of_a_mesh_holds_from_its_time_for_all_instances(place: Place, 
     process = place.start("launch", config, "--paused", "--window", window, "--no-progress")
     with place.session() as session:
         for time, value in ((0.5, 3.0), (0.25, 2.0), (0.9, 4.0)):
-            answer = ask(session, "fmu_mesh/pair/free/in/u", value, json.dumps({"time": time}))
+            answer = ask(session, "fmu_mesh/pair/free/set/u", value, json.dumps({"time": time}))
             assert answer["time"] == time
         ask(session, "fmu_mesh/pair/mesh/command", {"command": "resume"})
 

@@ -332,7 +332,7 @@ def test_a_sender_that_stops_ends_a_run_without_a_stop_time(place: Place) -> Non
         points: list[int] = []
 
         def sent() -> bool:
-            replies = session.get("fmu_mesh/free/gain/in/u", payload=str(float(len(points))))
+            replies = session.get("fmu_mesh/free/gain/set/u", payload=str(float(len(points))))
             points.extend(json.loads(reply.ok.payload.to_bytes())["point"] for reply in replies if reply.ok is not None)
             return len(points) > 20 and points[-1] > 30
 

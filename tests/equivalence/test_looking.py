@@ -287,7 +287,7 @@ def test_a_short_key_names_the_mesh_in_front(call: Call) -> None:
 
     short = ("looked_at/pendulum.der(a,2)", "looked_at/*.der(a,2)", "looked_at/pendulum/out/der(a,2)")
     assert {key_of(reference) for reference in short} == {f"{ROOT}/pendulum/out/der(a,2)"}
-    assert call("set", "looked_at/free.u", "0.75")[1].startswith(f"{ROOT}/free/in/u holds from point ")
+    assert call("set", "looked_at/free.u", "0.75")[1].startswith(f"{ROOT}/free/set/u holds from point ")
     assert len(call("watch", "looked_at/gain.y", "--count", "2")[1].splitlines()) == 2
 
     code, _, err = call("get", "loked_at/gain.y")
@@ -298,7 +298,7 @@ def test_log_messages_from_before_are_shown_and_chosen_by_instance_and_level(
     call: Call, session: zenoh.Session
 ) -> None:
     refused = Samples(session, f"{ROOT}/mesh/log")
-    for key in ("gain/in/u", "gain/in/u", "pendulum/param/l"):
+    for key in ("gain/set/u", "gain/set/u", "pendulum/set/l"):
         session.put(f"{ROOT}/{key}", "1")
     told = [json.loads(refused.until(lambda _: True).payload.to_bytes()) for _ in range(3)]
 
@@ -316,7 +316,7 @@ def test_log_messages_from_before_are_shown_and_chosen_by_instance_and_level(
 def test_of_a_long_log_the_newest_messages_are_kept(call: Call, session: zenoh.Session) -> None:
     published = Samples(session, f"{ROOT}/mesh/log")
     for _ in range(1100):
-        session.put(f"{ROOT}/gain/in/u", "1")
+        session.put(f"{ROOT}/gain/set/u", "1")
     first = json.loads(published.until(lambda _: True).payload.to_bytes())["number"]
     published.until(lambda sample: json.loads(sample.payload.to_bytes())["number"] >= first + 1099)
 
@@ -569,19 +569,35 @@ def test_tokens_tell_who_is_there(session: zenoh.Session) -> None:
 
 
 def test_a_put_on_an_input_and_on_a_parameter_takes_effect(session: zenoh.Session) -> None:
-    for key, value in ((f"{ROOT}/free/in/u", 0.5), (f"{ROOT}/gain/param/k", 4.25)):
-        samples = Samples(session, key)
-        session.put(key, json.dumps(value))
-        # What others put on the key has no attachment; what the instance says has one.
+    for key, shown, value in (("free/set/u", "free/in/u", 0.5), ("gain/set/k", "gain/param/k", 4.25)):
+        samples = Samples(session, f"{ROOT}/{shown}")
+        session.put(f"{ROOT}/{key}", json.dumps(value))
         for sample in samples:
-            if sample.attachment is not None and stamped(sample)[2] == value:
+            if stamped(sample)[2] == value:
                 break
+
+
+def test_an_old_key_still_sets_and_is_warned_of_once(session: zenoh.Session) -> None:
+    lines, samples = Samples(session, f"{ROOT}/free/log"), Samples(session, f"{ROOT}/free/in/u")
+    for value in (0.125, 0.25):
+        session.put(f"{ROOT}/free/in/u", json.dumps(value))
+    ask_one(session, f"{ROOT}/free/in/u", "0.375")
+    # What others put on the key has no attachment; what the instance says has one.
+    samples.until(lambda sample: sample.attachment is not None and stamped(sample)[2] == 0.375)
+    session.put(f"{ROOT}/free/in", '{"u": 0.5}')
+    samples.until(lambda sample: sample.attachment is not None and stamped(sample)[2] == 0.5)
+
+    told = [json.loads(next(iter(lines)).payload.to_bytes())["message"] for _ in range(2)]
+    assert told == [
+        f"'{ROOT}/free/in/u' sets nothing from version 0.6 on: send to '{ROOT}/free/set/u'",
+        f"'{ROOT}/free/in' sets nothing from version 0.6 on: send to '{ROOT}/free/set'",
+    ]
 
 
 def test_a_value_that_was_put_changes_the_outputs(session: zenoh.Session) -> None:
     outputs = Samples(session, f"{ROOT}/free/out/y")
-    point = ask_one(session, f"{ROOT}/free/in/u", "2.0")["point"]
-    ask_one(session, f"{ROOT}/free/param/k", "1.0")
+    point = ask_one(session, f"{ROOT}/free/set/u", "2.0")["point"]
+    ask_one(session, f"{ROOT}/free/set/k", "1.0")
 
     values = iter(outputs)
     before = next(value for at, _, value in map(stamped, values) if at > point + 5)
@@ -592,15 +608,19 @@ def test_a_value_that_was_put_changes_the_outputs(session: zenoh.Session) -> Non
 @pytest.mark.parametrize(
     ("key", "payload", "reason"),
     [
-        ("gain/in/u", "1", "is connected to 'pendulum'"),
-        ("pendulum/param/l", "1", "is a fixed parameter"),
+        ("gain/set/u", "1", "is connected to 'pendulum'"),
+        ("pendulum/set/l", "1", "is a fixed parameter"),
+        ("gain/set/y", "1", "is no input and no parameter"),
         ("gain/out/y", "1", "is no input and no parameter"),
-        ("gain/param/k", '"a"', "is no Real value"),
-        ("gain/param/k", "1 2", "it is no JSON value"),
+        ("gain/set/k", '"a"', "is no Real value"),
+        ("gain/set/k", "1 2", "it is no JSON value"),
+        ("gain/set/z", "1", "has no variable 'z'"),
         ("gain/param/z", "1", "has no variable 'z' under 'param'"),
-        ("gain/param/*", "1", "is not the key of one variable"),
-        ("gain/param", "[1]", "takes an object with a value for each variable"),
-        ("gain/in", '{"u": 1}', "is connected to 'pendulum'"),
+        ("gain/set/*", "1", "is not the key of one variable"),
+        ("gain/set", "[1]", "takes an object with a value for each variable"),
+        ("gain/set", '{"u": 1}', "is connected to 'pendulum'"),
+        ("free/set", '{"u": 1, "v": 2}', "has no variable 'v'"),
+        ("free/in", '{"u": 1, "k": 2}', "has no variable 'k' under 'in'"),
         ("free/in", '{"u": 1, "v": 2}', "has no variable 'v' under 'in'"),
     ],
 )
@@ -615,7 +635,7 @@ def test_a_refused_query_is_answered_with_the_reason(
 def test_a_refused_put_is_in_the_log(session: zenoh.Session) -> None:
     lines = Samples(session, f"{ROOT}/gain/log")
     ask_one(session, f"{ROOT}/gain/status")
-    session.put(f"{ROOT}/gain/in/u", "1.0")
+    session.put(f"{ROOT}/gain/set/u", "1.0")
     line = json.loads(next(iter(lines)).payload.to_bytes())
     assert (line["instance"], line["status"], line["category"]) == ("gain", "warning", "set")
     assert "is connected to 'pendulum'" in line["message"]

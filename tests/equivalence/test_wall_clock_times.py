@@ -39,7 +39,7 @@ def test_a_stream_with_unix_times_takes_effect_at_once_with_one_warning(stop_tim
         for sent in (2.0, 3.0):
             stamp = json.dumps({"time": NOW + sent, "who": "ros /cmd"})
             for instance in ("gain", "slow"):
-                session.put(f"fmu_mesh/free/{instance}/in/u", str(sent), attachment=stamp)
+                session.put(f"fmu_mesh/free/{instance}/set/u", str(sent), attachment=stamp)
             shown(sent)
     assert place.run("stop", "free").wait() == 0
     launched.wait()

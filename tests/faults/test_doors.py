@@ -16,8 +16,8 @@ import psutil
 import pytest
 import zenoh
 
+from fmu_mesh.config.access_sections import leaves_host
 from fmu_mesh.errors import ConfigurationError
-from fmu_mesh.run.wiring import leaves_host
 from fmu_mesh.wire.runtime import run_folder, runtime_folder
 from tests.helpers import Launched, Place, row_count, wait_until, write_config
 

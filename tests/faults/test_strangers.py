@@ -130,7 +130,7 @@ def test_the_messages_that_once_ended_run_are_refused_and_it_goes_on(place: Plac
         ):
             for payload in (b"", b"\xff", b"{}", b"[" * 3000, b'{"node":"left"}'):
                 assert stranger.ask(key, payload), key
-        stranger.put(public.variable("free", "in", "u"), b"1.0", b'{"time":"soon"}')
+        stranger.put(public.setting("free", "u"), b"1.0", b'{"time":"soon"}')
         stranger.put(f"{public.root}/left/log", b'{"instance":"\xff"}')
         stranger.put(f"{public.root}/left/log", b"\xff" * 100)
         for key in (keys.frames("left", "right"), keys.frames("right", "@record"), keys.progress("left")):
@@ -156,7 +156,10 @@ def keys_of(stranger: Stranger) -> list[str]:
     of_nodes = [key(node) for key in (keys.node, keys.ready, keys.report, keys.hello, keys.progress) for node in nodes]
     frames = [keys.frames(source, target) for source in ("left", "right") for target in nodes]
     views = [public.mesh_key(what) for what in ("info", "status", "plan", "command")]
-    of_left = [f"{public.root}/left/{what}" for what in ("info", "status", "log", "out/y", "in/u", "param/k", "in/no")]
+    of_left = [
+        f"{public.root}/left/{what}"
+        for what in ("info", "status", "log", "out/y", "set/u", "set/k", "set", "in/u", "param/k")
+    ]
     return [public.register, keys.master, *of_nodes, *frames, *keys.grants(nodes).values(), *views, *of_left]
 
 

@@ -176,15 +176,15 @@ def test_nothing_sets_or_stops_a_mesh_through_the_filter(place: Place, kept: str
     mesh = place.start("launch", config, "--no-progress", "--real-time-factor", "1", "--listen", endpoint)
     with running_bridge(place, ports, text if is_filtered else text.replace(FILTER, "")) as bridge:
         wait_until(lambda: "ready" in bridge.output, "the link of the bridge")
-        key = "fmu_mesh/pair/gain/in/u"
-        wait_until(lambda: ended(place, ports.curl(key)).output != "[]", "the mesh, by HTTP")
+        key, shown = "fmu_mesh/pair/gain/set/u", "fmu_mesh/pair/gain/in/u"
+        wait_until(lambda: ended(place, ports.curl(shown)).output != "[]", "the mesh, by HTTP")
 
         ended(place, ports.curl(f"{key}?_raw", "-X", "POST", *JSON, "-d", "2.5"))
-        by_post = json.loads(ended(place, ports.curl(key)).output)[0]["value"]
+        by_post = json.loads(ended(place, ports.curl(shown)).output)[0]["value"]
         ended(place, ports.publish(key, "-q", "1", "-m", "3.5"))
         ended(place, ports.publish("fmu_mesh/pair/mesh/command", "-q", "1", "-m", '{"command": "stop"}'))
         # The answer comes after all that was sent before by the same link.
-        by_topic = json.loads(ended(place, ports.curl(key)).output or "[]")
+        by_topic = json.loads(ended(place, ports.curl(shown)).output or "[]")
         stop = json.dumps({"command": "stop"})
         ended(place, ports.curl("fmu_mesh/pair/mesh/command", "-X", "POST", *JSON, "-d", stop))
         state = ended(place, ports.curl("fmu_mesh/pair/mesh/status")).output

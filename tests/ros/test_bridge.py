@@ -68,7 +68,7 @@ def test_a_thousand_samples_each_way_arrive_with_their_values_and_stamps(place: 
 
     with Peer("rclpy_peer.py", orders) as peer:
         mesh = place.start("launch", config, "--no-progress")
-        with _puts(place, "fmu_mesh/lab/*/in/u") as puts:
+        with _puts(place, "fmu_mesh/lab/*/set/u") as puts:
             peer.answer(0, 60.0)
             found = peer.answer(1, 60.0)
             wait_until(lambda: {len(values) for values in puts.values()} == {COUNT}, "every message as a setting")
@@ -79,8 +79,8 @@ def test_a_thousand_samples_each_way_arrive_with_their_values_and_stamps(place: 
     rows = rows_of(place.folder / "lab.csv")
 
     _assert_outputs(found["received"], rows)
-    assert puts["fmu_mesh/lab/gain/in/u"] == [0.1 * number for number in range(1, COUNT + 1)]
-    assert puts["fmu_mesh/lab/held/in/u"] == [0.5 * number for number in range(1, COUNT + 1)]
+    assert puts["fmu_mesh/lab/gain/set/u"] == [0.1 * number for number in range(1, COUNT + 1)]
+    assert puts["fmu_mesh/lab/held/set/u"] == [0.5 * number for number in range(1, COUNT + 1)]
     assert rows[-1][4] == 0.1 * COUNT
     _assert_never_early([row[0] for row in rows], [row[5] for row in rows], found["stamps"])
     assert {topic: found["graph"][topic] for topic in ("/angle", "/state", "/command", "/held", "/clock")} == {

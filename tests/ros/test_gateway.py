@@ -425,7 +425,7 @@ def test_commands_go_to_their_joints_in_any_order_and_none_is_lost(place: Place,
     wait_until(lambda: newest() == (["weak", "bare"], [0.5, -0.5]), "both commands at their joints")
     send(["bare", "weak"], [-0.25, 0.25])
     wait_until(lambda: newest() == (["weak", "bare"], [0.25, -0.25]), "both in the other order")
-    with place.session() as session, session.declare_subscriber("fmu_mesh/lab/*/in/u", keep):
+    with place.session() as session, session.declare_subscriber("fmu_mesh/lab/*/set/u", keep):
         wait_until(subscribed, "a subscriber that the gateway knows")
         for number in range(1, COMMANDS + 1):
             own = {"weak": float(number), "bare": -float(number), "stranger": 0.0}

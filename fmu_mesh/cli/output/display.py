@@ -9,12 +9,12 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
+from ...config.access_sections import is_socket
 from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
 from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status, WasReset
 from ...run.outcome import Outcome
-from ...run.wiring import is_socket, leaves_host
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
@@ -78,7 +78,6 @@ class Display:
         match event:
             case Reachable(endpoints):
                 self._endpoints = endpoints if not self._quiet else ()
-                self._warn()
                 if not self._waits_for_nodes:
                     self._show_address()
                 elif self._endpoints:
@@ -103,13 +102,6 @@ class Display:
         if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
             self._print(f"mesh '{self._plan.system.config.mesh}' at {shown}")
         self._endpoints = ()
-
-    def _warn(self) -> None:
-        """Warn if other hosts can reach it."""
-        zenoh = self._plan.system.config.zenoh
-        wide = ", ".join(filter(leaves_host, zenoh.listen)) if zenoh.mode == "peer" else ""
-        if wide and not self._quiet:
-            self._print(f"warning: whoever can reach this host at {wide} can read, set and end this mesh", "yellow")
 
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""

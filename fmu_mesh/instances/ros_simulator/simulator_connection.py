@@ -62,7 +62,7 @@ class ZenohConnection:
     def __init__(self, section: SimulatorConfig, types: MessageTypes, node: str) -> None:
         patience_s = section.timeout
         self._session = open_session(
-            Wiring(mode="client", connect=tuple(section.connect), patience_s=patience_s, timestamps=True)
+            Wiring("client", connect=tuple(section.connect), patience_s=patience_s, timestamps=True, insecure=True)
         )
         self._profile = RmwZenoh(self._session, RosPlan(types, node=node), section.domain or 0)
         self._arrived = threading.Event()

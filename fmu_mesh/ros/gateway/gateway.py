@@ -46,7 +46,7 @@ from ...ros_wire.topics import CLOCK_TOPIC, Port, RosPlan, Topic
 from ...simtime import TimeGrid
 from ...text import shown
 from ...wire.client.readings import latecomers
-from ...wire.keys import Keys, escape
+from ...wire.keys import Keys
 from ...wire.messages import decode_json
 from ...wire.refusals import Refusals
 from ...wire.session import Question, ask, undeclare_all
@@ -248,10 +248,12 @@ class Gateway:
         subscribed = _SubscribedTopic(Disassembler(topic, self._plan.types))
         places: dict[str, dict[str, int]] = {}
         for place, port in enumerate(topic.ports):
-            places.setdefault(self._keys.variables(port.instance, port.kind), {})[port.variable.name] = place
-        for root, own in places.items():
-            key = root if len(own) > 1 else f"{root}/{escape(*own)}"
+            places.setdefault(port.instance, {})[port.variable.name] = place
+        for instance, own in places.items():
+            key = self._keys.setting(instance, *(own if len(own) == 1 else ()))
             subscribed.inputs[key] = own
+            first = topic.ports[next(iter(own.values()))]
+            subscribed.shown[key] = self._keys.variable(instance, first.kind, first.variable.name)
             if key not in self._publishers:
                 self._publishers[key] = self._mesh.declare_publisher(
                     key, encoding=json_encoding, congestion_control=zenoh.CongestionControl.BLOCK
@@ -280,7 +282,7 @@ class Gateway:
             if sent := {name: value for name, at in places.items() if (value := values[at]) is not None}:
                 payload = encode_values(sent) if len(places) > 1 else encode_value(*sent.values())
                 self._publishers[key].put(payload, attachment=attachment)
-                self.settle.sent(key if len(places) == 1 else f"{key}/{escape(next(iter(sent)))}")
+                self.settle.sent(subscribed.shown[key])
         fields = subscribed.disassembler.fields
         if fields.ignored:
             self.ignored[subscribed.disassembler.topic.name] = fields.ignored
@@ -346,14 +348,16 @@ class _SubscribedTopic(_WarnOnce):
     """A topic that the gateway subscribes to.
 
     Attributes:
-        inputs: by the key of a variable, or of all inputs of an instance if there are several: the variables, and the
-            place of the field of each in the topic.
+        inputs: by the key that sets a variable, or several of an instance: the variables, and the place of the field of
+            each in the topic.
+        shown: by the same, the key that shows the value of one of them.
     """
 
     def __init__(self, disassembler: Disassembler) -> None:
         super().__init__(disassembler.topic.name)
         self.disassembler = disassembler
         self.inputs: dict[str, dict[str, int]] = {}
+        self.shown: dict[str, str] = {}
         self.who = f"ros {disassembler.topic.name}"
 
 

@@ -70,8 +70,10 @@ def open_ros(section: RosConfig, folder: Path) -> tuple[bool, zenoh.Session]:
     endpoints = tuple(section.connect)
     are_bridges = section.profile == "ros2dds" and len(endpoints) > 1
     if section.listen or are_bridges or all(map(is_of_this_host, endpoints)):
-        return True, open_session(Wiring(listen=tuple(section.listen), connect=endpoints, gossip=True, timestamps=True))
-    client = Wiring(mode="client", connect=endpoints, patience_s=_OPEN_S, timestamps=True)
+        return True, open_session(
+            Wiring(listen=tuple(section.listen), connect=endpoints, gossip=True, timestamps=True, insecure=True)
+        )
+    client = Wiring(mode="client", connect=endpoints, patience_s=_OPEN_S, timestamps=True, insecure=True)
     try:
         return False, open_session(client)
     except FmuMeshError:  # nobody answers, which `RosLink` reports
@@ -209,7 +211,7 @@ class RosLink:
         session = self._ros  # sees all tokens as a client, or if others connect to this gateway directly
         if self._as_peer and self._section.connect:
             try:
-                wiring = Wiring(mode="client", connect=tuple(self._section.connect), patience_s=_OPEN_S)
+                wiring = Wiring("client", connect=tuple(self._section.connect), patience_s=_OPEN_S, insecure=True)
                 session = self._client = open_session(wiring)
             except FmuMeshError:  # the link is lost again, which the next look reports
                 return

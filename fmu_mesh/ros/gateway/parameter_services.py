@@ -134,8 +134,9 @@ class ParameterServices:
 
     def _ask(self, parameter: NodeParameter, value: Value | None = None) -> tuple[Any, str]:
         """Get the value, or set a new one; returns the answer of the mesh, and why it refused or an empty text."""
-        key = self._keys.variable(parameter.instance, "param", parameter.variable.name)
+        instance, name = parameter.instance, parameter.variable.name
         payload = encode_value(value) if value is not None else None
+        key = self._keys.variable(instance, "param", name) if value is None else self._keys.setting(instance, name)
         question = Question(key, f"'{parameter.name}'", _ANSWER_S, payload, encode_origin(None, _WHO))
         try:
             return decode_json(ask(self._mesh, question), object), ""

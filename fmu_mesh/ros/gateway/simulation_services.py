@@ -319,7 +319,7 @@ class Settling:
         self._keys: dict[str, str] = {}
 
     def sent(self, key: str) -> None:
-        """Note that a value was put on the key of a variable."""
+        """Note that a value was sent for an instance; a question for ``key``, of one of its variables, comes later."""
         self._keys[key.rpartition("/")[0]] = key  # one question for each instance is enough
 
     def __call__(self) -> None:

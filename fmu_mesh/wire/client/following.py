@@ -60,12 +60,15 @@ class Follower(Generic[Item]):
         self.arrived.put(None)  # another thread may be waiting for more
 
     def subscribe(
-        self, keys: Collection[str], decode: Callable[[zenoh.Sample], Item | None], through: str | None = None
+        self,
+        keys: Collection[str],
+        decode: Callable[[zenoh.Sample], Item | None],
+        through: Collection[str] | None = None,
     ) -> None:
         """From now on the samples of these keys arrive, as ``decode`` returns them; not those that it refuses.
 
-        A reader that is much too slow loses samples, because a thread of Zenoh must not wait for it. ``through`` is one
-        key expression to subscribe to instead of each key.
+        A reader that is much too slow loses samples, because a thread of Zenoh must not wait for it. ``through`` are
+        the key expressions to subscribe to instead of each key.
         """
 
         def take(sample: zenoh.Sample) -> None:
@@ -76,7 +79,7 @@ class Follower(Generic[Item]):
                     self.arrived.put(item)
 
         directly = Callback(take, indirect=False)  # no thread for each of 1,000 keys
-        for key in keys if through is None else (through,):
+        for key in keys if through is None else through:
             self._stack.callback(self._session.declare_subscriber(key, directly).undeclare)
 
     def to_the_last(self, deadline: float | None = None) -> Iterator[Item]:

@@ -25,6 +25,7 @@ import numpy as np
 import zenoh
 from msgspec.structs import replace
 
+from ...config.access_sections import Role
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
 from ...text import did_you_mean, is_pattern, listed, matching, shown
 from ..keys import SUBSCRIBED, Keys
@@ -62,19 +63,21 @@ class MeshClient:
         session: a session that reaches the mesh; the caller closes it.
         endpoints: where the session reaches the mesh, for messages.
         over: raises `MeshLost` if the mesh has ended, where the caller knows it; otherwise returns False.
+        role: what the certificate of this process may do; None: it comes by a socket, or there is no security.
 
     Raises:
         ConfigurationError: (every method) a name is unknown, or the mesh refused; the message has the reason.
         DeadlineExceeded: (every method) there was no answer in time.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917  one mesh, and how it is reached
         self,
         session: zenoh.Session,
         keys: Keys,
         endpoints: Sequence[str],
         timeout_s: float,
         over: Callable[[], bool] = lambda: False,
+        role: Role | None = None,
     ) -> None:
         self.keys = keys
         self.endpoints = tuple(endpoints)
@@ -82,6 +85,7 @@ class MeshClient:
         self._who = f"mesh '{keys.mesh}'"
         self._timeout_s = timeout_s
         self._over = over
+        self._role = role
         self._lost = threading.Event()
         self._known: dict[str, dict[str, Target]] = {}
         self._known_run = ""
@@ -197,9 +201,11 @@ class MeshClient:
     def get(self, targets: Sequence[Target]) -> list[Reading]:
         """The current values with their points, in the order of the targets."""
         readings: dict[str, Reading] = {}
-        for instance in dict.fromkeys(target.instance for target in targets):
-            own = {target.key: target for target in targets if target.instance == instance}
-            key = next(iter(own)) if len(own) == 1 else f"{self._instance_key(instance)}/*/*"
+        for root in dict.fromkeys(target.root for target in targets):
+            own = {target.key: target for target in targets if target.root == root}
+            instance = next(iter(own.values())).instance
+            # A wider key lies in no rule of a mesh with security.
+            key = next(iter(own)) if len(own) == 1 else f"{root}/*"
             # An answer may be lost where this process reads too slowly; it is asked for again.
             for asked in chain([key], (own_key for own_key in own if own_key not in readings)):
                 for sample in self._ask(Question(asked, f"the values of instance '{instance}'", self._timeout_s)):
@@ -212,18 +218,30 @@ class MeshClient:
 
         That is the next one, or the one ``at`` a simulation time in s.
         """
+        self.check_may("setting a value")
         plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         try:
             payload = encode_value(cast("Any", plain))
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
-        return self._view(target.key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
+        key = self.keys.setting(target.instance, target.variable.name)
+        return self._view(key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
+        self.check_may(f"'{command.command}'")
         payload = msgspec.json.encode(command)
         question = Question(self._command_key, self._who, timeout_s or self._timeout_s, payload, once=True)
         return _understood(self._ask(question)[0], CommandAnswer, self._who)
+
+    def check_may(self, what: str) -> None:
+        """Check that the role of this process may set and command: what is not allowed would vanish without an answer.
+
+        Raises:
+            ConfigurationError: it may only read.
+        """
+        if self._role == "observer":
+            raise ConfigurationError(f"you are observer '{self.keys.by}'; {what} needs operator.")
 
     def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause or step the mesh; the answer comes when it has paused, and has the point at which it has.
@@ -268,7 +286,7 @@ class MeshClient:
                 by_instance.setdefault(target.instance, {})[target.key] = target
             for name, own in by_instance.items():
                 every = len(own) == len(self._known.get(name, ()))
-                through = f"{self.keys.instance(name)}/*/*" if every else None
+                through = {f"{target.root}/*" for target in own.values()} if every else None
                 follower.subscribe(own.keys(), partial(reading_among, own), through)
                 subscribed[name] = None if every else [target.variable.name for target in own.values()]
             there = self._is_there(follower, self._timeout_s)
@@ -360,7 +378,7 @@ class MeshClient:
 
     @cached_property
     def _command_key(self) -> zenoh.KeyExpr:
-        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.mesh_key("command"))
+        key: zenoh.KeyExpr = self.session.declare_keyexpr(self.keys.command)
         return key
 
     def _view(

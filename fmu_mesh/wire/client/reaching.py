@@ -11,16 +11,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
-from typing import NamedTuple, Self, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar, cast, get_args
 
 import zenoh
+from msgspec.structs import replace
 
+from ...config.access_sections import Role, given_folder, has_tls, is_socket
 from ...errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ...text import did_you_mean, listed
-from ..keys import Keys
-from ..runtime import meshes
+from ..keys import LOCAL, Keys
+from ..messages import decode_json
+from ..runtime import MeshNote, meshes
 from ..session import Wiring, close_session, open_session, tokens
+from ..views import Hello
 from .mesh_client import MeshClient, is_key, key_expression
+
+if TYPE_CHECKING:  # as above
+    from ..security.identity import Identity
 
 __all__ = ["Meshes"]
 
@@ -38,7 +46,10 @@ _GRACE_S = 1.0
 _NOTE_CHECK_S = 0.05
 _AGAIN_S = 1.0
 _TOKENS = "**/mesh"
+_HELLO = f"{_TOKENS}/hello"
 _NOBODY = "nobody answered"
+_HELLO_S = 1.0
+"""How long in s a mesh may need to say which role a certificate has."""
 
 
 class Meshes:
@@ -48,7 +59,10 @@ class Meshes:
     access to another one.
 
     Args:
-        endpoints: Zenoh endpoints to connect to; if empty, the notes of this user's meshes on this host are used.
+        connect: Zenoh endpoints to connect to; if empty, the notes of this user's meshes on this host are used.
+        timeout: deadline of every question, in s.
+        security: the folder of a certificate, for endpoints with TLS; None: that of this host, or of a note.
+        insecure: whether endpoints at a network may have no TLS.
 
     Attributes:
         silent: for meshes with a note that are not in `all`, the reason.
@@ -58,10 +72,15 @@ class Meshes:
         DeadlineExceeded: (every method) the mesh, or an endpoint, does not answer.
     """
 
-    def __init__(self, endpoints: Sequence[str], timeout_s: float) -> None:
+    def __init__(
+        self, connect: Sequence[str], timeout: float, security: str | Path | None = None, *, insecure: bool = False
+    ) -> None:
+        if insecure and security is not None:
+            raise ConfigurationError("`security=...` and `insecure=True` exclude each other", hint="Leave one out.")
         self.silent: list[FmuMeshError] = []
-        self._endpoints = tuple(endpoints)
-        self._timeout_s = timeout_s
+        self._endpoints = tuple(connect)
+        self._timeout_s = timeout
+        self._security, self._insecure = security, insecure
         self._found: list[_Found] = []
         self._openings: dict[tuple[str, ...], _Opening] = {}
 
@@ -160,6 +179,9 @@ class Meshes:
         if self._found:
             return None
         if self._endpoints:
+            opening = self._open(self._endpoints, _NOBODY)
+            if (own := opening.identity) is not None and (hello := _greeted(opening.session(), _HELLO, _HELLO_S)):
+                return _without_role(own, hello)
             return ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
         return ConfigurationError(
             "no mesh is running here.",
@@ -169,23 +191,44 @@ class Meshes:
     def _noted(self) -> Iterator[_Found]:
         """Every mesh of this user on this host."""
         for note in meshes():
-            opening = self._open(note.endpoints, f"mesh '{note.mesh}' did not answer")
-            yield _Found(Keys(note.key_prefix, note.mesh), note.endpoints, opening)
+            ends = tuple(filter(is_socket, note.endpoints)) or note.endpoints
+            nobody = f"mesh '{note.mesh}' did not answer"
+            opening = self._open(ends, nobody, note.security or None, insecure=note.insecure)
+            yield _Found(Keys(note.key_prefix, note.mesh, _by(note)), note.endpoints, opening)
 
     def _shown(self) -> Iterator[_Found]:
         """Every mesh whose master can be reached at the endpoints."""
         opening = self._open(self._endpoints, _NOBODY)
+        by = next((_by(note) for note in meshes() if {*note.endpoints} & {*self._endpoints}), None)
         for key in tokens(opening.session(), _TOKENS, self._timeout_s):
             *prefix, mesh, _ = key.split("/")
             if prefix:  # otherwise it is not a token of a mesh
-                yield _Found(Keys("/".join(prefix), mesh), self._endpoints, opening)
+                yield _Found(Keys("/".join(prefix), mesh, by), self._endpoints, opening)
 
-    def _open(self, endpoints: tuple[str, ...], else_: str) -> _Opening:
+    def _open(
+        self, endpoints: tuple[str, ...], else_: str, security: str | None = None, *, insecure: bool = False
+    ) -> _Opening:
         """The session with these endpoints; later calls return the same one."""
-        return self._openings.setdefault(endpoints, _Opening(endpoints, else_, self._timeout_s))
+        opening = self._openings.get(endpoints)
+        if opening is None:
+            wiring = Wiring(
+                mode="client",
+                connect=endpoints,
+                patience_s=self._timeout_s,
+                waits=False,
+                insecure=self._insecure or insecure,
+            )
+            opening = _Opening(wiring, else_, self._security or security)
+            self._openings[endpoints] = opening
+        return opening
 
     def _client(self, found: _Found) -> MeshClient:
-        return MeshClient(found.opening.session(), found.keys, found.endpoints, self._timeout_s)
+        session = found.opening.session()
+        own, reached = found.opening.identity, (found.endpoints, self._timeout_s)
+        if own is None:
+            return MeshClient(session, found.keys, *reached)
+        role = _role(session, found.keys, own, self._timeout_s)
+        return MeshClient(session, replace(found.keys, by=own.name), *reached, role=role)
 
     def _close(self) -> None:
         for opening in self._openings.values():
@@ -198,10 +241,12 @@ class _Opening:
     # It is opened on its own thread, so several can be opened at the same time. `session` waits for that thread shortly
     # beyond the deadline, because a process that ends while the thread is inside Zenoh may abort.
 
-    def __init__(self, endpoints: Sequence[str], else_: str, timeout_s: float) -> None:
-        self._endpoints = tuple(endpoints)
+    def __init__(self, wiring: Wiring, else_: str, security: str | Path | None) -> None:
+        self.identity: Identity | None = None
+        self._wiring = wiring
         self._else = else_
-        self._timeout_s = timeout_s
+        self._security = security
+        self._timeout_s = wiring.patience_s
         self._end = 0.0
         self._opened: Future[zenoh.Session] | None = None
 
@@ -229,13 +274,22 @@ class _Opening:
 
     def _run(self, opened: Future[zenoh.Session]) -> None:
         try:
-            wiring = Wiring(mode="client", connect=self._endpoints, patience_s=self._timeout_s)
-            opened.set_result(open_session(wiring))
+            ends = self._wiring.connect
+            if any(map(has_tls, ends)) or (self._security is not None and not all(map(is_socket, ends))):
+                self.identity = self._identity()
+            opened.set_result(open_session(replace(self._wiring, identity=self.identity)))
         except FmuMeshError as error:
             opened.set_exception(error if time.monotonic() < self._end else self._silence())
 
+    def _identity(self) -> Identity | None:
+        """The certificate with which this process comes."""
+        from ..security.certificates import identity_in  # noqa: PLC0415  most meshes need no certificate
+
+        folder = given_folder(self._security)
+        return identity_in(folder) if folder is not None and not self._wiring.insecure else None
+
     def _silence(self) -> DeadlineExceeded:
-        where = ", ".join(self._endpoints)
+        where = ", ".join(self._wiring.connect)
         return DeadlineExceeded(
             f"{self._else} at {where} within {self._timeout_s:g} s.",
             hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
@@ -253,6 +307,46 @@ class _Found(NamedTuple):
     def names(self) -> tuple[str, str]:
         """What the mesh may be called: its name and its key."""
         return self.keys.mesh, self.keys.root
+
+
+def _by(note: MeshNote) -> str | None:
+    """In whose name a tool comes to the socket of a mesh; None: it needs none."""
+    return LOCAL if note.security else None
+
+
+def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> Hello | None:
+    """What a master answers to a certificate at once; None if it does not, or may not."""
+    for reply in session.get(key, timeout=timeout_s):
+        if reply.ok is not None:
+            return decode_json(reply.ok.payload.to_bytes(), Hello)
+    return None
+
+
+def _role(session: zenoh.Session, keys: Keys, own: Identity, timeout_s: float) -> Role:
+    """The role that a mesh knows of a certificate, which may have another one in it.
+
+    Raises:
+        ConfigurationError: it has none there.
+        DeadlineExceeded: the mesh does not answer.
+    """
+    end, never = time.monotonic() + min(timeout_s, _HELLO_S), threading.Event()
+    while True:
+        for role in sorted(get_args(Role), key=lambda one: one != own.role):
+            if _greeted(session, keys.role(role), _HELLO_S) is not None:
+                return cast("Role", role)
+        # A query that comes before its queryable is known has no answer.
+        if (left_s := end - time.monotonic()) <= 0:
+            break
+        never.wait(min(left_s, _NOTE_CHECK_S))
+    if (hello := _greeted(session, keys.mesh_key("hello"), _HELLO_S)) is not None:
+        raise _without_role(own, hello)
+    raise DeadlineExceeded(f"mesh '{keys.mesh}' does not say which role '{own.name}' has", hint="Has it `security`?")
+
+
+def _without_role(own: Identity, hello: Hello) -> ConfigurationError:
+    table = f"table {hello.table} of roles" if hello.table else "its roles"
+    hint = f"The mesh has {table}. Whoever has the authority can add the name; the next start of the mesh knows it."
+    return ConfigurationError(f"'{own.name}' has no role in mesh '{hello.mesh}'.", hint=hint)
 
 
 def _means(keys: Keys, reference: str) -> bool:

@@ -37,6 +37,11 @@ class Target(msgspec.Struct, frozen=True):
         """`instance.variable`."""
         return f"{self.instance}.{self.variable.name}"
 
+    @property
+    def root(self) -> str:
+        """What the keys of the variables of its kind begin with."""
+        return self.key.rpartition("/")[0]
+
 
 class Reading(msgspec.Struct, frozen=True, omit_defaults=True):
     """One value that was received, with its communication point and the time of that point in s."""

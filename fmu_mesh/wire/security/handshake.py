@@ -11,15 +11,19 @@ from __future__ import annotations
 import select
 import socket
 import ssl
+import threading
 import time
+from collections.abc import Sequence
 from typing import Final
 
 from ...errors import ConfigurationError, MeshLost
 from .identity import Identity
 
-__all__ = ["check_link", "host_and_port"]
+__all__ = ["check_link", "host_and_port", "shake_hands"]
 
 _DEADLINE_S: Final = 2.0
+_DIAL_S: Final = 0.1
+"""Time in s between two looks for who does not listen yet."""
 
 _BY_ALERT: Final = {
     "CERTIFICATE_REQUIRED": "it wants a certificate, and got none",
@@ -75,6 +79,36 @@ def check_link(endpoint: str, own: Identity | None) -> None:
     except (TimeoutError, OSError) as error:
         reason = error.strerror or "no answer"
         raise MeshLost(f"nobody listens at {endpoint}: {reason.lower()}") from error
+
+
+def shake_hands(endpoints: Sequence[str], own: Identity, patience_s: float | None) -> None:
+    """Find out whether links with TLS will come about.
+
+    Args:
+        endpoints: where Zenoh will dial.
+        own: who comes.
+        patience_s: how long a client waits for who does not listen yet, in s; one endpoint is enough for it. None: a
+            peer, which dials all of them in the background until they answer.
+
+    Raises:
+        MeshLost: nobody listens there.
+        ConfigurationError: as of `check_link`.
+    """
+    end, never = time.monotonic() + (patience_s or 0.0), threading.Event()
+    while True:
+        failures: list[ConfigurationError | MeshLost] = []
+        for endpoint in endpoints:
+            try:
+                check_link(endpoint, own)
+            except (ConfigurationError, MeshLost) as error:
+                if patience_s is None and isinstance(error, ConfigurationError):
+                    raise
+                failures.append(error)
+        if patience_s is None or len(failures) < len(endpoints) or not endpoints:
+            return
+        if not isinstance(failures[0], MeshLost) or time.monotonic() >= end:
+            raise failures[0]
+        never.wait(_DIAL_S)
 
 
 def _context(own: Identity | None) -> ssl.SSLContext:

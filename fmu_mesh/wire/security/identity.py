@@ -9,18 +9,19 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 
+from ...config.access_sections import Role
 from ...text import counted
+from ..keys import LOCAL
 
 __all__ = [
     "CA",
     "CA_KEY",
     "CERTIFICATE",
     "KEY",
-    "LOCAL",
     "ROLES",
     "Identity",
     "Role",
@@ -31,8 +32,6 @@ __all__ = [
     "wrong_name",
 ]
 
-Role = Literal["observer", "operator", "node"]
-
 CA: Final = "ca.pem"
 CA_KEY: Final = "ca.key"
 """Only in the folder of the authority."""
@@ -40,9 +39,6 @@ CA_KEY: Final = "ca.key"
 CERTIFICATE: Final = "certificate.pem"
 KEY: Final = "key.pem"
 ROLES: Final = "roles.json"
-
-LOCAL: Final = "local"
-"""Who comes by the Unix socket of a mesh: an operator and node that no certificate can name."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SOON: Final = timedelta(days=30)

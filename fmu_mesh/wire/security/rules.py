@@ -7,22 +7,27 @@ their own. Nothing is allowed that no rule allows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
-from .identity import LOCAL, Role
+from ..keys import LOCAL
+from .identity import Role
 
-__all__ = ["ACTIONS", "ROLE_NAMES", "Action", "access_control"]
+__all__ = ["ACTIONS", "HELLO", "ROLE_NAMES", "Action", "access_control"]
+
+HELLO: Final = "**/mesh/hello"
+"""What meshes answer to every certificate."""
 
 ROLE_NAMES: Final[tuple[Role, ...]] = ("observer", "operator", "node")
+_WHO_ACTS: Final[tuple[Role, ...]] = ("operator", "node")
 
 _READS: Final = ("query", "declare_subscriber")
 _ANSWERS: Final = ("put", "delete", "reply")
 _TOKENS_IN: Final = ("liveliness_query", "declare_liveliness_subscriber")
 _TOKENS_OUT: Final = ("liveliness_token",)
 _SENDS: Final = ("put", "query")
-_ABOUT_SENDS: Final = ("reply", "declare_subscriber", "declare_queryable")
-"""What somebody who sends has to hear: an answer, and whether somebody listens."""
+_WHO_LISTENS: Final = ("declare_subscriber", "declare_queryable")
+"""What declared publishers and queriers hear before they send. The key is that of who listens, which may be wide."""
 
 _ALL: Final = (
     "put",
@@ -42,8 +47,8 @@ class Action(NamedTuple):
 
     Attributes:
         what: in words, for the table.
-        roles: who may.
-        keys: below the mesh, with `{name}` and `{role}` of who does it; of the whole prefix with `{all}`.
+        roles: who may; empty: whoever has a certificate.
+        keys: with `{mesh}`, and with `{name}` and `{role}` of who does it.
         comes: the messages that come in; ``goes``: those that go out.
     """
 
@@ -54,10 +59,15 @@ class Action(NamedTuple):
     goes: tuple[str, ...]
 
 
-_WHO_ACTS: Final[tuple[Role, ...]] = ("operator", "node")
+_OF_MESH: Final = ("info", "status", "plan", "log", "audit", "ros/*", "role/{role}")
+_ENDS: Final = ("{ends}",)
+_NAMED: Final = ("{mesh}/*/set/@by/**", "{mesh}/mesh/command/@by/**")
+"""The keys with names: a router hands on what others send, and so whoever is a part of a run may use all names."""
 
 ACTIONS: Final = (
-    Action("see which meshes and instances run", ROLE_NAMES, ("{mesh}/*", "{mesh}/mesh"), _TOKENS_IN, _TOKENS_OUT),
+    Action("know that a mesh is there", (), (HELLO,), ("query",), ("reply", "declare_queryable")),
+    Action("see which meshes and instances run", ROLE_NAMES, ("**/mesh", "{mesh}/*"), _TOKENS_IN, _TOKENS_OUT),
+    Action("see who listens", ROLE_NAMES, ("{mesh}/**",), (), _WHO_LISTENS),
     Action(
         "read values: outputs, inputs, parameters, local variables",
         ROLE_NAMES,
@@ -75,13 +85,16 @@ ACTIONS: Final = (
     Action(
         "read the plan, the state, the log and the audit of the mesh",
         ROLE_NAMES,
-        tuple(f"{{mesh}}/mesh/{what}" for what in ("info", "status", "plan", "log", "audit", "hello", "role/{role}")),
+        tuple(f"{{mesh}}/mesh/{what}" for what in _OF_MESH),
         _READS,
         _ANSWERS,
     ),
-    Action("set inputs and parameters", _WHO_ACTS, ("{mesh}/*/set/@by/{name}/**",), _SENDS, _ABOUT_SENDS),
-    Action("pause, resume, step, reset and stop", _WHO_ACTS, ("{mesh}/mesh/command/@by/{name}",), _SENDS, _ABOUT_SENDS),
-    Action("be a part of a run", ("node",), ("{mesh}/**", "{mesh}/@sync/**"), _ALL, _ALL),
+    Action("read the keys at ends of connections", ROLE_NAMES, _ENDS, _READS, (*_ANSWERS, *_WHO_LISTENS)),
+    Action("write the keys at ends of connections", _WHO_ACTS, _ENDS, _ALL, _ALL),
+    Action("set inputs and parameters", _WHO_ACTS, ("{mesh}/*/set/@by/{name}/**",), _SENDS, ("reply",)),
+    Action("pause, resume, step, reset and stop", _WHO_ACTS, ("{mesh}/mesh/command/@by/{name}",), _SENDS, ("reply",)),
+    Action("see who listens to settings and commands", _WHO_ACTS, _NAMED, (), _WHO_LISTENS),
+    Action("be a part of a run", ("node",), ("{mesh}/**", "{mesh}/@sync/**", *_NAMED), _ALL, _ALL),
 )
 
 
@@ -91,37 +104,24 @@ def access_control(root: str, roles: Mapping[str, Role], ends: Iterable[str] = (
     Args:
         root: prefix and name of the mesh; `*` for any mesh.
         roles: by common name.
-        ends: keys that the configuration names as ends of connections: operators may write and read them.
+        ends: keys that the configuration names as ends of connections; with what `zenoh.ext` adds to them.
     """
+    named: dict[str, Role] = {**roles, LOCAL: "node"}
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    named = {**roles, LOCAL: "node"}
-    own_ends = tuple(ends)
+    at_ends = [key for end in ends for key in (end, f"{end}/@adv/**")]
     for number, action in enumerate(ACTIONS):
-        texts = [key for key in action.keys if "{name}" in key or "{role}" in key]
-        for group, names in _groups(action, named, own=bool(texts)):
-            keys = [key.format(mesh=root, name=names[0], role=named[names[0]]) for key in action.keys]
+        for names in _together(action, named):
+            words = {"mesh": root, "name": names[0], "role": named.get(names[0])}
+            keys = at_ends if action.keys == _ENDS else [key.format(**words) for key in action.keys]
             for flow, messages in (("ingress", action.comes), ("egress", action.goes)):
-                rule = f"{number} {group} {flow}"
-                rules.append(
-                    {"id": rule, "permission": "allow", "flows": [flow], "messages": [*messages], "key_exprs": keys}
-                )
-                policies.append({"id": rule, "rules": [rule], "subjects": [*names]})
-    if own_ends:
-        rules.append(
-            {
-                "id": "ends",
-                "permission": "allow",
-                "flows": ["ingress", "egress"],
-                "messages": [*_ALL],
-                "key_exprs": [*own_ends],
-            }
-        )
-        policies.append(
-            {"id": "ends", "rules": ["ends"], "subjects": [name for name, role in named.items() if role != "observer"]}
-        )
+                if messages and keys:
+                    rule = f"{number} {names[0]} {flow}"
+                    about = {"messages": [*messages], "flows": [flow], "key_exprs": keys}
+                    rules.append({"id": rule, "permission": "allow", **about})
+                    policies.append({"id": rule, "rules": [rule], "subjects": [*names]})
     subjects: list[dict[str, Any]] = [{"id": name, "cert_common_names": [name]} for name in roles]
-    subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
+    subjects += [{"id": LOCAL, "link_protocols": ["unixsock-stream"]}, {"id": _EVERYBODY}]
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -131,9 +131,16 @@ def access_control(root: str, roles: Mapping[str, Role], ends: Iterable[str] = (
     }
 
 
-def _groups(action: Action, roles: Mapping[str, Role], *, own: bool) -> Sequence[tuple[str, tuple[str, ...]]]:
-    """Those who share the rules of an action: each name for itself where keys have the name."""
-    names = [name for name, role in roles.items() if role in action.roles]
-    if own:
-        return [(name, (name,)) for name in names]
-    return [("all", tuple(names))] if names else []
+_EVERYBODY: Final = "*"
+"""A subject without any property; no name of a certificate is this."""
+
+
+def _together(action: Action, roles: Mapping[str, Role]) -> Iterator[tuple[str, ...]]:
+    """Those who share the rules of an action: each name for itself where keys have the name or the role."""
+    names = tuple(name for name, role in roles.items() if role in action.roles)
+    if not action.roles:
+        yield (_EVERYBODY,)
+    elif any("{name}" in key or "{role}" in key for key in action.keys):
+        yield from ((name,) for name in names)
+    elif names:
+        yield names
