@@ -39,21 +39,16 @@ def lab(authority: Authority, place: Place) -> Path:
     return Path(shutil.copytree(authority.folder, place.folder / "lab"))
 
 
-def secured(place: Place, name: str = "lab", **sections: Mapping[str, Any]) -> Path:
+def secured(place: Place, sections: Mapping[str, Mapping[str, Any]] = {}, name: str = "lab") -> Path:
     """A mesh that runs in real time behind TLS."""
-    return write_config(
-        place.folder,
-        instances={"gain": {"fmu": "Gain"}},
-        connections=[],
-        name="pair",
-        stop_time=3600.0,
-        **{
-            "simulation": {"real_time_factor": 1},
-            "zenoh": {"listen": ["tls/127.0.0.1:0"]},
-            "security": {"folder": f"lab/{name}"},
-            **sections,
-        },
-    )
+    own: dict[str, Mapping[str, Any]] = {
+        "simulation": {"real_time_factor": 1},
+        "zenoh": {"listen": ["tls/127.0.0.1:0"]},
+        "security": {"folder": f"lab/{name}"},
+        **sections,
+    }
+    one = {"gain": {"fmu": "Gain"}}
+    return write_config(place.folder, instances=one, connections=[], name="pair", stop_time=3600.0, **own)
 
 
 @pytest.fixture
@@ -143,7 +138,7 @@ def test_a_variable_of_the_host_wins_over_the_file(place: Place, lab: Path) -> N
 def test_who_runs_a_mesh_at_a_network_is_a_node(place: Place, lab: Path) -> None:
     assert lab.is_dir()
 
-    refused = place.run("launch", secured(place, "alice"), "--no-progress")
+    refused = place.run("launch", secured(place, name="alice"), "--no-progress")
 
     assert refused.wait() == 2
     assert "'alice' of" in refused.message
@@ -159,8 +154,10 @@ def test_who_runs_a_mesh_at_a_network_is_a_node(place: Place, lab: Path) -> None
         ({"security": {"folder": "lab/alice", "roles": {"alice": "king"}}}, "expected node or observer or operator"),
     ],
 )
-def test_what_does_not_go_with_security_is_a_finding(place: Place, sections: dict[str, Mapping[str, Any]], words: str) -> None:
-    checked = place.run("check", secured(place, **sections))
+def test_what_does_not_go_with_security_is_a_finding(
+    place: Place, sections: dict[str, Mapping[str, Any]], words: str
+) -> None:
+    checked = place.run("check", secured(place, sections))
 
     assert checked.wait() == 2
     assert words in checked.message
