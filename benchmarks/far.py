@@ -140,9 +140,9 @@ class FarRuns:
             if alone.wait(_MOST_S):
                 raise RuntimeError(alone.story())
         running += [
-            first.start("fmu-mesh", "master", file, "--listen", "tcp/0.0.0.0:7447", "--output", f"../{result.name}"),
+            first.start("fmu-mesh", "master", file, "--listen", "tcp/0.0.0.0:7447", "--insecure", "--output", f"../{result.name}"),
             first.start("fmu-mesh", "node", file, near),
-            second.start("fmu-mesh", "node", file, far, "--connect", "tcp/router:7447"),
+            second.start("fmu-mesh", "node", file, far, "--connect", "tcp/router:7447", "--insecure"),
         ]
         wait_until(lambda: not running[0].running, "the end", _MOST_S)
         codes = [one.wait() for one in running]

@@ -140,8 +140,9 @@ def started_apart(
         environment: more variables of all processes.
     """
     first, second = hosts
-    there = ["--connect", "tcp/router:7447"]
-    master = ["fmu-mesh", "master", str(config), "--listen", "tcp/0.0.0.0:7447", "--no-progress", *options]
+    there = ["--connect", "tcp/router:7447", "--insecure"]
+    master = ["fmu-mesh", "master", str(config), "--listen", "tcp/0.0.0.0:7447", "--insecure"]
+    master += ["--no-progress", *options]
     return [
         first.start(*master, **environment),
         *(first.start("fmu-mesh", "node", str(config), node, **environment) for node in nodes[::2]),

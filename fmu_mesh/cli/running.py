@@ -33,7 +33,7 @@ from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
-from .output.terminal import say, stdout_as_stderr
+from .output.terminal import say_warning, stdout_as_stderr
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .run_options import given_options, mesh_of
 
@@ -145,7 +145,9 @@ def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
 def _node(arguments: argparse.Namespace) -> int:
     from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
 
-    run_node(mesh_of(arguments).plan(**given_options(arguments)).node(arguments.node))
+    plan = mesh_of(arguments).plan(**given_options(arguments))
+    warn(plan.plan, only_access=True)
+    run_node(plan.node(arguments.node))
     return 0
 
 
@@ -171,7 +173,9 @@ def _gateway(arguments: argparse.Namespace) -> int:
         if isinstance(event, Reachable):
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
-    run_gateway(mesh_of(arguments).plan(**given_options(arguments)), show)
+    plan = mesh_of(arguments).plan(**given_options(arguments))
+    warn(plan.plan, only_access=True)
+    run_gateway(plan, show)
     return 0
 
 
@@ -197,7 +201,7 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
 
         own = identity_in(folder)
     for _, text in why_open({"--listen": listen}, secured=own is not None):
-        say(f"warning: {text}")
+        say_warning(text)
     root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)
     return Wiring(listen=listen, insecure=arguments.insecure, identity=own, root=root, ends=ends)
 

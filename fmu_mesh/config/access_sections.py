@@ -149,7 +149,8 @@ def why_open(ends: Mapping[str, Sequence[str]], *, secured: bool) -> Iterator[tu
             elif has_tls(endpoint):
                 yield place, f"no roles are known at {endpoint}: who has a certificate can read, set and end this mesh"
             elif leaves_host(endpoint):
-                yield place, f"whoever can reach {endpoint} can read, set and end this mesh"
+                where = f"this host at {endpoint}" if path.endswith("listen") else endpoint
+                yield place, f"whoever can reach {where} can read, set and end this mesh"
             else:
                 yield place, f"every user of this host can set values at {endpoint}"
 

@@ -70,14 +70,18 @@ def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tu
     Raises:
         ConfigurationError: the certificate cannot be used, or not for this.
     """
-    if security is None or all(map(is_socket, (*made.listen, *made.connect))):
+    if security is None:
+        return made
+    # With gossip, a node could reach the master of its host by the port for others, whose rules do not know it.
+    made = replace(made, gossip=False)
+    if all(map(is_socket, (*made.listen, *made.connect))):
         return made
     from ..wire.security.certificates import identity_in  # noqa: PLC0415  most runs have no certificate
 
     own = identity_in(Path(security.folder), security.roles or None)
     if own.role != "node":
         text = f"'{own.name}' of '{security.folder}' is {own.role}, and who runs a mesh at a network has the role node"
-        raise ConfigurationError(text, hint="Each host has a certificate of its own: `security add ... --role node`.")
+        raise ConfigurationError(text, hint="`fmu-mesh security add` makes such a certificate for each host.")
     return replace(made, identity=own, root=root, ends=ends)
 
 

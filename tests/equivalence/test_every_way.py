@@ -96,7 +96,7 @@ def test_pause_and_set_over_two_hosts_equal_a_scenario(tmp_path: Path) -> None:
         )
         steered(
             configs[0].with_suffix(".csv"),
-            lambda *command: second.start("fmu-mesh", *command, "--connect", "tcp/router:7447"),
+            lambda *command: second.start("fmu-mesh", *command, "--connect", "tcp/router:7447", "--insecure"),
         )
 
         assert [one.wait() for one in by_hand] == [0] * 4, "".join(one.story() for one in by_hand)

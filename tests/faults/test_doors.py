@@ -131,16 +131,23 @@ def test_a_port_is_opened_where_listen_asks_for_it(place: Place, command: str) -
     assert others == [endpoint]
     if command != "run":
         assert value_of_angle(endpoint) != 0.0
-    assert "warning" not in started[0].errors
+    warning = "--listen tcp/127.0.0.1:0: every user of this host can set values at tcp/127.0.0.1:0"
+    assert started[0].errors.count(warning) == started[0].errors.count("warning: ") == 1
 
 
-def test_listening_beyond_this_host_is_warned_of_in_one_line(place: Place) -> None:
-    launched = running(place, "--listen", "tcp/0.0.0.0:0", "--listen", "tcp/127.0.0.1:0")
+def test_a_port_at_a_network_without_certificates_has_to_be_wanted(place: Place) -> None:
+    config = write_config(place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1})
 
-    warning = launched.wait_for_error_line("warning")
+    refused = place.run("launch", config, "--listen", "tcp/0.0.0.0:0")
+    launched = running(place, "--listen", "tcp/0.0.0.0:0", "--insecure")
 
-    assert warning == "warning: whoever can reach this host at tcp/0.0.0.0:0 can read, set and end this mesh\n"
-    assert launched.errors.count("warning") == 1
+    assert refused.wait() == 2
+    assert "--listen tcp/0.0.0.0:0: 'tcp/0.0.0.0:0' is open to everybody who can reach it; expected" in refused.errors
+    assert "`fmu-mesh security init` begins" in refused.errors
+    assert "`--insecure`" in refused.errors
+    assert launched.errors.count("warning: ") == 1
+    warning = "--listen tcp/0.0.0.0:0: whoever can reach this host at tcp/0.0.0.0:0 can read, set and end this mesh\n"
+    assert warning in launched.errors
 
 
 @pytest.mark.parametrize(

@@ -73,9 +73,9 @@ def test_nodes_of_another_host_connect_to_a_master_that_listens(tmp_path: Path) 
         expected = reference(second)
 
         by_hand = [
-            started(first, "fmu-mesh master CONFIG --listen tcp/0.0.0.0:7447 --paused"),
+            started(first, "fmu-mesh master CONFIG --listen tcp/0.0.0.0:7447 --insecure --paused"),
             started(first, "fmu-mesh node CONFIG pendulum"),
-            started(second, "fmu-mesh node CONFIG delay --connect tcp/router:7447"),
+            started(second, "fmu-mesh node CONFIG delay --connect tcp/router:7447 --insecure"),
         ]
 
         def ways() -> list[list[Any]]:
@@ -85,7 +85,7 @@ def test_nodes_of_another_host_connect_to_a_master_that_listens(tmp_path: Path) 
 
         streams = [["@mesh", "delay"], ["delay", "pendulum"]]
         assert wait_until(ways, "a mesh that is there") == [["pendulum", "@record", "@mesh"], streams]
-        resume = "fmu-mesh resume pendulum_delay --connect tcp/router:7447"
+        resume = "fmu-mesh resume pendulum_delay --connect tcp/router:7447 --insecure"
         wait_until(lambda: started(second, resume).wait() == 0, "a mesh that runs")
         assert ended(by_hand) == [0, 0, 0], "".join(one.story() for one in by_hand)
         assert (first.folder / RESULT).read_bytes() == expected

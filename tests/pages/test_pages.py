@@ -245,7 +245,7 @@ NOT_RUN = [
     ("README.md", "make demo", ".ci/run runs both; this test is part of the second"),
     (
         "README.md",
-        "fmu-mesh master CONFIG --connect tcp/router:7447",
+        "fmu-mesh master CONFIG --connect tcp/router:7447 --insecure",
         "CONFIG and router are yours; tests/faults/test_by_hand.py starts these parts",
     ),
     ("bridges/ros2dds/README.md", "./build", ".ci/long builds it, and tests/ros/test_bridge.py runs it"),

@@ -148,7 +148,7 @@ def test_every_process_meets_the_others_at_the_router(compose: dict[str, Any], m
         command = service["command"]
         assert command[command.index("--connect") + 1] == f"tcp/router:{port}"
         assert service["depends_on"]["router"] == {"condition": "service_healthy"}
-    assert mesh_config["zenoh"] == {"mode": "client", "connect": [f"tcp/router:{port}"]}
+    assert mesh_config["zenoh"] == {"mode": "client", "connect": [f"tcp/router:{port}"], "insecure": True}
     assert port in compose["services"]["router"]["healthcheck"]["test"]
 
 

@@ -48,6 +48,8 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "output": ("r.csv", Path("r.csv")),
     "listen": ("tcp/127.0.0.1:1", ("tcp/127.0.0.1:1",)),
     "connect": ("tcp/127.0.0.1:2", ("tcp/127.0.0.1:2",)),
+    "security": ("lab/host", Path("lab/host")),
+    "insecure": (None, True),
     "paused": (None, True),
     "allow_code": (None, True),
     "view": (None, True),
@@ -160,7 +162,8 @@ def test_every_option_with_a_key_replaces_it() -> None:
             "catch_up": 4.0,
         },
         "instances": {"gain": {"fmu": "Gain.fmu"}},
-        "zenoh": {"listen": ["tcp/127.0.0.1:1"], "connect": ["tcp/127.0.0.1:2"]},
+        "zenoh": {"listen": ["tcp/127.0.0.1:1"], "connect": ["tcp/127.0.0.1:2"], "insecure": True},
+        "security": {"folder": str(Path("lab/host").absolute())},
         "record": {"file": str(Path("r.csv").absolute())},
         "scenario": str(Path("drive.yaml").absolute()),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,7 +20,7 @@ from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
 from .progress import ProgressLine, progress_parts
-from .terminal import error_console, say
+from .terminal import error_console, say, say_warning
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,6 +34,8 @@ _COUNTED: Final = 1000
 """Number of different messages that are counted."""
 _HELD: Final = 100
 """Number of messages that are held back because their FMU may fail next."""
+_ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=")
+"""The place of a warning about a connection: in a file, or an option."""
 _ERRORS: Final = ("error", "fatal")
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
@@ -166,14 +169,22 @@ class Display:
             self._release(lambda line: status.progress[self._plan.node_of(line.instance)] > line.point)
 
 
-def warn(plan: Plan) -> None:
-    """Print the first five warnings about a system on standard error before it runs, and that it could be faster."""
+def warn(plan: Plan, *, only_access: bool = False) -> None:
+    """Print the first five warnings about a system on standard error before it runs, and that it could be faster.
+
+    Where one process of several is started manually, ``only_access`` leaves those that concern its connections.
+    """
+    if only_access:
+        for warning in plan.system.warnings:
+            if _ACCESS.search(warning.path):
+                say_warning(str(warning))
+        return
     if (slower := slower_than_it_could_be()) is not None:
-        say(f"warning: {slower}")
+        say_warning(slower)
     for warning in plan.system.warnings[:_WARNINGS]:
-        say(f"warning: {warning}")
+        say_warning(str(warning))
     if (rest := len(plan.system.warnings) - _WARNINGS) > 0:
-        say(f"warning: and {rest} more, which `fmu-mesh check` shows")
+        say_warning(f"and {rest} more, which `fmu-mesh check` shows")
 
 
 def summary(plan: Plan, outcome: Outcome) -> list[str]:

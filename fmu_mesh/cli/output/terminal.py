@@ -15,7 +15,7 @@ from .flag_words import in_flags
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["error_console", "may_draw", "say", "stdout_as_stderr", "teller"]
+__all__ = ["error_console", "may_draw", "say", "say_warning", "stdout_as_stderr", "teller"]
 
 
 def error_console() -> Console:
@@ -34,6 +34,13 @@ def may_draw(stream: IO[str]) -> bool:
 def say(text: str) -> None:
     """Print one line on standard error before a run."""
     print(f"fmu-mesh: {paragraph(in_flags(text))}", file=sys.stderr, flush=True)
+
+
+def say_warning(text: str) -> None:
+    """As `say`, with a colour where there are colours."""
+    from rich.text import Text  # noqa: PLC0415  as above
+
+    error_console().print(Text(f"fmu-mesh: warning: {paragraph(in_flags(text))}", "yellow"), soft_wrap=True)
 
 
 def teller(*, quiet: bool) -> Callable[[str], None]:

@@ -179,9 +179,6 @@ class Meshes:
         if self._found:
             return None
         if self._endpoints:
-            opening = self._open(self._endpoints, _NOBODY)
-            if (own := opening.identity) is not None and (hello := _greeted(opening.session(), _HELLO, _HELLO_S)):
-                return _without_role(own, hello)
             return ConfigurationError(f"no mesh can be reached at {', '.join(self._endpoints)}.")
         return ConfigurationError(
             "no mesh is running here.",
@@ -200,7 +197,12 @@ class Meshes:
         """Every mesh whose master can be reached at the endpoints."""
         opening = self._open(self._endpoints, _NOBODY)
         by = next((_by(note) for note in meshes() if {*note.endpoints} & {*self._endpoints}), None)
-        for key in tokens(opening.session(), _TOKENS, self._timeout_s):
+        session, own = opening.session(), opening.identity
+        found = tokens(session, _TOKENS, self._timeout_s)
+        if not found and own is not None and (hello := _greeted(session, _HELLO, _HELLO_S)) is not None:
+            *prefix, mesh, _, _ = hello[0].split("/")
+            _role(session, Keys("/".join(prefix), mesh), own, self._timeout_s)  # or only the tokens were late
+        for key in found:
             *prefix, mesh, _ = key.split("/")
             if prefix:  # otherwise it is not a token of a mesh
                 yield _Found(Keys("/".join(prefix), mesh, by), self._endpoints, opening)
@@ -314,11 +316,11 @@ def _by(note: MeshNote) -> str | None:
     return LOCAL if note.security else None
 
 
-def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> Hello | None:
-    """What a master answers to a certificate at once; None if it does not, or may not."""
+def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> tuple[str, Hello] | None:
+    """What a master answers to a certificate at once, and under which key; None if it does not, or may not."""
     for reply in session.get(key, timeout=timeout_s):
         if reply.ok is not None:
-            return decode_json(reply.ok.payload.to_bytes(), Hello)
+            return str(reply.ok.key_expr), decode_json(reply.ok.payload.to_bytes(), Hello)
     return None
 
 
@@ -339,14 +341,10 @@ def _role(session: zenoh.Session, keys: Keys, own: Identity, timeout_s: float) -
             break
         never.wait(min(left_s, _NOTE_CHECK_S))
     if (hello := _greeted(session, keys.mesh_key("hello"), _HELLO_S)) is not None:
-        raise _without_role(own, hello)
+        table = f"table {hello[1].table} of roles" if hello[1].table else "its roles"
+        hint = f"The mesh has {table}. Whoever has the authority can add the name; the next start of the mesh knows it."
+        raise ConfigurationError(f"'{own.name}' has no role in mesh '{keys.mesh}'.", hint=hint)
     raise DeadlineExceeded(f"mesh '{keys.mesh}' does not say which role '{own.name}' has", hint="Has it `security`?")
-
-
-def _without_role(own: Identity, hello: Hello) -> ConfigurationError:
-    table = f"table {hello.table} of roles" if hello.table else "its roles"
-    hint = f"The mesh has {table}. Whoever has the authority can add the name; the next start of the mesh knows it."
-    return ConfigurationError(f"'{own.name}' has no role in mesh '{hello.mesh}'.", hint=hint)
 
 
 def _means(keys: Keys, reference: str) -> bool:

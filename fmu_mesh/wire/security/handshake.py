@@ -222,7 +222,9 @@ def _refused(endpoint: str, error: ssl.SSLError, own: Identity | None) -> Config
     if alert is not None:
         if own is None:
             text = f"who listens at {endpoint} wants a certificate"
-            return ConfigurationError(text, hint="Give the folder that you have from its authority with `--security`.")
+            return ConfigurationError(
+                text, hint="Give the folder that you have from its authority with `security=...`."
+            )
         text = alert.format(name=f"'{own.name}'", authority=own.authority, until=own.until)
         return ConfigurationError(f"who listens at {endpoint} refuses: {text}")
     if "WRONG_VERSION_NUMBER" in reason or "RECORD_LAYER" in reason or "UNEXPECTED_EOF" in reason:
