@@ -187,7 +187,7 @@ def test_who_comes_without_a_certificate_is_told_to_give_one(folders: Path, list
     error = why_not(listens(folders / "host1"), None)
 
     assert "wants a certificate" in str(error)
-    assert "--security" in str(error)
+    assert "from its authority with `security=...`" in str(error)
 
 
 @pytest.mark.parametrize(
