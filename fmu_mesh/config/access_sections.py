@@ -173,4 +173,7 @@ def check_access(loaded: LoadedConfig, findings: Findings) -> Findings:
     ros = {f"ros.{name}": getattr(config.ros, name) for name in ("listen", "connect") if config.ros is not None}
     for place, text in why_open({**own, **ros}, secured=secured):
         warnings.add(place, text, "")
+    if (group := config.runtime.share_with) is not None:
+        trusted = f"the members of the group '{group}' are trusted as you are: they can read, set and end this mesh"
+        warnings.add("runtime.share_with", trusted, "")
     return warnings

@@ -57,7 +57,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         launch: the launcher that started this process; None if it was started manually.
         profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
-        table: number of the table of roles; None: it listens to nobody with a certificate.
+        table: number of the table of roles; 0: it has none of our authority.
     """
 
     endpoints: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     launch: str | None = None
     profile: bool = False
     paused: bool = False
-    table: int | None = None
+    table: int = 0
 
 
 class MasterServer:

@@ -228,7 +228,11 @@ class Meshes:
         session = found.opening.session()
         own, reached = found.opening.identity, (found.endpoints, self._timeout_s)
         if own is None:
-            return MeshClient(session, found.keys, *reached)
+            keys = found.keys
+            # It was reached by a socket that no note of this user names, such as one for a group.
+            if keys.by is None and self._endpoints and _greeted(session, keys.mesh_key("hello"), _HELLO_S) is not None:
+                keys = replace(keys, by=LOCAL)
+            return MeshClient(session, keys, *reached)
         role = _role(session, found.keys, own, self._timeout_s)
         return MeshClient(session, replace(found.keys, by=own.name), *reached, role=role)
 
