@@ -118,28 +118,45 @@ PARSERS: Parsers = {
     ),
     "security": (
         argument(
-            "what", "init|add|renew|remove|show", "what to do", choices=("init", "add", "renew", "remove", "show")
+            "what",
+            "init|add|renew|remove|show",
+            "init: make an authority in an empty folder; add: certify a person or a host, and write the folder "
+            "DIR/NAME to hand over; renew: with a new certificate; remove: take the role away; show: who, which role, "
+            "until when",
+            choices=("init", "add", "renew", "remove", "show"),
         ),
-        argument("folder", "DIR", "the folder of the authority", type=Path),
-        argument("name", "NAME", "a person or a host; not for init and show", nargs="?"),
-        argument("--role", "ROLE", "of NAME: observer, operator or node", choices=("observer", "operator", "node")),
-        argument(
-            "--days",
-            "N",
-            "how long the certificate lasts (90); a part of a day is possible",
-            type=positive_seconds,
-            default=90.0,
+        argument("folder", "DIR", "the folder of the authority; for show also that of one name", type=Path),
+        argument("name", "NAME", "a person or a host: of add, renew and remove", nargs="?"),
+        group(
+            "add and renew",
+            argument(
+                "--role",
+                "ROLE",
+                "observer (reads), operator (also sets and commands) or node (all that belongs to a run: who launches, "
+                "each host, a router); add only",
+                choices=("observer", "operator", "node"),
+            ),
+            argument(
+                "--days",
+                "N",
+                "how long the certificate lasts; default: 90; 0.5 are 12 hours",
+                type=positive_seconds,
+            ),
+            argument(
+                "--host",
+                "HOST",
+                "a name or an address by which others reach a node; repeatable; default: those of this host, or those "
+                "that it has",
+                action="append",
+                default=[],
+            ),
         ),
-        argument(
-            "--host",
-            "HOST",
-            "a name or an address at which a node listens; repeatable; default: this host's",
-            action="append",
-            default=[],
+        group(
+            "show",
+            switch("--table", text="what each role may do"),
+            switch("--zenohd", text="the rules for a router of your own, as JSON of Zenoh"),
+            json_switch("JSON, one object for each name"),
         ),
-        switch("--table", text="show: what each role may do"),
-        switch("--zenohd", text="show: the rules for a router of your own, as JSON"),
-        json_switch("show: JSON, one object for each name"),
     ),
     "recover": (
         argument("results", "FILE", "the result file, as the run was given it", type=Path),

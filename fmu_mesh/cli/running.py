@@ -197,7 +197,7 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
     folder = given_folder(arguments.security) if arguments.security or any(map(has_tls, listen)) else None
     own = None
     if folder is not None and not arguments.insecure:
-        from ..wire.security.identity import identity_in  # noqa: PLC0415  most routers have no certificate
+        from ..wire.security.certificates import identity_in  # noqa: PLC0415  most routers have no certificate
 
         own = identity_in(folder)
     for _, text in why_open({"--listen": listen}, secured=own is not None):

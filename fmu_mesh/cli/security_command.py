@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ..errors import ConfigurationError
-from ..installing import importing
-from ..text import counted, listed, short_path
+from ..text import listed, short_path
+from ..wire.security.identity import CERTIFICATE, ends_soon, time_left
 from ..wire.security.rules import ACTIONS, ROLE_NAMES, access_control
 from .arguments import Runs
 from .output.json_output import print_json
@@ -24,86 +24,113 @@ if TYPE_CHECKING:
 
 __all__ = ["RUNS"]
 
-_SOON: Final = timedelta(days=30)
+_DAYS: Final = 90.0
+_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "init": (),
+    "add": ("name", "role", "days", "host"),
+    "renew": ("name", "days", "host"),
+    "remove": ("name",),
+    "show": ("table", "zenohd", "json"),
+}
 
 
 def _security(arguments: argparse.Namespace) -> int:
-    with importing("cryptography", "certificates"):
-        from ..wire.security.authority import Authority  # noqa: PLC0415  an optional library
-    if arguments.what == "init":
-        authority = Authority.made(arguments.folder)
-        print(f"{short_path(authority.folder)}: a new authority. Its key, ca.key, stays here; no run reads it.")
-        print(f"Next, a folder for each host and person: `fmu-mesh security add {arguments.folder} NAME --role ROLE`.")
-        return 0
-    return _DO[arguments.what](Authority(arguments.folder), arguments)
-
-
-def _add(authority: Authority, arguments: argparse.Namespace) -> int:
-    name = _name(arguments)
-    if arguments.role is None:
-        raise ConfigurationError(f"'{name}' needs a role.", hint=f"`--role` is one of {listed(ROLE_NAMES)}.")
-    if arguments.host and arguments.role != "node":
-        raise ConfigurationError("`--host` is for who listens, and only a node does.")
-    _hand_over(authority, authority.add(name, arguments.role, arguments.days, arguments.host))
-    return 0
-
-
-def _renew(authority: Authority, arguments: argparse.Namespace) -> int:
-    _hand_over(authority, authority.renew(_name(arguments), arguments.days))
-    return 0
-
-
-def _remove(authority: Authority, arguments: argparse.Namespace) -> int:
-    name = _name(arguments)
-    authority.remove(name)
-    nodes = [own for own, member in authority.members.items() if member.role == "node"]
-    print(f"'{name}' has no role any more, from the next start of who listens with the new table on.")
-    if nodes:
-        print(f"Copy roles.json of {listed(nodes)} to their hosts again.")
-    return 0
-
-
-def _show(authority: Authority, arguments: argparse.Namespace) -> int:
-    if arguments.zenohd:
-        roles = {name: member.role for name, member in authority.members.items()}
-        print(json.dumps({"access_control": access_control("fmu_mesh/*", roles)}, indent=2))
-        return 0
+    what, given = arguments.what, vars(arguments)
+    for option in ("name", "role", "days", "host", "table", "zenohd", "json"):
+        if given[option] and option not in _OPTIONS[what]:
+            shown = f"'{arguments.name}'" if option == "name" else f"--{option}"
+            raise ConfigurationError(f"`security {what}` takes no {shown}")
+    if "name" in _OPTIONS[what] and arguments.name is None:
+        raise ConfigurationError(f"`security {what}` needs a name after the folder.")
     if arguments.table:
         for action in ACTIONS:
             print(f"{action.what:62} {', '.join(action.roles)}")
         return 0
-    if arguments.json:
-        for name, member in authority.members.items():
-            print_json({"name": name, "role": member.role, "until": member.until, "hosts": member.hosts})
-        return 0
-    for name, member in authority.members.items():
-        hosts = f"  listens as {', '.join(member.hosts)}" if member.hosts else ""
-        print(f"{name:20} {member.role:9} {_until(member)}{hosts}")
+    from ..wire.security.authority import LIST, Authority  # noqa: PLC0415  it needs an optional library
+
+    folder: Path = arguments.folder
+    if what == "init":
+        authority = Authority.made(folder)
+        print(f"{short_path(folder)}: a new authority, '{authority.name}', which {time_left(authority.until)}.")
+        print("Its key, ca.key, stays here: who has it can certify anybody. No run reads it.")
+        print(f"Next, a folder for each host and person: `fmu-mesh security add {folder} NAME --role ROLE`.")
+    elif what == "show" and not (folder / LIST).exists() and (folder / CERTIFICATE).exists():
+        _show_one(folder, as_json=arguments.json)
+    else:
+        _DO[what](Authority(folder), arguments)
     return 0
 
 
-def _until(member: Member) -> str:
-    until = datetime.fromisoformat(member.until)
-    left = until - datetime.now(UTC)
-    if left < timedelta(0):
-        return f"ended at {until:%Y-%m-%d %H:%M} UTC"
-    days = f"{counted(left.days, 'day')} left" if left >= timedelta(days=1) else "less than a day left"
-    return f"until {until:%Y-%m-%d %H:%M} UTC ({days}{': renew it' if left < _SOON else ''})"
+def _add(authority: Authority, arguments: argparse.Namespace) -> None:
+    name, role = arguments.name, arguments.role
+    if role is None:
+        raise ConfigurationError(f"'{name}' needs a role.", hint=f"`--role` is one of {listed(ROLE_NAMES)}.")
+    _hand_over(authority, authority.add(name, role, arguments.days or _DAYS, arguments.host))
+    _tell_of_tables(authority, name)
+
+
+def _renew(authority: Authority, arguments: argparse.Namespace) -> None:
+    _hand_over(authority, authority.renew(arguments.name, arguments.days or _DAYS, arguments.host))
+    print("Who dials takes it at the next dial, who listens at its next start. The old one is valid until it ends.")
+
+
+def _remove(authority: Authority, arguments: argparse.Namespace) -> None:
+    name, member = arguments.name, authority.members.get(arguments.name)
+    authority.remove(name)
+    print(f"'{name}' has no role in {authority.table}, nor in what is started with it.")
+    if member is not None:
+        print(f"What is running keeps its table until it is started again. The certificate {_life(member)}.")
+    _tell_of_tables(authority, name)
+
+
+def _show(authority: Authority, arguments: argparse.Namespace) -> None:
+    if arguments.zenohd:
+        print(json.dumps({"access_control": access_control("fmu_mesh/*", authority.table.roles)}, indent=2))
+        return
+    if arguments.json:
+        for name, member in authority.members.items():
+            print_json({"name": name, "role": member.role, "until": member.until, "hosts": member.hosts})
+        return
+    print(f"The authority '{authority.name}' {time_left(authority.until)}; {authority.table}:")
+    for name, member in authority.members.items():
+        soon = ": renew it" if ends_soon(datetime.fromisoformat(member.until)) else ""
+        print(f"{name:20} {member.role:9} {_life(member)}{soon}")
+
+
+def _show_one(folder: Path, *, as_json: bool) -> None:
+    from ..wire.security.certificates import identity_in  # noqa: PLC0415  as above
+
+    own = identity_in(folder)
+    if as_json:
+        print_json({"name": own.name, "role": own.role, "until": own.until.isoformat(), "authority": own.authority})
+        return
+    role = f"{own.role} " if own.role is not None else ""
+    print(f"{short_path(folder)}: {role}'{own.name}' of the authority '{own.authority}', {time_left(own.until)}")
+    if own.table is not None:
+        print(f"It has {own.table}: {', '.join(f'{name} ({role})' for name, role in own.table.roles.items())}")
+
+
+def _life(member: Member) -> str:
+    hosts = f"; listens as {', '.join(member.hosts)}" if member.hosts else ""
+    return time_left(datetime.fromisoformat(member.until)) + hosts
 
 
 def _hand_over(authority: Authority, folder: Path) -> None:
     member = authority.members[folder.name]
-    print(f"{short_path(folder)}: {member.role} '{folder.name}', {_until(member)}")
+    print(f"{short_path(folder)}: {member.role} '{folder.name}', {_life(member)}")
     print("Hand this folder over, and nothing else: its key.pem is a secret.")
 
 
-def _name(arguments: argparse.Namespace) -> str:
-    if arguments.name is None:
-        raise ConfigurationError(f"`security {arguments.what}` needs a name after the folder.")
-    return str(arguments.name)
+def _tell_of_tables(authority: Authority, changed: str) -> None:
+    """A table is read at a start, so each host needs the newest one before."""
+    nodes = [own for own, member in authority.members.items() if member.role == "node" and own != changed]
+    if nodes:
+        print(
+            f"The folder of {listed(nodes)} has a new roles.json: copy it to each host that has a copy of its folder."
+        )
 
 
-_DO: Final[Mapping[str, Callable[[Authority, argparse.Namespace], int]]] = {
+_DO: Final[Mapping[str, Callable[[Authority, argparse.Namespace], None]]] = {
     "add": _add,
     "renew": _renew,
     "remove": _remove,

@@ -76,7 +76,7 @@ def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tu
     made = replace(made, gossip=False)
     if all(map(is_socket, (*made.listen, *made.connect))):
         return made
-    from ..wire.security.identity import identity_in  # noqa: PLC0415  most runs have no certificate
+    from ..wire.security.certificates import identity_in  # noqa: PLC0415  most runs have no certificate
 
     own = identity_in(Path(security.folder), security.roles or None)
     if own.role != "node":

@@ -101,7 +101,7 @@ def test_who_has_no_certificate_or_no_role_is_told_so_in_time(place: Place, lab:
     port = running.rpartition(":")[2]
     expected = {
         (running, "carl"): "'carl' has no role in mesh 'pair'",
-        (running, "../other/eve"): "is not signed by fmu_mesh other",
+        (running, "../other/eve"): "and ours by 'other of 20",
         (running, None): "without a certificate. Expected `--security`, or FMU_MESH_SECURITY",
         (f"tcp/127.0.0.1:{port}", "alice"): "without TLS, although there is `security`",
         (f"tls/127.0.0.1:{free_port()}", "alice"): "nobody listens at",

@@ -289,7 +289,7 @@ class _Opening:
 
     def _identity(self) -> Identity | None:
         """The certificate with which this process comes."""
-        from ..security.identity import identity_in  # noqa: PLC0415  most meshes need no certificate
+        from ..security.certificates import identity_in  # noqa: PLC0415  most meshes need no certificate
 
         folder = given_folder(self._security)
         return identity_in(folder) if folder is not None and not self._wiring.insecure else None

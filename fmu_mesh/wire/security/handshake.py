@@ -8,27 +8,37 @@ Zenoh has one text for all reasons, after its whole deadline; or it opens, and h
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import ssl
 import threading
 import time
 from collections.abc import Sequence
-from typing import Final
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final, Self
 
 from ...errors import ConfigurationError, MeshLost
 from .identity import Identity
 
+if TYPE_CHECKING:
+    from cryptography.x509 import Certificate
+
 __all__ = ["check_link", "host_and_port", "shake_hands"]
 
-_DEADLINE_S: Final = 2.0
+_DEADLINE_S: Final = 1.9
 _DIAL_S: Final = 0.1
 """Time in s between two looks for who does not listen yet."""
+
+_UNKNOWN_VERSION_OF_QUIC: Final = b"\xc0\x1a\x2a\x3a\x4a\x08" + os.urandom(8) + b"\x00" + bytes(1185)
+"""Who listens with QUIC answers with the versions that it knows (RFC 9000, 6.1)."""
 
 _BY_ALERT: Final = {
     "CERTIFICATE_REQUIRED": "it wants a certificate, and got none",
     "UNKNOWN_CA": "it does not know the authority {authority} of {name}",
-    "CERTIFICATE_EXPIRED": "the certificate of {name} has ended ({until:%Y-%m-%d %H:%M} UTC)",
+    "CERTIFICATE_EXPIRED": "by its clock the certificate of {name}, which ends at {until:%Y-%m-%d %H:%M} UTC, "
+    "is not valid now",
     "BAD_CERTIFICATE": "it does not take the certificate of {name}",
     "UNSUPPORTED_CERTIFICATE": "the certificate of {name} is for another use",
     "CERTIFICATE_REVOKED": "the certificate of {name} is revoked",
@@ -50,33 +60,40 @@ def check_link(endpoint: str, own: Identity | None) -> None:
     """Shake hands with who listens at an endpoint, and hang up.
 
     Args:
-        endpoint: `tls/host:port` or `quic/host:port`; the second kind is not looked at.
-        own: who comes; None: without a certificate.
+        endpoint: `tls/host:port`. Of `quic/host:port` it is only seen whether somebody listens with QUIC.
+        own: who comes; None: without a certificate, and without a look at that of who listens.
 
     Raises:
         MeshLost: nobody listens there, or not with TLS.
         ConfigurationError: one of the two does not take the certificate of the other one; says which, and why.
     """
-    if not endpoint.startswith("tls/"):
+    if not endpoint.startswith(("tls/", "quic/")):
         return
-    host, port = host_and_port(endpoint)
+    (host, port), quic = host_and_port(endpoint), endpoint.startswith("quic/")
     end = time.monotonic() + _DEADLINE_S
     try:
-        with socket.create_connection((host, port), _DEADLINE_S) as connection:
-            context = _context(own)
+        with _connection(host, port, end, socket.SOCK_DGRAM if quic else socket.SOCK_STREAM) as connection:
             try:
-                with context.wrap_socket(connection, server_hostname=host) as secured:
+                if quic:
+                    connection.send(_UNKNOWN_VERSION_OF_QUIC)
+                    connection.recv(1)
+                    return
+                with _Context(own).wrap_socket(connection, server_hostname=host) as secured:
                     _wait_for_verdict(secured, end)
             except ssl.SSLCertVerificationError as error:
-                raise ConfigurationError(f"{endpoint}: {_why_not_theirs(error, host, own)}") from error
+                why = _why_not_theirs(error.verify_code, host, own, _certificate_at(host, port, end))
+                raise ConfigurationError(f"{endpoint}: {why or error.verify_message}") from error
             except ssl.SSLError as error:
                 raise _refused(endpoint, error, own) from error
-            except (TimeoutError, ConnectionError) as error:
-                text = f"who listens at {endpoint} does not answer with TLS within {_DEADLINE_S:g} s"
-                raise MeshLost(text, hint="Is it a port of TCP? Then it is tcp/ and not tls/.") from error
-    except socket.gaierror as error:
+            except TimeoutError as error:
+                text = f"who listens at {endpoint} does not answer with {'QUIC' if quic else 'TLS'}"
+                hint = f"It had {_DEADLINE_S:g} s." + (
+                    "" if quic else " Is it a port of TCP? Then it is tcp/ and not tls/."
+                )
+                raise MeshLost(text, hint=hint) from error
+    except (socket.gaierror, UnicodeError) as error:
         raise MeshLost(f"{endpoint}: no host has the name '{host}'") from error
-    except (TimeoutError, OSError) as error:
+    except OSError as error:
         reason = error.strerror or "no answer"
         raise MeshLost(f"nobody listens at {endpoint}: {reason.lower()}") from error
 
@@ -111,12 +128,51 @@ def shake_hands(endpoints: Sequence[str], own: Identity, patience_s: float | Non
         never.wait(_DIAL_S)
 
 
-def _context(own: Identity | None) -> ssl.SSLContext:
-    context = ssl.create_default_context(ssl.Purpose.SERVER_AUTH, cafile=own.ca if own is not None else None)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    if own is not None:
-        context.load_cert_chain(own.certificate, own.key)
-    return context
+class _Context(ssl.SSLContext):
+    """Takes and refuses the same certificates as Zenoh: any authority of the folder is enough, a common name is not.
+
+    Without an identity it takes each, and shows none.
+    """
+
+    def __new__(cls, own: Identity | None) -> Self:
+        self = super().__new__(cls, ssl.PROTOCOL_TLS_CLIENT)
+        if own is None:
+            self.check_hostname = False
+            self.verify_mode = ssl.CERT_NONE
+        else:
+            self.hostname_checks_common_name = False
+            self.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+            self.load_verify_locations(own.ca)
+            self.load_cert_chain(own.certificate, own.key)
+        return self
+
+
+def _connection(host: str, port: int, end: float, kind: socket.SocketKind) -> socket.socket:
+    for family, _, _, _, address in (places := socket.getaddrinfo(host, port, type=kind)):
+        connection = socket.socket(family, kind)
+        connection.settimeout(max(end - time.monotonic(), _DIAL_S))
+        try:
+            connection.connect(address)
+        except OSError:
+            connection.close()
+            if address == places[-1][-1]:
+                raise
+        else:
+            return connection
+    raise TimeoutError
+
+
+def _certificate_at(host: str, port: int, end: float) -> Certificate | None:
+    """The certificate of who listens, whatever it is worth; None if it does not come in time."""
+    from cryptography.x509 import load_der_x509_certificate  # noqa: PLC0415  an optional library
+
+    with (
+        suppress(OSError),
+        _connection(host, port, end, socket.SOCK_STREAM) as connection,
+        _Context(None).wrap_socket(connection, server_hostname=host) as secured,
+    ):
+        return load_der_x509_certificate(secured.getpeercert(binary_form=True) or b"")
+    return None
 
 
 def _wait_for_verdict(secured: ssl.SSLSocket, end: float) -> None:
@@ -133,21 +189,31 @@ def _wait_for_verdict(secured: ssl.SSLSocket, end: float) -> None:
     # Neither: an end that sends no tickets has taken the certificate.
 
 
-def _why_not_theirs(error: ssl.SSLCertVerificationError, host: str, own: Identity | None) -> str:
-    """Why we do not take the certificate of who listens."""
-    code, whose = error.verify_code, own.authority if own is not None else "this system"
+def _why_not_theirs(code: int, host: str, own: Identity | None, theirs: Certificate | None) -> str | None:
+    """Why we do not take the certificate of who listens, by the code of OpenSSL."""
+    from .certificates import called, hosts_of  # noqa: PLC0415  an optional library
+
+    if theirs is None:
+        return None
+    whose = f"the certificate of who listens, '{called(theirs.subject)}',"
     match code:
         case 10:
-            return "the certificate of who listens has ended. It renews it with `fmu-mesh security renew`"
+            ended = theirs.not_valid_after_utc
+            return (
+                f"{whose} ended at {ended:%Y-%m-%d %H:%M} UTC. `fmu-mesh security renew` renews it, for its next start"
+            )
         case 9:
-            return "the certificate of who listens is not valid yet: is the clock of this host right?"
+            begins, now = theirs.not_valid_before_utc, datetime.now(UTC)
+            return (
+                f"{whose} is not valid before {begins:%Y-%m-%d %H:%M} UTC, and the clock here says {now:%Y-%m-%d %H:%M}"
+            )
         case 62 | 64:
-            return f"the certificate of who listens is not for '{host}': it was made with other `--host` names"
+            hint = "`fmu-mesh security renew ... --host` gives it other names"
+            return f"{whose} is for {', '.join(hosts_of(theirs)) or 'no host'} and not for '{host}'. {hint}"
         case 26:
-            return "who listens has a certificate for clients only: its role is not node"
-        case 18 | 19 | 20 | 21:
-            return f"the certificate of who listens is not signed by {whose}"
-    return f"the certificate of who listens is not valid: {error.verify_message}"
+            return f"{whose} is for clients only: its role is not node"
+    ours = f", and ours by '{own.authority}'" if own is not None else ""
+    return f"{whose} is signed by '{called(theirs.issuer)}'{ours}"
 
 
 def _refused(endpoint: str, error: ssl.SSLError, own: Identity | None) -> ConfigurationError | MeshLost:
