@@ -23,7 +23,7 @@ from ..wire.keys import Keys
 from ..wire.messages import decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import Hello, LogLine, MeshStatus
+from ..wire.views import LogLine, MeshHello, MeshStatus
 
 __all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
 
@@ -119,7 +119,7 @@ class MasterServer:
 
         The rules let it ask only for its own role; so an answer is all that it needs.
         """
-        answer = msgspec.json.encode(Hello(self._keys.mesh, table))
+        answer = msgspec.json.encode(MeshHello(self._keys.mesh, table))
 
         def reply(key: str, query: zenoh.Query) -> None:
             query.reply(key, answer, encoding=json_encoding)

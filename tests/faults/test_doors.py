@@ -188,7 +188,7 @@ with zenoh.open(config) as session:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
-def test_the_members_of_a_group_reach_a_mesh_that_is_shared_with_them(place: Place) -> None:
+def test_members_of_a_group_reach_a_mesh_shared_with_them(place: Place) -> None:
     group = next(own for own in grp.getgrall() if own.gr_gid not in (0, NOBODY))
     launched = running(place, "--set-config", f"runtime.share_with={group.gr_name}")
     path = place.note().endpoints[1].partition("/")[2]

@@ -24,7 +24,7 @@ from ..keys import LOCAL, Keys
 from ..messages import decode_json
 from ..runtime import MeshNote, meshes
 from ..session import Wiring, close_session, open_session, tokens
-from ..views import Hello
+from ..views import MeshHello
 from .mesh_client import MeshClient, is_key, key_expression
 
 if TYPE_CHECKING:  # as above
@@ -320,11 +320,11 @@ def _by(note: MeshNote) -> str | None:
     return LOCAL if note.security else None
 
 
-def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> tuple[str, Hello] | None:
+def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> tuple[str, MeshHello] | None:
     """What a master answers to a certificate at once, and under which key; None if it does not, or may not."""
     for reply in session.get(key, timeout=timeout_s):
         if reply.ok is not None:
-            return str(reply.ok.key_expr), decode_json(reply.ok.payload.to_bytes(), Hello)
+            return str(reply.ok.key_expr), decode_json(reply.ok.payload.to_bytes(), MeshHello)
     return None
 
 
