@@ -34,6 +34,7 @@ from tests.network_hosts import NetworkHost, two_hosts
 
 __all__ = ["JOBS", "LINKS", "FarJob", "FarRuns", "main"]
 
+_LISTENING: Final = "--listen", "tcp/0.0.0.0:7447", "--insecure"
 _MOST_S: Final = 120.0
 _NOT_MET: Final = "their rows go by Zenoh"
 """The end of a warning: processes did not meet for a row stream in time."""
@@ -140,7 +141,7 @@ class FarRuns:
             if alone.wait(_MOST_S):
                 raise RuntimeError(alone.story())
         running += [
-            first.start("fmu-mesh", "master", file, "--listen", "tcp/0.0.0.0:7447", "--insecure", "--output", f"../{result.name}"),
+            first.start("fmu-mesh", "master", file, *_LISTENING, "--output", f"../{result.name}"),
             first.start("fmu-mesh", "node", file, near),
             second.start("fmu-mesh", "node", file, far, "--connect", "tcp/router:7447", "--insecure"),
         ]

@@ -1,4 +1,4 @@
-"""Who can reach a mesh: the sections `security` and `runtime`, and what an endpoint opens to others.
+"""Who can reach a mesh: the sections `zenoh`, `security` and `runtime`, and what an endpoint opens to others.
 
 A Unix socket is open to its user. A port of this host is open to all its users, and one at a network to everybody
 there: with TLS they need a certificate; without it they can do everything, so a configuration has to say that they may.
@@ -10,21 +10,19 @@ import ipaddress
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from fmu_mesh.config.base import Base
-
-if TYPE_CHECKING:  # a configuration has sections of this module
-    from fmu_mesh.config.findings import Findings
-    from fmu_mesh.config.loading import LoadedConfig
+from fmu_mesh.config.base import KEY_PREFIX_PATTERN, Base, Endpoint
+from fmu_mesh.config.findings import Findings
 
 __all__ = [
     "SECURITY_VARIABLE",
     "Role",
     "RuntimeConfig",
     "SecurityConfig",
+    "ZenohConfig",
     "check_access",
     "given_folder",
     "has_tls",
@@ -39,6 +37,70 @@ Role = Literal["observer", "operator", "node"]
 
 SECURITY_VARIABLE: Final = "FMU_MESH_SECURITY"
 """The variable of a host with the folder of its certificate."""
+
+
+class ZenohConfig(Base, frozen=True, kw_only=True):
+    """How the processes of the mesh find each other."""
+
+    key_prefix: Annotated[
+        str,
+        Meta(
+            pattern=KEY_PREFIX_PATTERN,
+            title="a key such as fmu_mesh or lab/fmu_mesh, without / * $ ? # @ in its parts",
+            description="First part of every key of the mesh.",
+        ),
+    ] = "fmu_mesh"
+    mode: Annotated[
+        Literal["peer", "client"],
+        Meta(
+            description="peer: nodes link directly to each other; client: everything goes through the router "
+            "in `connect`, which is always so for nodes and masters that are started manually and only connect."
+        ),
+    ] = "peer"
+    listen: Annotated[
+        list[Endpoint],
+        Meta(
+            description="Where other hosts and users can connect to the master, such as tls/0.0.0.0:7447, besides the "
+            "Unix socket in the user's runtime folder. tls/ needs `security`; tcp/ beyond this host, `insecure`."
+        ),
+    ] = []
+    connect: Annotated[
+        list[Endpoint],
+        Meta(description="Where to connect to a router or to the mesh of another host, such as tls/192.168.1.2:7447."),
+    ] = []
+    insecure: Annotated[
+        bool,
+        Meta(
+            description="true: there may be endpoints without TLS at a network, and everybody there can read and set "
+            "values and end runs."
+        ),
+    ] = False
+    shared_memory: Annotated[
+        bool,
+        Meta(
+            description="true: processes on the same host read values, grants and progress in shared memory; false: "
+            "they exchange them as processes of different hosts do."
+        ),
+    ] = True
+    row_streams: Annotated[
+        bool | None,
+        Meta(
+            description="true: processes that share no memory exchange values, grants and progress through sockets of "
+            "their own, where they can reach each other; false: through Zenoh. null: true, and with `security` false, "
+            "because those sockets have no TLS."
+        ),
+    ] = None
+    rows_address: Annotated[
+        Annotated[str, Meta(min_length=1)] | None,
+        Meta(
+            description="Address at which other hosts reach this host for row streams. Each host has its own, so it is "
+            "an option of each process. null: the one from which it reaches the master or the router in `connect`."
+        ),
+    ] = None
+    config: Annotated[
+        str | None,
+        Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),
+    ] = None
 
 
 class SecurityConfig(Base, frozen=True, kw_only=True):
@@ -155,10 +217,15 @@ def why_open(ends: Mapping[str, Sequence[str]], *, secured: bool) -> Iterator[tu
                 yield place, f"every user of this host can set values at {endpoint}"
 
 
-def check_access(loaded: LoadedConfig, findings: Findings) -> Findings:
-    """Check the endpoints of a mesh; returns warnings of those that are open to others."""
-    config, warnings = loaded.config, loaded.findings()
-    zenoh, secured = config.zenoh, config.security is not None
+def check_access(
+    zenoh: ZenohConfig,
+    security: SecurityConfig | None,
+    ros: Mapping[str, Sequence[str]],
+    findings: Findings,
+    warnings: Findings,
+) -> None:
+    """Check where a mesh can be reached; ``ros`` has the endpoints of the section `ros` by their paths."""
+    secured = security is not None
     if secured and zenoh.insecure:
         findings.add("zenoh.insecure", "true, although there is `security`", "one of the two")
     if secured and zenoh.row_streams:
@@ -170,7 +237,5 @@ def check_access(loaded: LoadedConfig, findings: Findings) -> Findings:
             closed = why_closed(endpoint, secured=secured, insecure=zenoh.insecure, own_settings=settings)
             if closed is not None:
                 findings.add(f"{place}[{index}]", *closed)
-    ros = {f"ros.{name}": getattr(config.ros, name) for name in ("listen", "connect") if config.ros is not None}
     for place, text in why_open({**own, **ros}, secured=secured):
         warnings.add(place, text, "")
-    return warnings

@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 from msgspec import Meta
 
-from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig
-from fmu_mesh.config.base import KEY_PREFIX_PATTERN, NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Endpoint, Name
+from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig, ZenohConfig
+from fmu_mesh.config.base import NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Name
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection
 from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
@@ -222,70 +222,6 @@ class RecordConfig(Base, frozen=True, kw_only=True):
         float | None,
         Meta(description="Time in s from which on there are rows; null: from the first communication point on."),
     ] = msgspec.field(name="from", default=None)
-
-
-class ZenohConfig(Base, frozen=True, kw_only=True):
-    """How the processes of the mesh find each other."""
-
-    key_prefix: Annotated[
-        str,
-        Meta(
-            pattern=KEY_PREFIX_PATTERN,
-            title="a key such as fmu_mesh or lab/fmu_mesh, without / * $ ? # @ in its parts",
-            description="First part of every key of the mesh.",
-        ),
-    ] = "fmu_mesh"
-    mode: Annotated[
-        Literal["peer", "client"],
-        Meta(
-            description="peer: nodes link directly to each other; client: everything goes through the router "
-            "in `connect`, which is always so for nodes and masters that are started manually and only connect."
-        ),
-    ] = "peer"
-    listen: Annotated[
-        list[Endpoint],
-        Meta(
-            description="Where other hosts and users can connect to the master, such as tls/0.0.0.0:7447, besides the "
-            "Unix socket in the user's runtime folder. tls/ needs `security`; tcp/ beyond this host, `insecure`."
-        ),
-    ] = []
-    connect: Annotated[
-        list[Endpoint],
-        Meta(description="Where to connect to a router or to the mesh of another host, such as tls/192.168.1.2:7447."),
-    ] = []
-    insecure: Annotated[
-        bool,
-        Meta(
-            description="true: there may be endpoints without TLS at a network, and everybody there can read and set "
-            "values and end runs."
-        ),
-    ] = False
-    shared_memory: Annotated[
-        bool,
-        Meta(
-            description="true: processes on the same host read values, grants and progress in shared memory; false: "
-            "they exchange them as processes of different hosts do."
-        ),
-    ] = True
-    row_streams: Annotated[
-        bool | None,
-        Meta(
-            description="true: processes that share no memory exchange values, grants and progress through sockets of "
-            "their own, where they can reach each other; false: through Zenoh. null: true, and with `security` false, "
-            "because those sockets have no TLS."
-        ),
-    ] = None
-    rows_address: Annotated[
-        Annotated[str, Meta(min_length=1)] | None,
-        Meta(
-            description="Address at which other hosts reach this host for row streams. Each host has its own, so it is "
-            "an option of each process. null: the one from which it reaches the master or the router in `connect`."
-        ),
-    ] = None
-    config: Annotated[
-        str | None,
-        Meta(description="A Zenoh configuration file (JSON5), relative to this file, to start from."),
-    ] = None
 
 
 class TimeoutsConfig(Base, frozen=True, kw_only=True):

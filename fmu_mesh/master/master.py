@@ -188,7 +188,7 @@ class Master:
         server.show("plan", lambda: self._states.plan.nodes)
         for key in (self._keys.command, *([replace(self._keys, by="*").command] if self._is_secured else ())):
             server.serve(key, self._command)
-        if self._settings.table is not None:
+        if self._is_secured:
             server.greet(self._settings.table)
         server.hand_on_logs()
         self._token = self._session.liveliness().declare_token(self._keys.master)

@@ -23,7 +23,7 @@ from ..wire.keys import Keys
 from ..wire.messages import decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import Hello, LogLine, MeshStatus
+from ..wire.views import LogLine, MeshHello, MeshStatus
 
 __all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
 
@@ -57,7 +57,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         launch: the launcher that started this process; None if it was started manually.
         profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
-        table: number of the table of roles; None: it listens to nobody with a certificate.
+        table: number of the table of roles; 0: it has none of our authority.
     """
 
     endpoints: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     launch: str | None = None
     profile: bool = False
     paused: bool = False
-    table: int | None = None
+    table: int = 0
 
 
 class MasterServer:
@@ -119,7 +119,7 @@ class MasterServer:
 
         The rules let it ask only for its own role; so an answer is all that it needs.
         """
-        answer = msgspec.json.encode(Hello(self._keys.mesh, table))
+        answer = msgspec.json.encode(MeshHello(self._keys.mesh, table))
 
         def reply(key: str, query: zenoh.Query) -> None:
             query.reply(key, answer, encoding=json_encoding)

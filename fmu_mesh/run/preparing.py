@@ -37,6 +37,7 @@ from ..text import nearest_file
 from ..variables.model_description import ModelDescription, Variable
 from ..variables.value_conversion import ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue
+from ..wire.runtime import why_not_shared
 from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
@@ -180,6 +181,11 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
+    if (group := loaded.config.runtime.share_with) is not None:
+        trusted = f"the members of the group '{group}' are trusted as you are: they can read, set and end this mesh"
+        warnings.add("runtime.share_with", trusted, "")
+        if (why_not := why_not_shared(group)) is not None:
+            obstacles.add("runtime.share_with", why_not, "a group of this host that you are a member of")
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)

@@ -34,7 +34,7 @@ from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Stiff
 from ..wire.router_link import RouterLink
-from ..wire.runtime import fmu_folder, run_folder, write_note
+from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_endpoint, write_note
 from ..wire.session import Wiring, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
@@ -252,9 +252,12 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
             own = certified(own, config.security, Keys(config.zenoh.key_prefix, config.mesh).root, config.ends)
-            runs = _MasterRuns(run, process, own)
+            shared = _shared(run, process, own)
+            runs = _MasterRuns(run, process, replace(own, listen=(*own.listen, *shared)))
+            for endpoint in shared:
+                share(endpoint)
             session = runs.session
-            ends = own_endpoints(session, own) if zenoh.mode == "peer" else ()
+            ends = own_endpoints(session, runs.wiring) if zenoh.mode == "peer" else ()
             ends = ends or tuple(config.zenoh.connect)  # a client is reached through its router
             settings = MasterSettings(
                 endpoints=tuple(sorted(ends, key=is_socket, reverse=True)),
@@ -262,7 +265,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 launch=process.launch,
                 profile=run.profile,
                 paused=run.paused,
-                table=table.number if (table := own.identity and own.identity.table) else None,
+                table=table.number if (table := own.identity and own.identity.table) else 0,
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())
@@ -298,6 +301,22 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         return outcome
 
 
+def _shared(run: RunPlan, process: RunProcess, own: Wiring) -> tuple[str, ...]:
+    """Where the members of a group reach the mesh, if it is shared with one.
+
+    Raises:
+        ConfigurationError: it cannot be.
+    """
+    if (group := run.loaded.config.runtime.share_with) is None:
+        return ()
+    if own.mode == "client":
+        text = f"mesh '{run.mesh}' cannot be shared with the group '{group}': its master only connects to a router"
+        raise ConfigurationError(text, hint="With `zenoh.mode: peer`, or started by `launch`, it has a socket.")
+    endpoint = shared_endpoint(process.folder, group)
+    process.stack.callback(leave_shared, endpoint)
+    return (endpoint,)
+
+
 class _MasterRuns:
     """The runs of a master, which follow each other where the mesh is reset.
 
@@ -305,6 +324,7 @@ class _MasterRuns:
         session: of this process.
         run: the plan of the newest.
         resets: how often the mesh was reset.
+        wiring: of its session.
     """
 
     def __init__(self, run: RunPlan, process: RunProcess, wiring: Wiring) -> None:
@@ -313,7 +333,7 @@ class _MasterRuns:
         self.run = self._first = run
         self.resets = 0
         self._process = process
-        self._wiring = wiring
+        self.wiring = wiring
         self._files: Sequence[ResultFile] | None = None
         self._meeting: Meeting | None = None
         self._known: KnownModels | None = None
@@ -344,7 +364,7 @@ class _MasterRuns:
         zenoh = self._first.zenoh(self._first.loaded.config.zenoh.listen)
         if self._meeting is not None:
             self._meeting.close()
-        at = self._process.folder, self._wiring, zenoh.rows_address
+        at = self._process.folder, self.wiring, zenoh.rows_address
         self._meeting = meeting_of(MASTER, *at) if self._first.loaded.config.row_streams else None
         return self._meeting
 

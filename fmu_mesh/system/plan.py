@@ -137,12 +137,10 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         batch: number of points that it may sleep for at once; 1 if others may wait for its own next row.
         memory: where everything lies in the memory that processes of one host share.
         rings: the output rings of its instances, and of all instances that it has values from.
-        loops: the algebraic loops at the start that have instances of this node.
-        initialization: how these loops are iterated.
+        loops: the algebraic loops at the start with instances of this node; ``initialization``: how they are iterated.
         shared_memory: whether processes of one host exchange messages through shared memory.
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
-        records: the result files, if it is the recorder.
-        secured: whether those who set values have names.
+        records: the result files, if it is the recorder; ``secured``: whether those who set values have names.
     """
 
     mesh: str

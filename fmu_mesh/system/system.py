@@ -197,8 +197,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     }
     timed = {(name, timeout.variable) for name, own in timeouts.items() for timeout in own}
     prescribed = _prescribed(scenario, variables, instances, sources, grid, collected)
-    _check_zenoh(loaded, collected)
-    doors = check_access(loaded, collected)
+    doors = _check_zenoh(loaded, collected)
     if len(collected):
         collected.merge(obstacles or ())
         execution_order([*instances], connections, config.simulation.algorithm, collected)  # for its findings
@@ -437,10 +436,15 @@ def _replaced_start_values(config: Config, connections: Iterable[Connection], fi
             findings.add(f"instances.{c.target_instance}.start_values.{c.target.name}", found, "")
 
 
-def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> None:
-    zenoh = loaded.config.zenoh
+def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> Findings:
+    """Check where the mesh can be reached; returns warnings of what is open to others."""
+    config, warnings = loaded.config, loaded.findings()
+    zenoh = config.zenoh
     if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
         findings.add("zenoh.mode", "client without a router", "an endpoint in zenoh.connect")
     if zenoh.config is not None and not files.is_file(path := loaded.resolve(zenoh.config)):
         found = f"no such file '{zenoh.config}'"
         findings.add("zenoh.config", found, "an existing Zenoh configuration", nearest_file(path))
+    ros = {f"ros.{name}": getattr(config.ros, name) for name in ("listen", "connect") if config.ros is not None}
+    check_access(zenoh, config.security, ros, findings, warnings)
+    return warnings

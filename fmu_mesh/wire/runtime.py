@@ -8,6 +8,7 @@ folder; a process id means something only on the host of the process, so nothing
 from __future__ import annotations
 
 import fcntl
+import grp
 import hashlib
 import itertools
 import os
@@ -35,15 +36,19 @@ __all__ = [
     "is_alive",
     "is_stopped",
     "leave_run_folder",
+    "leave_shared",
     "meshes",
     "remove_stale_folders",
     "rows_socket",
     "run_folder",
     "run_name",
     "runtime_folder",
+    "share",
+    "shared_endpoint",
     "socket_endpoint",
     "this_host",
     "tidy_run_folder",
+    "why_not_shared",
     "write_note",
 ]
 
@@ -141,7 +146,57 @@ def _launcher_of(folder: Path) -> int | None:
     return int(pid) if pid.isdigit() and rest.startswith(this_host()) else None
 
 
-def _private(folder: Path) -> Path:
+def why_not_shared(group: str) -> str | None:
+    """Why this user cannot share a socket with a group of this host; None if it can."""
+    try:
+        number = grp.getgrnam(group).gr_gid
+    except KeyError:
+        return f"there is no group '{group}' on this host"
+    if number in (os.getegid(), *os.getgroups()) or os.geteuid() == 0:
+        return None
+    return f"you are not a member of the group '{group}' of this host"
+
+
+def shared_endpoint(folder: Path, group: str) -> str:
+    """The Zenoh endpoint of a socket for the members of a group, beside that of the master in the folder of a run.
+
+    It is in a folder of its own, which they can enter: that of the run, with the plan and the FMUs, stays private.
+
+    Raises:
+        ConfigurationError: the folder cannot be used, or its path is too long.
+    """
+    number = grp.getgrnam(group).gr_gid
+    shared = _private(Path(tempfile.gettempdir()) / f"fmu_mesh-{os.getuid()}.{number}", others=0o027)
+    os.chown(shared, -1, number)
+    shared.chmod(0o750)
+    for other in shared.glob(f"*{_SOCKET}"):  # of a master that was killed
+        with socket.socket(socket.AF_UNIX) as probe:
+            try:
+                probe.connect(str(other))
+            except ConnectionRefusedError:
+                leave_shared(f"unixsock-stream/{other}")
+            except OSError:  # it is gone meanwhile, or has too many connections
+                continue
+    return _endpoint_at(shared / f"{folder.name}{_SOCKET}")
+
+
+def share(endpoint: str) -> None:
+    """Let the group of the folder of a socket connect to it, once it is there."""
+    file = Path(endpoint.partition("/")[2])
+    os.chown(file, -1, file.parent.stat().st_gid)
+    file.chmod(0o770)
+
+
+def leave_shared(endpoint: str) -> None:
+    """Remove a socket for a group, and its folder if it was the last one."""
+    file = Path(endpoint.partition("/")[2])
+    for own in (file, file.with_name(f"{file.name}.lock")):
+        own.unlink(missing_ok=True)
+    with suppress(OSError):  # others are there
+        file.parent.rmdir()
+
+
+def _private(folder: Path, others: int = 0o077) -> Path:
     """Create a folder with mode 0700, or check that an existing folder belongs only to this user.
 
     Everybody who can enter it can connect to the sockets in it, and so read and set values and end the run.
@@ -158,7 +213,7 @@ def _private(folder: Path) -> Path:
         raise ConfigurationError(f"the runtime folder '{folder}' is no folder", hint=_FOLDER_HINT)
     if found.st_uid != os.getuid():
         raise ConfigurationError(f"the runtime folder '{folder}' belongs to another user", hint=_FOLDER_HINT)
-    if (mode := stat.S_IMODE(found.st_mode)) & 0o077:
+    if (mode := stat.S_IMODE(found.st_mode)) & others:
         raise ConfigurationError(
             f"the runtime folder '{folder}' is open to other users (mode {mode:04o})",
             hint=f"Close it with `chmod 700 {folder}`, or set FMU_MESH_RUNTIME_DIR to another folder.",
@@ -269,7 +324,10 @@ def socket_endpoint(folder: Path, node: str) -> str:
     Raises:
         ConfigurationError: the path is too long for a Unix socket.
     """
-    path = folder / _socket_name(node)
+    return _endpoint_at(folder / _socket_name(node))
+
+
+def _endpoint_at(path: Path) -> str:
     if len(os.fsencode(path)) > _SOCKET_PATH_LIMIT:
         raise ConfigurationError(
             f"'{path}' is too long for a socket ({_SOCKET_PATH_LIMIT} bytes)",

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
+import pwd
+import socket
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -27,11 +32,13 @@ __all__ = [
     "encode_value",
     "encode_values",
     "json_encoding",
+    "this_program",
 ]
 
 MAX_VALUE_SIZE = 2 * MAX_TEXT_SIZE
 
 _LONGEST_WHO: Final = 200
+_OURS: Final = ("fmu-mesh", "__main__.py")
 
 json_encoding = zenoh.Encoding.APPLICATION_JSON
 
@@ -109,3 +116,15 @@ def decode_value(data: bytes, variable: Variable, *, finite: bool = False) -> Va
     except MessageRefused as error:
         raise ValueRefused(f"it is no JSON value ({error})") from error
     return checked_value(value, variable, data[:80].decode(errors="replace"), finite=finite)
+
+
+def this_program() -> str:
+    """This process in words: `anna@lab fmu-mesh set (pid 4711)`, or `anna@lab steer.py (pid 4711)`."""
+    try:
+        user = pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # a container may have users without names
+        user = str(os.getuid())
+    program, command = Path(sys.argv[0] if sys.argv else "").name, sys.argv[1:2]
+    if program in _OURS:
+        program = " ".join(["fmu-mesh", *command])
+    return f"{user}@{socket.gethostname()} {program or 'python'} (pid {os.getpid()})"

@@ -19,11 +19,11 @@ __all__ = [
     "Command",
     "CommandAnswer",
     "ConnectionView",
-    "Hello",
     "InstanceInfo",
     "InstanceStatus",
     "KeyStatus",
     "LogLine",
+    "MeshHello",
     "MeshInfo",
     "MeshState",
     "MeshStatus",
@@ -264,7 +264,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
         return self.host_id == this_host()
 
 
-class Hello(msgspec.Struct, frozen=True):
+class MeshHello(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/hello` and `…/mesh/role/<role>`, in a mesh with `security`.
 
     Attributes:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import grp
 import json
+import math
 import os
 import re
 import stat
@@ -19,7 +21,7 @@ import zenoh
 from fmu_mesh.config.access_sections import leaves_host
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.wire.runtime import run_folder, runtime_folder
-from tests.helpers import Launched, Place, row_count, wait_until, write_config
+from tests.helpers import DEADLINE_S, Launched, Place, row_count, wait_until, write_config
 
 FAR_S = 1_000_000.0
 NOBODY = 65534
@@ -167,6 +169,50 @@ def test_a_port_at_a_network_without_certificates_has_to_be_wanted(place: Place)
 )
 def test_what_leaves_the_host(endpoint: str, *, leaves: bool) -> None:
     assert leaves_host(endpoint) is leaves
+
+
+_AS_MEMBER = """
+import os, sys
+import zenoh
+os.setgroups([int(sys.argv[2])])
+os.setgid({nobody})
+os.setuid({nobody})
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("scouting/multicast/enabled", "false")
+config.insert_json5("connect/endpoints", '["unixsock-stream/%s"]' % sys.argv[1])
+with zenoh.open(config) as session:
+    [reply] = session.get("fmu_mesh/pair/delay/out/y")
+    print(reply.ok.payload.to_string())
+"""
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+def test_members_of_a_group_reach_a_mesh_shared_with_them(place: Place) -> None:
+    group = next(own for own in grp.getgrall() if own.gr_gid not in (0, NOBODY))
+    launched = running(place, "--set-config", f"runtime.share_with={group.gr_name}")
+    path = place.note().endpoints[1].partition("/")[2]
+    for folder in (place.folder, place.folder / "tmp"):  # above that of the group
+        folder.chmod(0o755)
+
+    def tried(program: str, number: int) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", program.format(nobody=NOBODY), path, str(number)]
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
+
+    assert math.isfinite(float(tried(_AS_MEMBER, group.gr_gid).stdout))
+    assert "PermissionError" in tried(_AS_NOBODY, NOBODY).stderr
+    assert f"the members of the group '{group.gr_name}' are trusted as you are" in launched.errors
+    assert Path(path).parent.stat().st_mode & 0o777 == 0o750
+    assert place.run("stop").wait() == 0
+    launched.wait()
+    assert not Path(path).parent.exists()
+
+
+def test_a_group_that_is_not_there_is_a_finding(place: Place) -> None:
+    checked = place.run("check", write_config(place.folder), "--set-config", "runtime.share_with=nobody-has-this")
+
+    assert checked.wait() == 2
+    assert "runtime.share_with=nobody-has-this: there is no group 'nobody-has-this' on this host" in checked.message
 
 
 # --- the runtime folder

@@ -7,17 +7,12 @@ there are deadlines, and names instead of keys.
 
 from __future__ import annotations
 
-import os
-import pwd
-import socket
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from itertools import chain
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import msgspec
@@ -31,7 +26,7 @@ from ...text import did_you_mean, is_pattern, listed, matching, shown
 from ..keys import SUBSCRIBED, Keys
 from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
-from ..values import encode_origin, encode_value
+from ..values import encode_origin, encode_value, this_program
 from ..views import (
     Command,
     CommandAnswer,
@@ -225,7 +220,7 @@ class MeshClient:
         except (TypeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"{shown(value)} is no value of a variable: {error}") from error
         key = self.keys.setting(target.instance, target.variable.name)
-        return self._view(key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, _this_program()))
+        return self._view(key, SetAnswer, f"'{target.name}'", payload, encode_origin(at, this_program()))
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
@@ -403,21 +398,6 @@ class MeshClient:
             return [sample for reply in replies if (sample := answer_of(reply)) is not None]
         except MeshLost as error:
             raise ConfigurationError(error.message) from error
-
-
-_OURS = ("fmu-mesh", "__main__.py")
-
-
-def _this_program() -> str:
-    """This process in words: `anna@lab fmu-mesh set (pid 4711)`, or `anna@lab steer.py (pid 4711)`."""
-    try:
-        user = pwd.getpwuid(os.getuid()).pw_name
-    except KeyError:  # a container may have users without names
-        user = str(os.getuid())
-    program, command = Path(sys.argv[0] if sys.argv else "").name, sys.argv[1:2]
-    if program in _OURS:
-        program = " ".join(["fmu-mesh", *command])
-    return f"{user}@{socket.gethostname()} {program or 'python'} (pid {os.getpid()})"
 
 
 def is_key(reference: str, keys: Keys) -> bool:

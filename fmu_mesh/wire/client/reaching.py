@@ -24,7 +24,7 @@ from ..keys import LOCAL, Keys
 from ..messages import decode_json
 from ..runtime import MeshNote, meshes
 from ..session import Wiring, close_session, open_session, tokens
-from ..views import Hello
+from ..views import MeshHello
 from .mesh_client import MeshClient, is_key, key_expression
 
 if TYPE_CHECKING:  # as above
@@ -228,7 +228,11 @@ class Meshes:
         session = found.opening.session()
         own, reached = found.opening.identity, (found.endpoints, self._timeout_s)
         if own is None:
-            return MeshClient(session, found.keys, *reached)
+            keys = found.keys
+            # It was reached by a socket that no note of this user names, such as one for a group.
+            if keys.by is None and self._endpoints and _greeted(session, keys.mesh_key("hello"), _HELLO_S) is not None:
+                keys = replace(keys, by=LOCAL)
+            return MeshClient(session, keys, *reached)
         role = _role(session, found.keys, own, self._timeout_s)
         return MeshClient(session, replace(found.keys, by=own.name), *reached, role=role)
 
@@ -316,11 +320,11 @@ def _by(note: MeshNote) -> str | None:
     return LOCAL if note.security else None
 
 
-def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> tuple[str, Hello] | None:
+def _greeted(session: zenoh.Session, key: str, timeout_s: float) -> tuple[str, MeshHello] | None:
     """What a master answers to a certificate at once, and under which key; None if it does not, or may not."""
     for reply in session.get(key, timeout=timeout_s):
         if reply.ok is not None:
-            return str(reply.ok.key_expr), decode_json(reply.ok.payload.to_bytes(), Hello)
+            return str(reply.ok.key_expr), decode_json(reply.ok.payload.to_bytes(), MeshHello)
     return None
 
 
