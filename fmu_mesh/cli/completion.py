@@ -27,6 +27,7 @@ from ..api.inspection import readable_configuration, variables_of_fmu, variables
 from ..config.mesh import Config, SimulationConfig
 from ..ssp.configuration_files import named_package
 from ..ssp.package import Package
+from ..wire.security.identity import CERTIFICATE
 from .arguments import CommandParser, Runs
 
 if TYPE_CHECKING:
@@ -238,6 +239,7 @@ _BY_COMMAND: Final[_Offers] = {
     ("plot", "variables"): _columns,
     ("plot", "x"): _columns,
     ("compare", "variables"): _columns,
+    ("security", "name"): lambda _, given: [own.parent.name for own in given.folder.glob(f"*/{CERTIFICATE}")],
 }
 """The same where it depends on the command."""
 

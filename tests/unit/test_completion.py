@@ -106,6 +106,17 @@ def test_a_shell_completes_commands_options_files_and_instances_of_a_file(place:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_what_security_does_for_whom(place: Place, shell: str) -> None:
+    for name in ("alice", "bob"):
+        (place.folder / "lab" / name).mkdir(parents=True)
+        (place.folder / "lab" / name / "certificate.pem").touch()
+
+    assert offered(place, shell, "security", "re") == ["renew", "remove"]
+    assert offered(place, shell, "security", "add", "lab", "carol", "--role", "o") == ["observer", "operator"]
+    assert offered(place, shell, "security", "renew", "lab", "a") == ["alice"]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_completes_packages_and_their_descriptions_and_instances(place: Place, shell: str) -> None:
     write_package(place.folder / "ship.ssp", SHIP)
     write_package(place.folder / "unpacked", SHIP)
