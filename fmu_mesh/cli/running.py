@@ -27,6 +27,7 @@ from ..run.events import Event, Reachable
 from ..run.options import RerunOptions
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
+from ..run.wiring import warnings_of
 from ..system.plan import Plan
 from ..wire.session import Wiring, run_router
 from .arguments import Runs
@@ -103,11 +104,22 @@ def _shown(
 def _planned(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:
     """Plan the run of a command, and check what it shows at the end."""
     plan = mesh.plan(**options)
-    if not arguments.quiet:
-        warn(plan.plan)
+    _warn(plan, quiet=arguments.quiet)
     if getattr(arguments, "plot", None) is not None:
         check_plot(arguments.plot, plan)
     return plan
+
+
+def _warn(plan: RunPlan, *, quiet: bool = False, every: bool = True) -> None:
+    """Show the warnings before a run; of one process of several only those that concern its connections."""
+    told = warnings_of(plan)  # also where nothing is said: a wrong certificate is found before anything is started
+    if quiet:
+        return
+    if every:
+        warn(plan.plan)
+        told = [text for text in told if text not in map(str, plan.plan.system.warnings)]
+    for text in told:
+        say_warning(text)
 
 
 @contextmanager
@@ -146,7 +158,7 @@ def _node(arguments: argparse.Namespace) -> int:
     from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
 
     plan = mesh_of(arguments).plan(**given_options(arguments))
-    warn(plan.plan, only_access=True)
+    _warn(plan, every=False)
     run_node(plan.node(arguments.node))
     return 0
 
@@ -174,7 +186,7 @@ def _gateway(arguments: argparse.Namespace) -> int:
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
     plan = mesh_of(arguments).plan(**given_options(arguments))
-    warn(plan.plan, only_access=True)
+    _warn(plan, quiet=arguments.quiet, every=False)
     run_gateway(plan, show)
     return 0
 

@@ -163,6 +163,21 @@ def test_what_does_not_go_with_security_is_a_finding(
     assert words in checked.message
 
 
+def test_check_says_who_may_do_what_and_a_start_what_ends_soon(place: Place, lab: Path) -> None:
+    checked = place.run("check", secured(place)).output
+    Authority(lab).renew("lab", 2.0)
+
+    launched = place.start("launch", secured(place), "--no-progress")
+    endpoint_of(launched)
+    place.run("stop")
+
+    access = checked.partition("Access\n")[2]
+    assert "  listens at tls/127.0.0.1:0\n  certificate of 'lab', signed by 'fmu_mesh lab', until " in access
+    assert "  node: lab, rig\n  observer: bob\n  operator: alice\n" in access
+    assert "warning: the certificate of 'lab' ends at" in launched.errors
+    assert "before this run" in launched.errors
+
+
 @pytest.mark.parametrize("shared_memory", [True, False], ids=["memory", "zenoh"])
 @pytest.mark.parametrize("way", ["master", "router"])
 def test_nodes_over_tls_give_the_floats_of_one_process(
