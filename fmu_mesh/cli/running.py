@@ -3,10 +3,14 @@
 # Signals: the first SIGINT or SIGTERM ends the run in order, and the second does not wait for its processes. The run
 # has a thread of its own (`fmu_mesh.api.run_thread`), so the handler only tells it; before there is one, the handler
 # raises KeyboardInterrupt. The handlers of before come back with the end of the run.
+#
+# A thread: Zenoh writes its log on the descriptor of standard output, and no callback gets it. So where strangers may
+# knock, "refusals" reads what comes there (`_refusals_told`), until the descriptor is that of before.
 
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -14,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
 
@@ -27,14 +31,14 @@ from ..run.events import Event, Reachable
 from ..run.options import RerunOptions
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
-from ..run.wiring import warnings_of
+from ..run.wiring import identity_of, warnings_of
 from ..system.plan import Plan
-from ..wire.session import Wiring, run_router
+from ..wire.session import Wiring, refused_link, run_router
 from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
-from .output.terminal import say_warning, stdout_as_stderr
+from .output.terminal import say, say_warning, stdout_as_stderr
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .run_options import given_options, mesh_of
 
@@ -42,6 +46,9 @@ if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
 __all__ = ["RUNS", "interrupted_by_signals", "run_mesh"]
+
+_READ_S: Final = 1.0
+"""How long the end of a listener waits until its last refusals are said."""
 
 
 def _launch(arguments: argparse.Namespace) -> int:
@@ -172,6 +179,7 @@ def _master(arguments: argparse.Namespace) -> int:
         Display(
             plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
         ) as display,
+        _refusals_told() if identity_of(plan) is not None else nullcontext(),
     ):
         outcome = run_master(plan, display.event)
     _finish(plan.plan, result_of(plan, outcome), arguments)
@@ -194,7 +202,11 @@ def _gateway(arguments: argparse.Namespace) -> int:
 def _router(arguments: argparse.Namespace) -> int:
     stop = threading.Event()
     wiring = _router_wiring(arguments)
-    with ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False), run_router(wiring) as where:
+    with (
+        ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False),
+        _refusals_told() if wiring.identity is not None else nullcontext(),
+        run_router(wiring) as where,
+    ):
         print(f"router at {', '.join(where)}", flush=True)
         stop.wait()
     sys.stdout.flush()
@@ -216,6 +228,34 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
         say_warning(text)
     root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)
     return Wiring(listen=listen, insecure=arguments.insecure, identity=own, root=root, ends=ends)
+
+
+@contextmanager
+def _refusals_told() -> Iterator[None]:
+    """In the block, what Zenoh writes on standard output about links that it has refused goes to standard error."""
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    reading, writing = os.pipe()
+    os.dup2(writing, 1)
+    os.close(writing)
+
+    def read() -> None:
+        with os.fdopen(reading, "rb") as lines:
+            for line in lines:
+                if (refused := refused_link(line.decode(errors="replace").rstrip())) is not None:
+                    say(refused)
+                else:
+                    os.write(stdout, line)
+
+    reader = threading.Thread(target=read, name="refusals", daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(stdout, 1)
+        reader.join(_READ_S)
+        os.close(stdout)
 
 
 def _rerun(arguments: argparse.Namespace) -> int:
