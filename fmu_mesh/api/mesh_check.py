@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -14,10 +14,11 @@ from ..pictures.plan_view import PlanView, plan_view
 from ..pictures.tables import html_table
 from ..printing import page
 from ..run.run_plan import RunPlan
+from ..run.wiring import identity_of
 from ..ssp.configuration_files import names_world
 from ..ssp.naming import WORLD
 from ..system.round_trip import round_trip_cost
-from ..text import counted
+from ..text import counted, listed
 
 __all__ = ["Check", "check_of", "together"]
 
@@ -42,11 +43,13 @@ class Check(msgspec.Struct, frozen=True):
         file: the configuration, as messages name it.
         error: why the mesh cannot run; None if it can.
         run: the plan of the run; None if the configuration is wrong. It is there if only this host lacks something.
+        access: with which certificate it is reached at a network, and who may do what, in lines.
     """
 
     file: str
     error: ConfigurationError | None = None
     run: RunPlan | None = None
+    access: tuple[str, ...] = ()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -68,7 +71,7 @@ class Check(msgspec.Struct, frozen=True):
     @property
     def page(self) -> str:
         """What would run, as text; empty if the configuration is wrong."""
-        return page(plan_page(self.run.plan, self.run.loaded)) if self.run is not None else ""
+        return page([*plan_page(self.run.plan, self.run.loaded), *self.access]) if self.run is not None else ""
 
     def at_round_trip(self, seconds: float) -> list[str]:
         """What a network with this round trip between hosts costs the run at least, in sentences.
@@ -115,7 +118,7 @@ class Check(msgspec.Struct, frozen=True):
 
 def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
     """Check what ``plan`` makes of the file, and that this host has what the run needs."""
-    run, errors = None, []
+    run, errors, access = None, [], tuple[str, ...]()
     try:
         run = plan()
     except ConfigurationError as error:
@@ -132,7 +135,29 @@ def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
                 look()
             except ConfigurationError as error:
                 errors.append(error)
-    return Check(file, together(file, errors) if errors else None, run)
+        try:
+            access = tuple(_access(run))
+        except ConfigurationError as error:
+            errors.append(error)
+    return Check(file, together(file, errors) if errors else None, run, access)
+
+
+def _access(run: RunPlan) -> Iterator[str]:
+    """Who may do what at the network of a run.
+
+    Raises:
+        ConfigurationError: its certificate cannot be used.
+    """
+    if (own := identity_of(run)) is None:
+        return
+    zenoh = run.loaded.config.zenoh
+    yield from ("", "Access")
+    yield f"  listens at {listed(zenoh.listen)}" if zenoh.listen else f"  connects to {listed(zenoh.connect)}"
+    yield f"  certificate of '{own.name}', signed by '{own.authority}', until {own.until:%Y-%m-%d %H:%M} UTC"
+    if own.table is not None:
+        yield f"  {own.table}"
+        for role in sorted({*own.table.roles.values()}):
+            yield f"  {role}: {listed([name for name, its in own.table.roles.items() if its == role])}"
 
 
 def together(file: str, errors: Sequence[ConfigurationError]) -> ConfigurationError:

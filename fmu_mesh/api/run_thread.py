@@ -40,7 +40,7 @@ from ..run.options import StartOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
 from ..run.run_plan import RunPlan, numbered
-from ..run.wiring import certified, name_of
+from ..run.wiring import certified, name_of, warnings_of
 from ..simtime import ENDLESS
 from ..wire.client.mesh_client import MeshClient
 from ..wire.keys import Keys
@@ -87,6 +87,10 @@ class RunThread:
             except FileExistsError as error:
                 text = f"this plan of '{plan.mesh}' runs already"
                 raise CallRefused(text, hint="Make another one for another run.") from error
+        if settings.processes:
+            for text in warnings_of(plan):  # a certificate that cannot be used raises
+                if settings.on_event is None:
+                    log.warning("%s", text)
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
         self._thread.start()

@@ -181,7 +181,8 @@ def _descriptions_in(_prefix: str, given: argparse.Namespace) -> Iterable[str]:
 def _reached(given: argparse.Namespace) -> Meshes:
     from ..wire.client.reaching import Meshes  # noqa: PLC0415 only this needs Zenoh
 
-    return Meshes(getattr(given, "connect", ()), _PATIENCE_S)
+    access = getattr(given, "security", None), getattr(given, "insecure", False)
+    return Meshes(getattr(given, "connect", ()), _PATIENCE_S, access[0], insecure=access[1])
 
 
 def _meshes(_prefix: str, given: argparse.Namespace) -> list[str]:

@@ -3,10 +3,14 @@
 # Signals: the first SIGINT or SIGTERM ends the run in order, and the second does not wait for its processes. The run
 # has a thread of its own (`fmu_mesh.api.run_thread`), so the handler only tells it; before there is one, the handler
 # raises KeyboardInterrupt. The handlers of before come back with the end of the run.
+#
+# A thread: Zenoh writes its log on the descriptor of standard output, and no callback gets it. So where strangers may
+# knock, "refusals" reads what comes there (`_refusals_told`), until the descriptor is that of before.
 
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -14,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
 
@@ -27,13 +31,14 @@ from ..run.events import Event, Reachable
 from ..run.options import RerunOptions
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
+from ..run.wiring import identity_of, warnings_of
 from ..system.plan import Plan
-from ..wire.session import Wiring, run_router
+from ..wire.session import Wiring, refused_link, run_router
 from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
 from .output.reports import RunReporter
-from .output.terminal import say_warning, stdout_as_stderr
+from .output.terminal import say, say_warning, stdout_as_stderr
 from .plotting import check_plot, plot_results, plotted_where_it_ends
 from .run_options import given_options, mesh_of
 
@@ -41,6 +46,9 @@ if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
 __all__ = ["RUNS", "interrupted_by_signals", "run_mesh"]
+
+_READ_S: Final = 1.0
+"""How long the end of a listener waits until its last refusals are said."""
 
 
 def _launch(arguments: argparse.Namespace) -> int:
@@ -103,11 +111,22 @@ def _shown(
 def _planned(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:
     """Plan the run of a command, and check what it shows at the end."""
     plan = mesh.plan(**options)
-    if not arguments.quiet:
-        warn(plan.plan)
+    _warn(plan, quiet=arguments.quiet)
     if getattr(arguments, "plot", None) is not None:
         check_plot(arguments.plot, plan)
     return plan
+
+
+def _warn(plan: RunPlan, *, quiet: bool = False, every: bool = True) -> None:
+    """Show the warnings before a run; of one process of several only those that concern its connections."""
+    told = warnings_of(plan)  # also where nothing is said: a wrong certificate is found before anything is started
+    if quiet:
+        return
+    if every:
+        warn(plan.plan)
+        told = [text for text in told if text not in map(str, plan.plan.system.warnings)]
+    for text in told:
+        say_warning(text)
 
 
 @contextmanager
@@ -146,7 +165,7 @@ def _node(arguments: argparse.Namespace) -> int:
     from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
 
     plan = mesh_of(arguments).plan(**given_options(arguments))
-    warn(plan.plan, only_access=True)
+    _warn(plan, every=False)
     run_node(plan.node(arguments.node))
     return 0
 
@@ -160,6 +179,7 @@ def _master(arguments: argparse.Namespace) -> int:
         Display(
             plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
         ) as display,
+        _refusals_told() if identity_of(plan) is not None else nullcontext(),
     ):
         outcome = run_master(plan, display.event)
     _finish(plan.plan, result_of(plan, outcome), arguments)
@@ -174,7 +194,7 @@ def _gateway(arguments: argparse.Namespace) -> int:
             print(f"topics of ROS at {', '.join(event.endpoints)}", flush=True)
 
     plan = mesh_of(arguments).plan(**given_options(arguments))
-    warn(plan.plan, only_access=True)
+    _warn(plan, quiet=arguments.quiet, every=False)
     run_gateway(plan, show)
     return 0
 
@@ -182,7 +202,11 @@ def _gateway(arguments: argparse.Namespace) -> int:
 def _router(arguments: argparse.Namespace) -> int:
     stop = threading.Event()
     wiring = _router_wiring(arguments)
-    with ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False), run_router(wiring) as where:
+    with (
+        ended_by_signals(lambda _reason: stop.set(), lambda: None, watch_stdin=False),
+        _refusals_told() if wiring.identity is not None else nullcontext(),
+        run_router(wiring) as where,
+    ):
         print(f"router at {', '.join(where)}", flush=True)
         stop.wait()
     sys.stdout.flush()
@@ -204,6 +228,34 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
         say_warning(text)
     root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)
     return Wiring(listen=listen, insecure=arguments.insecure, identity=own, root=root, ends=ends)
+
+
+@contextmanager
+def _refusals_told() -> Iterator[None]:
+    """In the block, what Zenoh writes on standard output about links that it has refused goes to standard error."""
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    reading, writing = os.pipe()
+    os.dup2(writing, 1)
+    os.close(writing)
+
+    def read() -> None:
+        with os.fdopen(reading, "rb") as lines:
+            for line in lines:
+                if (refused := refused_link(line.decode(errors="replace").rstrip())) is not None:
+                    say(refused)
+                else:
+                    os.write(stdout, line)
+
+    reader = threading.Thread(target=read, name="refusals", daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(stdout, 1)
+        reader.join(_READ_S)
+        os.close(stdout)
 
 
 def _rerun(arguments: argparse.Namespace) -> int:

@@ -180,7 +180,7 @@ def why_closed(endpoint: str, *, secured: bool, insecure: bool, own_settings: bo
     if is_socket(endpoint):
         return None
     if has_tls(endpoint):
-        if secured or insecure or own_settings:
+        if secured or own_settings:
             return None
         return f"'{endpoint}' without a certificate", f"`security=...`, or {SECURITY_VARIABLE}: a folder with one"
     if secured:

@@ -38,6 +38,7 @@ from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
 from ..wire.runtime import remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
+from ..wire.session import refused_link
 from .child import Child, Process
 from .events import Event, OutputLine, Reachable, WasReset, decode_event
 from .fork_server import ForkServer, executed, fork_server
@@ -194,7 +195,8 @@ class Launcher:
             self._do(self._states.gateway_ready())
 
     def _take_output(self, name: str, line: bytes) -> None:
-        self._on_event(OutputLine(name, line.decode(errors="replace").rstrip()))
+        text = line.decode(errors="replace").rstrip()
+        self._on_event(OutputLine(name, (refused_link(text) if name == THE_MASTER else None) or text))
 
     # --- the end
 

@@ -7,8 +7,12 @@ reach the master only at the endpoints of `zenoh.listen`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
@@ -20,8 +24,16 @@ from ..system.plan import MASTER
 from ..wire.keys import LOCAL
 from ..wire.runtime import socket_endpoint
 from ..wire.session import Wiring
+from .run_plan import RunPlan
 
-__all__ = ["certified", "name_of", "patient", "wiring"]
+if TYPE_CHECKING:  # as below
+    from ..wire.security.identity import Identity
+
+__all__ = ["certified", "identity_of", "name_of", "patient", "warnings_of", "wiring"]
+
+
+_ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=|\bruntime\.share_with")
+"""The place of a warning about a connection: in a file, or an option."""
 
 
 def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, peers: Iterable[str]) -> Wiring:
@@ -79,10 +91,40 @@ def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tu
     from ..wire.security.certificates import identity_in  # noqa: PLC0415  most runs have no certificate
 
     own = identity_in(Path(security.folder), security.roles or None)
-    if own.role != "node":
+    if own.role not in ("node", None):  # None: only others know it
         text = f"'{own.name}' of '{security.folder}' is {own.role}, and who runs a mesh at a network has the role node"
         raise ConfigurationError(text, hint="`fmu-mesh security add` makes such a certificate for each host.")
     return replace(made, identity=own, root=root, ends=ends)
+
+
+def identity_of(run: RunPlan) -> Identity | None:
+    """The certificate with which the processes of a run come to others; None: they need none.
+
+    Raises:
+        ConfigurationError: it cannot be used.
+    """
+    zenoh, listens = run.loaded.config.zenoh, run.loaded.config.zenoh.mode == "peer"
+    ends = Wiring(listen=tuple(zenoh.listen) if listens else (), connect=tuple(zenoh.connect))
+    return certified(ends, run.loaded.config.security, "").identity
+
+
+def warnings_of(run: RunPlan) -> list[str]:
+    """What somebody should know who starts a part of a run: who can reach it, and when its certificate ends.
+
+    Raises:
+        ConfigurationError: it cannot be used.
+    """
+    open_ones = [str(warning) for warning in run.plan.system.warnings if _ACCESS.search(warning.path)]
+    if (own := identity_of(run)) is None:
+        return open_ones
+    from ..wire.security.identity import warnings_about  # noqa: PLC0415  as above
+
+    grid, factor = run.plan.grid, run.loaded.config.simulation.real_time_factor
+    ends_at = None
+    if factor and grid.stop_time is not None:
+        with suppress(OverflowError):  # in more years than a date can have
+            ends_at = datetime.now(UTC) + timedelta(seconds=(grid.stop_time - grid.start_time) / factor)
+    return [*open_ones, *warnings_about(own, ends_at)]
 
 
 def name_of(made: Wiring, security: SecurityConfig | None) -> str | None:

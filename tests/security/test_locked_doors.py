@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import socket
+import ssl
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -161,6 +164,44 @@ def test_what_does_not_go_with_security_is_a_finding(
 
     assert checked.wait() == 2
     assert words in checked.message
+
+
+def test_check_says_who_may_do_what_and_a_start_what_ends_soon(place: Place, lab: Path) -> None:
+    checked = place.run("check", secured(place)).output
+    Authority(lab).renew("lab", 0.01)
+
+    launched = place.start("launch", secured(place), "--no-progress")
+    endpoint_of(launched)
+    place.run("stop")
+
+    access = checked.partition("Access\n")[2]
+    assert "  listens at tls/127.0.0.1:0\n  certificate of 'lab', signed by 'lab of " in access
+    assert "  node: lab, rig\n  observer: bob\n  operator: alice\n" in access
+    assert "warning: the certificate of 'lab' ends at" in launched.errors
+    assert "before this run" in launched.errors
+
+
+@pytest.mark.parametrize("who", ["launch", "master", "router"])
+def test_who_listens_says_why_it_has_refused_a_link(place: Place, lab: Path, who: str) -> None:
+    if who == "router":
+        there = f"tls/127.0.0.1:{free_port()}"
+        listener = place.start("router", "--listen", there, "--security", lab / "lab")
+        wait_until(lambda: "router at" in listener.output, "the router")
+    else:
+        listener = place.start(who, secured(place), "--no-progress")
+        there = endpoint_of(listener)
+    stranger = ssl.create_default_context()
+    stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
+
+    with (
+        suppress(ssl.SSLError),
+        socket.create_connection(("127.0.0.1", int(there.rpartition(":")[2]))) as knocking,
+        stranger.wrap_socket(knocking) as link,
+    ):
+        link.recv(1)
+
+    listener.wait_for_error_line("a link was refused: peer sent no certificates\n")
+    assert "Hint: increase" not in listener.errors + listener.output
 
 
 @pytest.mark.parametrize("shared_memory", [True, False], ids=["memory", "zenoh"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -34,8 +33,6 @@ _COUNTED: Final = 1000
 """Number of different messages that are counted."""
 _HELD: Final = 100
 """Number of messages that are held back because their FMU may fail next."""
-_ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=")
-"""The place of a warning about a connection: in a file, or an option."""
 _ERRORS: Final = ("error", "fatal")
 _STYLES = {"ok": "dim", "warning": "yellow", "discard": "yellow", "error": "red", "fatal": "red"}
 
@@ -169,16 +166,8 @@ class Display:
             self._release(lambda line: status.progress[self._plan.node_of(line.instance)] > line.point)
 
 
-def warn(plan: Plan, *, only_access: bool = False) -> None:
-    """Print the first five warnings about a system on standard error before it runs, and that it could be faster.
-
-    Where one process of several is started manually, ``only_access`` leaves those that concern its connections.
-    """
-    if only_access:
-        for warning in plan.system.warnings:
-            if _ACCESS.search(warning.path):
-                say_warning(str(warning))
-        return
+def warn(plan: Plan) -> None:
+    """Print the first five warnings about a system on standard error before it runs, and that it could be faster."""
     if (slower := slower_than_it_could_be()) is not None:
         say_warning(slower)
     for warning in plan.system.warnings[:_WARNINGS]:

@@ -21,12 +21,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ...config.loading import LoadedConfig
 from ...errors import ConfigurationError, FmuError, FmuMeshError, Interrupted
 from ...ros_wire.rclpy_profile import RosNode, ros_module
-from ...wire.client.reaching import Meshes
 from ..bags.playing import running_configuration
 from .fmu_node import PARAMETERS, FmuNode
-from .gateway_node import GatewayNode
+from .gateway_node import GatewayNode, meshes_of
 
 __all__ = ["create_node", "main"]
 
@@ -255,13 +255,13 @@ def _mesh_came(node: RosNode, over: threading.Event) -> bool:
     """Wait until all instances of the mesh answer; after the timeout only say so."""
     timeout_s, ros_log = node.get_parameter("autostart_timeout").value, node.get_logger()
     try:
-        mesh = running_configuration(Path(node.get_parameter("config").value)).config.mesh
+        loaded = running_configuration(Path(node.get_parameter("config").value))
     except FmuMeshError:
         return True  # `configure` reports what is wrong with the file
-    deadline = time.monotonic() + timeout_s
+    deadline, mesh = time.monotonic() + timeout_s, loaded.config.mesh
     reported = False
     while not over.is_set():
-        reason = _absence(node, mesh)
+        reason = _absence(node, loaded)
         if reason is None:
             return True
         if time.monotonic() >= deadline:
@@ -279,12 +279,11 @@ def _mesh_came(node: RosNode, over: threading.Event) -> bool:
     return False
 
 
-def _absence(node: RosNode, mesh: str) -> str | None:
+def _absence(node: RosNode, loaded: LoadedConfig) -> str | None:
     """Why the gateway cannot start yet; None if it can."""
-    endpoints = [endpoint for endpoint in node.get_parameter("connect").value if endpoint]
     try:
-        with Meshes(endpoints, _ATTEMPT_S) as meshes:
-            client = meshes.named(mesh)
+        with meshes_of(node, loaded, _ATTEMPT_S) as meshes:
+            client = meshes.named(loaded.config.mesh)
             for name in client.info().instances:
                 client.instance_info(name)
     except FmuMeshError as error:

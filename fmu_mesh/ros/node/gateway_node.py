@@ -22,6 +22,8 @@ import msgspec
 import zenoh
 from msgspec.structs import replace
 
+from ...config.access_sections import given_folder
+from ...config.loading import LoadedConfig
 from ...config.mesh import RosConfig
 from ...config.ros_section import SimulationInterfacesConfig
 from ...errors import ConfigurationError, FmuMeshError, MeshLost
@@ -41,10 +43,18 @@ from ..gateway.simulation_services import SimulationServices
 from .rclpy_modules import other_clocks, steady_timer, watch_clock
 from .simulation_server import SimulationServer
 
-__all__ = ["GatewayNode"]
+__all__ = ["GatewayNode", "meshes_of"]
 
 _TIMEOUT_S = 10.0
 _INTERVAL_S = 0.25
+
+
+def meshes_of(node: RosNode, loaded: LoadedConfig, timeout_s: float) -> Meshes:
+    """The meshes that a gateway reaches, as its parameters say, and its configuration where it needs a certificate."""
+    endpoints = [endpoint for endpoint in node.get_parameter("connect").value if endpoint]
+    security, insecure = loaded.config.security, loaded.config.zenoh.insecure
+    folder = given_folder(None) or (loaded.resolve(security.folder) if security is not None else None)
+    return Meshes(endpoints, timeout_s, None if insecure else folder, insecure=insecure)
 
 
 class GatewayNode:
@@ -80,7 +90,7 @@ class GatewayNode:
             section = replace(section, namespace=namespace)
         loaded = replace(loaded, config=replace(loaded.config, ros=section))
         with ExitStack() as stack:
-            client = stack.enter_context(Meshes(self._endpoints(), _TIMEOUT_S)).named(loaded.config.mesh)
+            client = stack.enter_context(meshes_of(self._node, loaded, _TIMEOUT_S)).named(loaded.config.mesh)
             info = client.info()
             infos = {name: client.instance_info(name) for name in info.instances}
             findings = loaded.findings()
@@ -114,7 +124,8 @@ class GatewayNode:
             names = {topic.profile for topic in plan.topics} or {"ros2dds"}
             profiles: dict[str, Profile] = dict.fromkeys(map(str, sorted(names)), profile)
             # A session of its own: answers to the other one would queue behind the samples of a mesh that is fast.
-            own = stack.enter_context(Meshes(self._endpoints(), _TIMEOUT_S)).named(client.keys.mesh)
+            loaded = running_configuration(Path(self._node.get_parameter("config").value))
+            own = stack.enter_context(meshes_of(self._node, loaded, _TIMEOUT_S)).named(client.keys.mesh)
             gateway = Gateway(plan, own.session, client.keys, grid_of(info))
             stack.callback(gateway.close)
             gateway.open(profiles, _TIMEOUT_S)
@@ -153,9 +164,6 @@ class GatewayNode:
         """Clean up; returns True, because nothing is left running."""
         self.cleanup()
         return True
-
-    def _endpoints(self) -> list[str]:
-        return [endpoint for endpoint in self._node.get_parameter("connect").value if endpoint]
 
     def _declare_parameters(self, client: MeshClient, plan: RosPlan, stack: ExitStack) -> None:
         """Declare the parameters of the mesh as parameters of the node, with their current values."""
