@@ -36,6 +36,8 @@ RIGHT: Mapping[str, Any] = {
     "keys_from": os.devnull,
     "listen": ["tcp/127.0.0.1:0"],
     "connect": ["tcp/127.0.0.1:7447"],
+    "security": "lab/host",
+    "insecure": True,
     "paused": False,
     "view": False,
     "video": None,
