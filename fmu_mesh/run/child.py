@@ -75,6 +75,11 @@ class Child:
         return self._process.poll() is None
 
     @property
+    def pid(self) -> int | None:
+        """Its process id; None before it has started."""
+        return self._process.pid
+
+    @property
     def stopped(self) -> bool:
         """Whether it is stopped by SIGSTOP; being held by a debugger does not count."""
         pid = self._process.pid

@@ -54,6 +54,7 @@ from .launcher_states import (
     Signal,
     Start,
 )
+from .limits import memory_share, why_ended
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
@@ -80,6 +81,7 @@ class Launcher:
         self._server: ForkServer | None = None
         self._processes: dict[str, Child] = {}
         self._files: tuple[tuple[str, int], ...] | None = None
+        self._shares: dict[str, float | None] = {}
         self._clock = AwakeClock()
         config, plan = run.loaded.config, run.plan
         self._states = LaunchStates(
@@ -123,6 +125,9 @@ class Launcher:
     # --- waiting and doing; all of it on the thread that called `run`
 
     def _turn(self) -> None:
+        for name, process in self._processes.items():
+            if (node := self._run.plan.nodes.get(name)) is not None and node.process.memory is not None:
+                self._shares[name] = memory_share(node.process, process.pid) or self._shares.get(name)
         try:
             self._happened.get(timeout=self._states.wait_s)()
             quiet = False
@@ -167,9 +172,14 @@ class Launcher:
         child.watch(
             on_line,
             self._take_output,
-            lambda name, code: self._states.ended(name, code, self._clock()),
+            lambda name, code: self._states.ended(name, code, self._clock(), self._why(name, code)),
             limited=limited,
         )
+
+    def _why(self, name: str, code: int) -> str | None:
+        """How the process of a node has ended, if its limits say it."""
+        node = self._run.plan.nodes.get(name)
+        return why_ended(code, node.process, self._shares.get(name)) if node is not None else None
 
     def _take_event(self, line: bytes) -> None:
         try:

@@ -11,6 +11,7 @@ import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,7 @@ from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
 from ..wire.session import Wiring, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
+from .limits import limit_process, strain
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
@@ -130,11 +132,15 @@ class _NodeProcess:
         plan = run.plan
         process.cleans_up(self._remove_files)
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
+        if plan.process.is_private:
+            (own_folder := fmu_folder(process.folder) / "work").mkdir(mode=0o700, parents=True)
+            os.chdir(own_folder)
         publishes = f"{Keys(plan.key_prefix, plan.mesh).root}/**"
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
         own = replace(patient(ends, plan.timeouts, is_node=True), publishes=publishes)
         session = open_session(own)
         process.stack.callback(close_session, session)
+        limit_process(plan.process)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
         router = RouterLink(session, run.zenoh.connect)
@@ -151,6 +157,7 @@ class _NodeProcess:
                 router=router,
                 launch=process.launch,
                 meeting=self._meeting,
+                strain=partial(strain, plan.process),
             )
             gc.collect()  # the memory of the run before a reset is in circles of objects
             if process.interruption.reason is not None:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.instance_sections import InstanceSection, placed
+from ..config.instance_sections import InstanceSection, ProcessConfig, placed
 from ..config.key_sections import KEY
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
@@ -142,6 +142,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shared_memory: whether processes of one host exchange messages through shared memory.
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder.
+        process: what its process may take of its host.
     """
 
     mesh: str
@@ -167,6 +168,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shared_memory: bool = True
     row_streams: bool = True
     restarts: int = 0
+    process: ProcessConfig = ProcessConfig()
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -274,6 +276,7 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
         replace(
             node,
             limits=LimitsConfig(),
+            process=ProcessConfig(),
             records=tuple(replace(record, file="") for record in node.records),
             instances=tuple(
                 replace(
@@ -341,6 +344,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             limits=config.limits,
             shared_memory=config.zenoh.shared_memory,
             row_streams=config.zenoh.row_streams,
+            process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
         )
     return nodes
 
