@@ -144,8 +144,7 @@ class Node:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
-        self._make_engine = engine
-        self._strain = strain
+        self._make_engine, self._strain = engine, strain
         self._finish_at: float = math.inf
         self._token_went = False
         self.failure_is_known = False

@@ -254,17 +254,7 @@ def make_plan(
     check_loops(initialization, connections, descriptions, findings)
     outputs = system.output_layouts(connections)
     points = window_of(system.config.simulation.window if window is None else window, outputs.values())
-    plan = Plan(
-        system=system,
-        connections=connections,
-        order=order,
-        cycles=cycles,
-        closing=closing,
-        initialization=initialization,
-        window=points,
-        digest="",
-        nodes={},
-    )
+    plan = Plan(system, connections, order, cycles, closing, initialization, window=points, digest="", nodes={})
     nodes = _nodes(plan, outputs)
     digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})

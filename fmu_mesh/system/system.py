@@ -371,7 +371,7 @@ def _step_points(name: str, config: InstanceSection, base: float, findings: Find
     return points
 
 
-def _check_nodes(
+def _check_nodes(  # noqa: C901  one check after another
     config: Config, descriptions: Mapping[str, ModelDescription], claims: ClaimsOf, findings: Findings
 ) -> None:
     """Check that the instances of each group can share one node."""
@@ -393,7 +393,9 @@ def _check_nodes(
             found = f"{shown(instance.host)}, while '{first}' has {shown(config.instances[first].host)}"
             expected = f"one host for all instances of the group '{group}'"
             findings.add(f"instances.{name}.host", found, expected)
-        _check_limits(config, name, first, findings)
+        if config.process_of(config.instances[first]) != config.process_of(instance):
+            found, expected = f"other limits than '{first}' has", f"the same for all instances of the group '{group}'"
+            findings.add(f"instances.{name}.process", found, expected)
         if instance.names_code:
             first = first_with_code.setdefault(group, name)
             if config.instances[first].interpreter != instance.interpreter:
@@ -406,13 +408,6 @@ def _check_nodes(
             process = processes.setdefault(group, SharedProcess())
             if (why := process.refusal(name, partial(claims, name))) is not None:
                 findings.add(path, why, "different groups")
-
-
-def _check_limits(config: Config, name: str, first: str, findings: Findings) -> None:
-    if config.process_of(config.instances[first]) != config.process_of(config.instances[name]):
-        found = f"limits for '{name}', while '{first}' has others, and both share a node"
-        expected = f"the same for all instances of the group '{config.instances[name].group}'"
-        findings.add(f"instances.{name}.process", found, expected)
 
 
 def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findings: Findings) -> None:

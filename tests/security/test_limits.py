@@ -115,7 +115,7 @@ def test_instances_of_one_node_have_the_same_limits(place: Place) -> None:
     launched = place.run("check", config)
 
     assert launched.wait() == 2
-    assert "instances.b.process: limits for 'b', while 'a' has others, and both share a node" in launched.errors
+    assert "instances.b.process: other limits than 'a' has; expected the same for all" in launched.errors
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,18 @@ def test_every_key_without_an_example_is_a_section(pages: ModuleType) -> None:
     without = {key.name for section in pages.sections() for key in section.keys if key.example is None}
 
     assert without == {
-        *("simulation", "instances", "initialization", "record", "zenoh", "timeouts", "limits", "ros", "solver")
+        *(
+            "simulation",
+            "instances",
+            "initialization",
+            "record",
+            "zenoh",
+            "timeouts",
+            "limits",
+            "process",
+            "ros",
+            "solver",
+        )
     }
 
 
