@@ -6,7 +6,6 @@ Settings are checked here and made by the main thread. A query that waits too lo
 
 from __future__ import annotations
 
-import os
 import socket
 import time
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from ..variables.value_types import is_text
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, escape, unescape
 from ..wire.messages import SetValue, decode_json
+from ..wire.runtime import own_pid
 from ..wire.values import (
     NO_ORIGIN,
     Origin,
@@ -367,7 +367,7 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
             for own in feed.columns
         ),
         node=plan.node,
-        pid=os.getpid(),
+        pid=own_pid(),
         host=socket.gethostname(),
         problems=description.problems,
         clocks=description.clocks,

@@ -41,6 +41,7 @@ from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
+from .sandbox import why_no_sandbox
 
 __all__ = ["KnownModels", "OtherStartValues", "check_reset", "planned", "planned_reset", "without_keys"]
 
@@ -149,6 +150,8 @@ def planned(
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
     check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
     obstacles = loaded.findings()
+    if (why := why_no_sandbox(loaded.config)) is not None:
+        obstacles.add("process.sandbox", *why)
     if not len(findings):  # otherwise the world may be what is wrong
         try:
             check_showing(loaded.config.instances, showing)

@@ -35,7 +35,7 @@ from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Stiff
 from ..wire.router_link import RouterLink
-from ..wire.runtime import MeshNote, fmu_folder, run_folder, write_note
+from ..wire.runtime import MeshNote, ask_outside, fmu_folder, run_folder, write_note
 from ..wire.session import Wiring, close_session, is_socket, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
@@ -61,12 +61,14 @@ def job_of(role: str, plan: str, node: str = "", *others: str, forks: bool = Fal
         role: one of the three; or `copies`, which a batch starts.
         plan: the file of the run plan.
         node: name of the node, or the number of the process with copies.
-        others: what a process with copies needs besides.
+        others: what a process with copies needs besides; of a node in a sandbox, the socket for its questions.
         forks: whether the process is forked from this one. Then what several nodes need is done here, once, such as
             extracting the FMU of all.
     """
     file = Path(plan)
     if role == "node":
+        for channel in others:
+            ask_outside(int(channel))
         run = read_node(file, node)
         for item in run.plan.instances if forks else ():
             with suppress(FmuMeshError):  # the node says it
@@ -111,6 +113,9 @@ def run_node(run: NodeRun) -> None:
         text = f"node '{run.plan.node}' needs the Python '{python}', and this process is another one"
         command = shlex.join([python, "-m", "fmu_mesh", "node", str(run.config_file), run.plan.node])
         raise ConfigurationError(text, hint=f"Start it with `{command}`.")
+    if run.run == MANUAL and run.plan.process.is_sandboxed:  # it could ask nobody outside
+        text = f"`sandbox` of node '{run.plan.node}' has no effect where the node is started manually"
+        raise ConfigurationError(text, hint="`fmu-mesh launch` starts it in a sandbox; `sandbox: none` without.")
     with RunProcess(run.plan.mesh, run.run) as process:
         _NodeProcess(run, process).run()
 

@@ -15,12 +15,13 @@ import signal
 import socket
 import stat
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from errno import ENOENT
 from functools import cache
 from pathlib import Path
-from typing import TextIO
+from typing import Final, TextIO
 
 import msgspec
 
@@ -29,13 +30,20 @@ from ..files import remove_tree
 
 __all__ = [
     "OR_CUT",
+    "STATES",
+    "Answered",
+    "Asked",
     "MeshNote",
+    "ask_outside",
+    "box_of",
     "enter_run_folder",
     "fmu_folder",
     "is_alive",
     "is_stopped",
     "leave_run_folder",
     "meshes",
+    "opened_of",
+    "own_pid",
     "remove_stale_folders",
     "rows_socket",
     "run_folder",
@@ -56,6 +64,12 @@ _PF_EXITING = 0x4
 STOPPED = "is stopped (state T)"
 OR_CUT = ", or the link between it and the master is cut"
 """What a message says of such a process; see `is_stopped`."""
+
+STATES: Final = ("gone", "running", "stopped")
+_ANSWER_BYTES: Final = 1024
+
+_outside: list[tuple[socket.socket, threading.Lock]] = []
+"""To the launcher of a process in a sandbox, which sees no other processes; empty in others."""
 
 _KILLED = 1 << (signal.SIGKILL - 1)
 """Bits of a process in /proc."""
@@ -85,6 +99,52 @@ class MeshNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pid: int
     config: str
     host: str = ""
+
+
+class Asked(msgspec.Struct, frozen=True):
+    """What a process in a sandbox asks its launcher: how a process is, and for the memory that it has open."""
+
+    pid: int
+    descriptor: int | None = None
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """The process id of who asks, as others see it, and the state of the other one, of `STATES`."""
+
+    own: int
+    state: str
+
+
+def ask_outside(descriptor: int) -> None:
+    """From now on, ask for other processes at this socket: this one is in a sandbox (`fmu_mesh.run.sandbox`)."""
+    _outside.append((socket.socket(fileno=descriptor), threading.Lock()))
+
+
+def _told(asked: Asked) -> tuple[Answered, list[int]]:
+    connection, lock = _outside[0]
+    with lock:
+        connection.send(msgspec.msgpack.encode(asked))
+        data, descriptors, *_ = socket.recv_fds(connection, _ANSWER_BYTES, 1)
+    return msgspec.msgpack.decode(data, type=Answered), descriptors
+
+
+def own_pid() -> int:
+    """The process id of this process, as others see it."""
+    return _told(Asked(0))[0].own if _outside else os.getpid()
+
+
+def opened_of(pid: int, descriptor: int) -> int:
+    """A descriptor of the memory that another process has open.
+
+    Raises:
+        OSError: it cannot be opened from here: another host, or another user.
+    """
+    if not _outside:
+        return os.open(f"/proc/{pid}/fd/{descriptor}", os.O_RDWR | os.O_CLOEXEC)
+    for own in _told(Asked(pid, descriptor))[1]:
+        os.set_inheritable(own, False)  # noqa: FBT003  it takes no keyword
+        return own
+    raise FileNotFoundError(ENOENT, "the launcher does not hand it out")
 
 
 def runtime_folder() -> Path:
@@ -177,7 +237,18 @@ def _made(folder: Path) -> os.stat_result:
 
 def fmu_folder(folder: Path) -> Path:
     """Where this process extracts FMUs in the folder of a run."""
-    return folder / "fmus" / _own_name(folder)
+    return (Path(_held[folder].name).parent if folder in _held else folder) / "fmus" / _own_name(folder)
+
+
+def box_of(folder: Path, node: str) -> Path:
+    """The part of the folder of a run that is there for a node in a sandbox, and that only this one can write."""
+    return folder / _socket_name(node).removesuffix(_SOCKET)
+
+
+def _place(folder: Path, node: str) -> Path:
+    """Where a node has its sockets and its note: its box, which the launcher has made, or the folder of the run."""
+    box = box_of(folder, node)
+    return box if box.is_dir() else folder
 
 
 def _own_name(folder: Path) -> str:
@@ -196,7 +267,7 @@ def enter_run_folder(folder: Path, node: str) -> None:
     """
     name, socket_name = str(os.getpid()), _socket_name(node)
     for number in range(2, _ENTRIES):
-        note = _private(folder) / f"{name}.{socket_name.removesuffix(_SOCKET)}.pid"
+        note = _place(_private(folder), node) / f"{name}.{socket_name.removesuffix(_SOCKET)}.pid"
         try:
             file = note.open("x", encoding="utf-8")
             fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
@@ -265,7 +336,7 @@ def socket_endpoint(folder: Path, node: str) -> str:
     Raises:
         ConfigurationError: the path is too long for a Unix socket.
     """
-    path = folder / _socket_name(node)
+    path = _place(folder, node) / _socket_name(node)
     if len(os.fsencode(path)) > _SOCKET_PATH_LIMIT:
         raise ConfigurationError(
             f"'{path}' is too long for a socket ({_SOCKET_PATH_LIMIT} bytes)",
@@ -276,7 +347,7 @@ def socket_endpoint(folder: Path, node: str) -> str:
 
 def rows_socket(folder: Path, node: str) -> Path:
     """The socket where a node waits for row streams, in the folder of a run."""
-    return folder / _socket_name(node).replace(_SOCKET, _ROWS)
+    return _place(folder, node) / _socket_name(node).replace(_SOCKET, _ROWS)
 
 
 def _socket_name(node: str) -> str:
@@ -341,6 +412,8 @@ def _own_note(file: Path) -> MeshNote | None:
 
 def is_alive(pid: int) -> bool:
     """Whether this process still runs; one that has ended, or is about to end because it was killed, does not."""
+    if _outside:
+        return _told(Asked(pid))[0].state != STATES[0]
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -359,6 +432,8 @@ def is_alive(pid: int) -> bool:
 
 def is_stopped(pid: int) -> bool:
     """Whether a process is stopped by a signal, such as SIGSTOP or Ctrl-Z; False if it is gone."""
+    if _outside:
+        return _told(Asked(pid))[0].state == STATES[2]
     try:
         return _stat(pid)[0] == "T"
     except (OSError, IndexError):
