@@ -161,9 +161,7 @@ def _system() -> Iterator[str]:
 
 def _of_models(node: NodePlan) -> Iterator[Path]:
     """The files of the models of a node: an FMU alone, and of other kinds the folder, where further ones may be."""
-    from ..instances.fmi.archive.sources import cache_folder  # noqa: PLC0415  FMPy is slow to import
-
-    yield cache_folder() / "sources"
+    yield files.cache_folder() / "sources"
     for item in node.instances:
         path = Path(item.fmu)
         yield (files.archive_on_the_way(path) or path) if item.section.follows_fmi else path.parent

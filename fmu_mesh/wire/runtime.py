@@ -68,6 +68,8 @@ OR_CUT = ", or the link between it and the master is cut"
 STATES: Final = ("gone", "running", "stopped")
 _ANSWER_BYTES: Final = 1024
 
+# Threads of a node in a sandbox ask its launcher one after another: the lock is held from a question to its answer, and
+# the launcher answers whatever it is doing, on a thread of its own (ADR 84).
 _outside: list[tuple[socket.socket, threading.Lock]] = []
 """To the launcher of a process in a sandbox, which sees no other processes; empty in others."""
 
