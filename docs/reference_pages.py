@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
-_COMMON = ("start_values", "inputs", "step_size", "group", "host", "not_finite")
+_COMMON = ("start_values", "inputs", "step_size", "group", "host", "not_finite", "process")
 _INTERPOLATION = "interpolation"
 _WRITTEN = "<!-- written by `python docs/reference_pages.py` -->"
 

@@ -39,6 +39,7 @@ __all__ = [
     "OwnFile",
     "archive_on_the_way",
     "beside",
+    "cache_folder",
     "cloned",
     "decoded_json",
     "exists",
@@ -109,6 +110,15 @@ def beside(file: Path, relative: str) -> Path:
     if archive_on_the_way(file) is not None:
         path = Path(os.path.normpath(path))
     return path.parent.resolve() / path.name
+
+
+def cache_folder() -> Path:
+    """The user's cache folder: ``$FMU_MESH_CACHE_DIR``, or else a folder below ``$XDG_CACHE_HOME``."""
+    if chosen := os.environ.get("FMU_MESH_CACHE_DIR"):
+        return Path(chosen)
+    from platformdirs import user_cache_path  # noqa: PLC0415 only FMUs of sources need it
+
+    return user_cache_path("fmu_mesh")
 
 
 def opened(path: Path) -> BufferedReader[FileIO]:

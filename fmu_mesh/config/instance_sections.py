@@ -7,6 +7,7 @@ engines. It knows no kind.
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,12 +39,16 @@ __all__ = [
     "Kinds",
     "NotFinitePolicy",
     "PhysicsSection",
+    "Process",
+    "ProcessConfig",
     "StartValues",
     "StepSize",
     "key_of",
     "keys_of",
     "placed",
 ]
+
+_SIZE = re.compile(r"^([0-9]+) ?([KMG])iB$")
 
 KIND = "@kind"
 """The tag field of the sections. A file does not have it: there the kind of an instance follows from its keys."""
@@ -73,6 +78,71 @@ NotFinitePolicy = Annotated[
 Host = Annotated[str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")]
 
 
+class ProcessConfig(Base, frozen=True, kw_only=True):
+    """What the process of a node may take of its host. What is null is not limited."""
+
+    memory: Annotated[
+        Annotated[int, Meta(ge=1)] | Annotated[str, Meta(pattern=_SIZE.pattern, title="a size such as 512 MiB")] | None,
+        Meta(
+            description="Memory above what the node has before it loads its models, in bytes, or as 512 MiB; more is "
+            "refused to the model (RLIMIT_DATA).",
+            examples=["512 MiB"],
+        ),
+    ] = None
+    cpu_time: Annotated[
+        Annotated[float, Meta(gt=0)] | None,
+        Meta(description="Processor time from there on in s, rounded up to a second; then the process is ended."),
+    ] = None
+    open_files: Annotated[
+        Annotated[int, Meta(ge=64)] | None,
+        Meta(description="Files and sockets that are open at a time; a node has some thirty of its own."),
+    ] = None
+    working_folder: Annotated[
+        Literal["shared", "private"] | None,
+        Meta(
+            description="shared: the node works in the folder where the mesh was started; private: in an empty one of "
+            "its own, which is removed at the end, as always in a sandbox."
+        ),
+    ] = None
+    sandbox: Annotated[
+        Literal["none", "bubblewrap"] | None,
+        Meta(
+            description="bubblewrap: without the network, other processes, and all files but the model and those of "
+            "the system, which it can only read."
+        ),
+    ] = None
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """The limit of the memory in bytes."""
+        if not isinstance(self.memory, str):
+            return self.memory
+        number, unit = cast("re.Match[str]", _SIZE.match(self.memory)).groups()
+        return int(number) << {"K": 10, "M": 20, "G": 30}[unit]
+
+    @property
+    def is_private(self) -> bool:
+        """Whether the node has a working folder of its own."""
+        return self.working_folder == "private" or self.is_sandboxed
+
+    @property
+    def is_sandboxed(self) -> bool:
+        """Whether the node runs in a sandbox."""
+        return self.sandbox == "bubblewrap"
+
+    def over(self, general: ProcessConfig) -> ProcessConfig:
+        """This section, with what a more general one says where this one says nothing."""
+        names = self.__struct_fields__
+        return ProcessConfig(
+            **{n: own if (own := getattr(self, n)) is not None else getattr(general, n) for n in names}
+        )
+
+
+Process = Annotated[
+    ProcessConfig | None,
+    Meta(description="What the process of its node may take; what it does not say is as in `process` of the mesh."),
+]
+
 Section = TypeVar("Section", bound="InstanceSection")
 
 
@@ -99,7 +169,7 @@ class InstanceSection:
     """Base class of the sections of instances.
 
     A kind derives its section from `Base` and from this class. The field that has the same name as the kind is the path
-    of the model, unless the section overrides `path` and `agreed`. The section has those of the six common keys that
+    of the model, unless the section overrides `path` and `agreed`. The section has those of the seven common keys that
     make sense for its kind::
 
         class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="table"):
@@ -109,6 +179,7 @@ class InstanceSection:
             group: Group = None
             host: Host = None
             not_finite: NotFinitePolicy = None
+            process: Process = None
 
     Attributes:
         start_values: by variable name, as written in the file.
@@ -117,6 +188,7 @@ class InstanceSection:
         group: the group that shares one node; None: none.
         host: the host that the node is meant to run on; None: the one of `launch`.
         not_finite: what an output that is NaN or infinite means; None: what the simulation says.
+        process: what the process of its node may take; None: what the mesh says.
         interpolation: how a timed value for an unconnected input is used; None: its time is ignored.
         strict: whether what FMI forbids is an error for this instance; None: as the whole configuration says.
         follows_fmi: whether the rules of FMI apply to the model. If so, a start value that FMI forbids is a warning, or
@@ -133,6 +205,7 @@ class InstanceSection:
     group: str | None = None
     host: str | None = None
     not_finite: Literal["stop", "record"] | None = None
+    process: ProcessConfig | None = None
     interpolation: Literal["hold", "linear"] | None = None
     strict: bool | None = None
     follows_fmi: ClassVar[bool] = False
@@ -202,6 +275,7 @@ def placed(section: InstanceSection, not_finite: Literal["stop", "record"] | Non
         "group": None,
         "host": None,
         "not_finite": not_finite,
+        "process": None,
     }
     return _replaced(section, common)
 

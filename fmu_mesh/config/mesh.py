@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig, ZenohConfig
 from fmu_mesh.config.base import NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Name
-from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection
+from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection, ProcessConfig
 from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
 from fmu_mesh.config.scenario_section import ScenarioConfig
@@ -304,6 +304,7 @@ class Config(Base, frozen=True, kw_only=True):
     runtime: RuntimeConfig = RuntimeConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     limits: LimitsConfig = LimitsConfig()
+    process: ProcessConfig = ProcessConfig()
     strict: Annotated[
         bool,
         Meta(
@@ -340,6 +341,10 @@ class Config(Base, frozen=True, kw_only=True):
     def not_finite(self, section: InstanceSection) -> Literal["stop", "record"]:
         """What an output that is NaN or infinite means for an instance of this mesh."""
         return section.not_finite or self.simulation.not_finite
+
+    def process_of(self, section: InstanceSection) -> ProcessConfig:
+        """What the process of the node of an instance may take."""
+        return (section.process or ProcessConfig()).over(self.process)
 
     def is_strict(self, section: InstanceSection) -> bool:
         """Whether a violation of FMI is an error, and not a warning, for an instance of this mesh."""

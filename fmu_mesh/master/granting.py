@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from ..errors import DeadlineExceeded, ProtocolBroken
 from ..system.plan import MASTER, RECORDER, Plan
-from ..wire.runtime import STOPPED
+from ..wire.host_processes import STOPPED
 from ..wire.ways import Ways
 from .pacing import CLOCK, PAUSE, Reach
 from .registrations import spoken

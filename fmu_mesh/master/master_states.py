@@ -51,8 +51,8 @@ from ..errors import (
     from_report,
 )
 from ..system.plan import RECORDER, Plan
+from ..wire.host_processes import OR_CUT
 from ..wire.messages import FINISH, GRANT, NodeReport
-from ..wire.runtime import OR_CUT
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
 from ..wire.ways import Ways
 from .granting import Granting

@@ -16,6 +16,7 @@ import zenoh
 from ..errors import FmuMeshError
 from ..rings.host_memory import Offer
 from ..system.plan import RECORDER
+from ..wire.host_processes import is_alive, is_stopped
 from ..wire.inbox import Inbox
 from ..wire.keys import RunKeys
 from ..wire.meeting import Meeting
@@ -23,7 +24,6 @@ from ..wire.membership import Admission, NodeReady, Registration, Welcome
 from ..wire.messages import ABORT, HEADER, RESET, NewStart, decode_json, encode_json
 from ..wire.refusals import payload_of
 from ..wire.router_link import RouterLink
-from ..wire.runtime import is_alive, is_stopped
 from ..wire.session import undeclare_all
 from ..wire.ways import Ways
 from .registrations import Registrations

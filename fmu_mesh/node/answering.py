@@ -6,7 +6,6 @@ Settings are checked here and made by the main thread. A query that waits too lo
 
 from __future__ import annotations
 
-import os
 import socket
 import time
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from ..system.start_values import why_not_settable
 from ..variables.model_description import Value, Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import is_text
+from ..wire.host_processes import own_pid
 from ..wire.inbox import Inbox
 from ..wire.keys import BY, Keys, VariableKind, escape, unescape
 from ..wire.messages import SetValue, decode_json
@@ -399,7 +399,7 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
             for own in feed.columns
         ),
         node=plan.node,
-        pid=os.getpid(),
+        pid=own_pid(),
         host=socket.gethostname(),
         problems=description.problems,
         clocks=description.clocks,

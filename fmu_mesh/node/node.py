@@ -119,6 +119,7 @@ class Node:
         on_hang: called on another thread if a step does not return in time.
         launch: the launcher that started this process; None if it was started manually.
         meeting: where it meets others for row streams; the caller closes it.
+        strain: which limit of this process a failure of an FMU may come from, as a sentence; None: none.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -138,11 +139,12 @@ class Node:
         launch: str | None = None,
         meeting: Meeting | None = None,
         engine: Callable[..., Engine] = make_engine,
+        strain: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
-        self._make_engine = engine
+        self._make_engine, self._strain = engine, strain
         self._finish_at: float = math.inf
         self._token_went = False
         self.failure_is_known = False
@@ -192,6 +194,8 @@ class Node:
             self._tell_end(None, self._plan.timeouts.stop + self._plan.timeouts.link)  # the link may be cut
         except FmuMeshError as error:
             located = self._located(error)
+            if isinstance(located, FmuError) and located is error:
+                located.with_hint(self._strain())
             aborted = isinstance(error, _Aborted)
             self.new_start = error.new_start if isinstance(error, _Aborted) else None
             if aborted or not self._membership.lost_master:  # its token may be gone before its last message arrives

@@ -6,10 +6,10 @@ every burst.
 
 from __future__ import annotations
 
-import os
 import socket
 from time import perf_counter
 
+from ..wire.host_processes import own_pid
 from ..wire.time_profile import GRANT, Burst, NodeProfile, UnitProfile, Wait
 from .engine import Engine
 
@@ -69,7 +69,7 @@ class Profiler:
         return NodeProfile(
             node=self._node,
             host=socket.gethostname(),
-            pid=os.getpid(),
+            pid=own_pid(),
             started=self._started,
             ended=self._ended,
             units=tuple(self._units),

@@ -12,7 +12,7 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Self
 
@@ -130,12 +130,15 @@ class HostMemory:
         return [memory[first : first + size] for first in range(0, count * size, size)]
 
     @classmethod
-    def opened(cls, offer: Offer, map_: MemoryMap, process: str) -> Self | None:
-        """The memory of an offer; None if it cannot be reached from here: another host, or another user."""
+    def opened(cls, offer: Offer, map_: MemoryMap, process: str, open_: Callable[[int, int], int]) -> Self | None:
+        """The memory of an offer; None if it cannot be reached from here: another host, or another user.
+
+        ``open_`` opens a descriptor of another process.
+        """
         if not can_share():
             return None
         try:
-            descriptor = os.open(f"/proc/{offer.pid}/fd/{offer.descriptor}", os.O_RDWR | os.O_CLOEXEC)
+            descriptor = open_(offer.pid, offer.descriptor)
         except OSError:
             return None
         try:

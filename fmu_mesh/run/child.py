@@ -19,7 +19,7 @@ from functools import partial
 from typing import IO
 
 from ..errors import Interrupted
-from ..wire.runtime import is_stopped
+from ..wire.host_processes import is_stopped
 from .fork_server import Forked
 
 __all__ = ["Child", "Process", "how_it_ended"]
@@ -73,6 +73,11 @@ class Child:
     def running(self) -> bool:
         """Whether it has not ended yet."""
         return self._process.poll() is None
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id; None before it has started."""
+        return self._process.pid
 
     @property
     def stopped(self) -> bool:

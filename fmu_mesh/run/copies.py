@@ -49,7 +49,7 @@ from .copy_threads import CopyThreads, Pieces
 from .first_points import FirstPoints
 from .hosted_system import IN_ONE_NODE, HostedSystem, in_one_node
 from .local_system import opening_of
-from .one_process import claims_in
+from .one_process import claims_in, limited
 from .run_plan import RunPlan
 from .system_copy import Overrides, SavedCopy, SystemCopy, Verb
 from .threads import one_thread_meanwhile
@@ -420,6 +420,8 @@ class Copies:
         why = [reason for name in self._plan.order for reason in claims_of(name)] if self._several else []
         if why:
             raise CallRefused(f"copies cannot be stepped by several threads, where {why[0]}", hint="Use one thread.")
+        for limit in limited(self._plan):
+            raise NotInOneProcess(limit, hint="Copies have no such limits: leave out `process`.")
         for copy in ("", " of another copy")[: len(self._table)]:
             for name in self._plan.order:
                 if (refusal := process.refusal(f"{name}{copy}", partial(claims_of, name))) is not None:

@@ -18,7 +18,7 @@ from ..config.mesh import TimeoutsConfig
 from ..errors import FmuMeshError, MeshLost, from_report
 from ..instances.contract import LogMessage
 from ..simtime import TimeGrid
-from ..wire.runtime import STOPPED, is_stopped
+from ..wire.host_processes import STOPPED, is_stopped
 from .child import how_it_ended
 from .copies_messages import Answer, Channel, Failed, LoggedByModel, News, Request, SharedBlock
 from .fork_server import Forked, ForkServer

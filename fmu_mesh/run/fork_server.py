@@ -47,10 +47,10 @@ from typing import IO, Final
 import msgspec
 
 from ..errors import ConfigurationError, Interrupted, MeshLost
-from ..wire.runtime import is_alive
+from ..wire.host_processes import is_alive
 from .threads import ONE_THREAD
 
-__all__ = ["ForkServer", "Forked", "executed", "fork_server", "serve", "started_ahead"]
+__all__ = ["ForkServer", "Forked", "executed", "executed_command", "fork_server", "serve", "started_ahead"]
 
 Job = Callable[[], None]
 """What a process does, from its start to its end."""
@@ -87,9 +87,7 @@ def executed(*arguments: str, interpreter: str | None = None, pass_fds: Sequence
     It has a session of its own, so that Ctrl-C reaches only the launcher.
     """
     return subprocess.Popen(
-        # With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
-        # imported instead of that of the standard library.
-        [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments],
+        executed_command(*arguments, interpreter=interpreter),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -98,6 +96,13 @@ def executed(*arguments: str, interpreter: str | None = None, pass_fds: Sequence
         # Without the last one, setproctitle would overwrite what `/proc/PID/environ` shows.
         env=os.environ | ONE_THREAD | {"SPT_NOENV": "1"},
     )
+
+
+def executed_command(*arguments: str, interpreter: str | None = None) -> list[str]:
+    """The command line of `executed`."""
+    # With -P, Python does not look for modules in the current folder. Otherwise a `random.py` of the user would be
+    # imported instead of that of the standard library.
+    return [interpreter or sys.executable, "-Pm", "fmu_mesh.run", *arguments]
 
 
 class ForkServer:

@@ -37,11 +37,11 @@ from ..errors import Interrupted, MeshLost
 from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
-from ..wire.runtime import remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
+from ..wire.runtime import box_of, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
 from ..wire.session import refused_link
 from .child import Child, Process
 from .events import Event, OutputLine, Reachable, WasReset, decode_event
-from .fork_server import ForkServer, executed, fork_server
+from .fork_server import ForkServer, executed, executed_command, fork_server
 from .launcher_states import (
     GATEWAY,
     SERVER,
@@ -54,9 +54,11 @@ from .launcher_states import (
     Signal,
     Start,
 )
+from .limits import memory_share, why_ended
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
+from .sandbox import Sandboxed
 
 __all__ = ["Launcher"]
 
@@ -80,6 +82,7 @@ class Launcher:
         self._server: ForkServer | None = None
         self._processes: dict[str, Child] = {}
         self._files: tuple[tuple[str, int], ...] | None = None
+        self._shares: dict[str, float | None] = {}
         self._clock = AwakeClock()
         config, plan = run.loaded.config, run.plan
         self._states = LaunchStates(
@@ -102,6 +105,9 @@ class Launcher:
         self._folder = run_folder(self._run.mesh, self._run.run)
         try:
             socket_endpoint(self._folder, MASTER)  # a path that is too long is found here
+            for name, node in self._run.plan.nodes.items():
+                if node.process.is_sandboxed:
+                    box_of(self._folder, name).mkdir(mode=0o700)
             self._file = str(self._run.write(self._folder))
             self._do(self._states.begin())
             while not self._states.is_ending:
@@ -123,6 +129,9 @@ class Launcher:
     # --- waiting and doing; all of it on the thread that called `run`
 
     def _turn(self) -> None:
+        for name, process in self._processes.items():
+            if (node := self._run.plan.nodes.get(name)) is not None and node.process.memory is not None:
+                self._shares[name] = memory_share(node.process, process.pid) or self._shares.get(name)
         try:
             self._happened.get(timeout=self._states.wait_s)()
             quiet = False
@@ -153,10 +162,19 @@ class Launcher:
         elif name == GATEWAY:
             self._watch(name, self._fork("gateway"), self._take_gateway_line)
         else:
-            python = self._run.plan.nodes[name].interpreter
-            is_other = python is not None and is_other_python(python)
-            process = executed("node", self._file, name, interpreter=python) if is_other else self._fork("node", name)
+            node = self._run.plan.nodes[name]
+            process: Process
+            if node.process.is_sandboxed:
+                process = Sandboxed(node, self._folder, executed_command("node", self._file, name), self._is_own)
+            elif node.interpreter is not None and is_other_python(node.interpreter):
+                process = executed("node", self._file, name, interpreter=node.interpreter)
+            else:
+                process = self._fork("node", name)
             self._watch(name, process, partial(self._take_output, name), limited=True)
+
+    def _is_own(self, pid: int) -> bool:
+        """From any thread: whether a process is one of this run."""
+        return pid in [process.pid for process in [*self._processes.values()]]
 
     def _fork(self, role: str, *arguments: str) -> Process:
         assert self._server is not None
@@ -167,9 +185,14 @@ class Launcher:
         child.watch(
             on_line,
             self._take_output,
-            lambda name, code: self._states.ended(name, code, self._clock()),
+            lambda name, code: self._states.ended(name, code, self._clock(), self._why(name, code)),
             limited=limited,
         )
+
+    def _why(self, name: str, code: int) -> str | None:
+        """How the process of a node has ended, if its limits say it."""
+        node = self._run.plan.nodes.get(name)
+        return why_ended(code, node.process, self._shares.get(name)) if node is not None else None
 
     def _take_event(self, line: bytes) -> None:
         try:

@@ -33,7 +33,7 @@ from msgspec import Struct
 
 from ..config.deadlines import Deadlines
 from ..errors import DeadlineExceeded, FmuError, FmuMeshError, Interrupted, MeshLost, from_report
-from ..wire.runtime import OR_CUT, STOPPED
+from ..wire.host_processes import OR_CUT, STOPPED
 from ..wire.views import GOING_ON, MeshStatus
 from .child import how_it_ended
 from .events import Event, Status
@@ -185,8 +185,8 @@ class LaunchStates:
         self._gateway_ready = True
         return () if self.is_ending else self._starts(*self._terms.nodes)
 
-    def ended(self, name: str, code: int, now: float) -> None:
-        """A process has ended with an exit code: the negative number of a signal if it was one."""
+    def ended(self, name: str, code: int, now: float, why: str | None = None) -> None:
+        """A process has ended with an exit code: the negative number of a signal if it was one; and why, if known."""
         self._running.discard(name)
         if name == SERVER:  # it ends after all others, or is lost, whatever the master reports of what that means
             if code != 0 and self._how.get(name) != _UNTOLD:  # otherwise this process has killed it
@@ -195,7 +195,7 @@ class LaunchStates:
             return
         if not self._signalled:  # afterwards the signal is the reason
             lost_link = code == MeshLost.exit_code and name in self._terms.nodes
-            self._how.setdefault(name, "lost its link to the master" if lost_link else how_it_ended(code))
+            self._how.setdefault(name, why or ("lost its link to the master" if lost_link else how_it_ended(code)))
         if self.is_ending:
             return
         stopping = self._status is not None and self._status.state == "stopping"  # then the master warns of its loss

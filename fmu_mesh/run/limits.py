@@ -1,29 +1,40 @@
-"""The limits of memory: checks before a command starts that the address space (`ulimit -v`) and the memory are enough.
+"""Limits: checks before a command starts that the memory is enough, and what `process` allows the process of a node.
 
-With too little, each library fails in its own way: a traceback of an import, a panic, an abort. Knows only the name of
-a command and imports nothing large, so that the check itself works.
+With too little, each library fails in its own way: a traceback of an import, a panic, an abort. The checks know only
+the name of a command and import nothing large, so that they work themselves.
 """
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import resource
+import signal
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from ..config.instance_sections import ProcessConfig
 
 __all__ = [
     "FEWEST_MIB",
     "RUN_MIB",
     "address_space_problem",
+    "limit_process",
+    "memory_share",
     "needed_mib",
     "out_of_memory",
     "resident_bytes",
     "ring_problem",
+    "strain",
+    "why_ended",
 ]
 
 FEWEST_MIB = 300
@@ -37,6 +48,11 @@ RUN_MIB = 1700
 _WITHOUT_SESSION = ("check", "completion", "inspect", "new", "plot", "schema")
 _RUNS = ("launch", "run", "node", "master", "gateway")
 _SWEEP = "sweep"
+_NEARLY = 0.9
+"""From this part of a limit on, it may be why a model fails."""
+_OWN_BYTES = 128 << 20
+"""What a node takes after its models are loaded: the stacks of a dozen threads, most of which it never uses."""
+_OWN_FILES = 16
 _NO_MEMORY = ("can't start new thread", "failed to map segment", "Cannot allocate memory")
 """Texts in other errors than MemoryError that mean a lack of memory."""
 
@@ -101,6 +117,68 @@ def ring_problem(rings: Mapping[str, tuple[int, int]]) -> ConfigurationError | N
     )
     hint = "Set `simulation.window` to 1, use smaller arrays, or use `processes=False`, which needs a few rows."
     return ConfigurationError(text, hint=hint)
+
+
+def limit_process(process: ProcessConfig) -> None:
+    """Limit this process from here on, above what it has used so far.
+
+    Raises:
+        ConfigurationError: the limit of the system is lower.
+    """
+    wanted = []  # the key, the kind, the limit, and what the process gets to say that it was reached
+    if (memory := process.memory_bytes) is not None:
+        wanted.append(("memory", resource.RLIMIT_DATA, _data_bytes("self") + _OWN_BYTES + memory, _OWN_BYTES))
+    if process.cpu_time is not None:
+        wanted.append(("cpu_time", resource.RLIMIT_CPU, math.ceil(time.process_time() + process.cpu_time), 1))
+    if process.open_files is not None:
+        wanted.append(("open_files", resource.RLIMIT_NOFILE, process.open_files, _OWN_FILES))
+    for name, kind, limit, more in wanted:
+        most = resource.getrlimit(kind)[1]
+        if most != resource.RLIM_INFINITY and limit + more > most:
+            text = f"`process.{name}` of {getattr(process, name)} is above the limit of this system ({most})"
+            raise ConfigurationError(text, hint="Lower it, or raise the limit with `ulimit -H`.")
+        resource.setrlimit(kind, (limit, limit + more))
+
+
+def memory_share(process: ProcessConfig, pid: int | None = None) -> float | None:
+    """The part of its memory limit that a process uses, such as 0.96; None: it has no limit, or is gone."""
+    if (memory := process.memory_bytes) is None:
+        return None
+    try:
+        limit, _ = resource.prlimit(pid or 0, resource.RLIMIT_DATA)
+        share = 1 - (limit - _data_bytes(str(pid or "self"))) / memory
+    except (OSError, IndexError):
+        return None
+    return max(0.0, share) if limit != resource.RLIM_INFINITY else None
+
+
+def strain(process: ProcessConfig) -> str | None:
+    """Of this process, after a failure: a sentence with each limit that it has nearly reached; None: with none."""
+    said = []
+    if (share := memory_share(process)) is not None and share > _NEARLY:
+        said.append(f"{share:.0%} of its memory limit ({process.memory}) is in use")
+    for kind in (resource.RLIMIT_DATA, resource.RLIMIT_NOFILE):  # to say it takes some of both
+        hard = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (hard, hard))
+    if (most := process.open_files) is not None and (
+        count := len([*Path("/proc/self/fd").iterdir()]) - 1
+    ) > _NEARLY * most:
+        said.append(f"{count} of {most} descriptors are open")
+    return f"In its process, {' and '.join(said)} (`process` in the configuration)." if said else None
+
+
+def why_ended(code: int, process: ProcessConfig, share: float | None) -> str | None:
+    """How a process of this exit code has ended, if its limits may say that; ``share``: see `memory_share`."""
+    if code == -signal.SIGXCPU and process.cpu_time is not None:
+        return f"has used its cpu_time of {process.cpu_time:g} s"
+    if code < 0 and share is not None:
+        return f"was ended by {signal.Signals(-code).name} with {share:.0%} of its memory limit in use"
+    return None
+
+
+def _data_bytes(process: str) -> int:
+    """What RLIMIT_DATA counts: private memory that can be written, except the stack."""
+    return int(Path(f"/proc/{process}/status").read_text(encoding="ascii").partition("VmData:")[2].split()[0]) << 10
 
 
 def _available() -> int | None:

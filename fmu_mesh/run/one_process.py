@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
+from ..config.instance_sections import ProcessConfig
 from ..errors import NotInOneProcess
 from ..instances.registry import claims
 from ..system.plan import Plan
 from ..system.process_sharing import Claims, ClaimsOf, SharedProcess
 
-__all__ = ["OneProcess", "apart", "claims_in", "is_other_python"]
+__all__ = ["OneProcess", "apart", "claims_in", "is_other_python", "limited"]
 
 
 class OneProcess:
@@ -30,13 +31,16 @@ class OneProcess:
             contents: the SHA-256 of the model of each instance: what ran once can run again.
 
         Raises:
-            NotInOneProcess: a component needs another Python, or two instances cannot share a process.
+            NotInOneProcess: a component needs another Python, a node has limits of its own, or two instances cannot
+                share a process.
         """
         hint = "Run the mesh in processes: leave out what keeps it in one, such as `processes=False`."
         for node in plan.nodes.values():
             if node.interpreter is not None and is_other_python(node.interpreter):
                 text = f"'{node.node}' needs the Python '{node.interpreter}', and this process is another one"
                 raise NotInOneProcess(text, hint=hint)
+        for limit in limited(plan):
+            raise NotInOneProcess(limit, hint=hint)
         claims_of = claims_in(plan)
         for name in plan.system.instances:
             member = name, contents.get(name, "")
@@ -59,7 +63,14 @@ def apart(plan: Plan) -> list[str]:
     """Why a plan cannot run in one process: a sentence for each instance that another one keeps out."""
     process, claims_of = SharedProcess(), claims_in(plan)
     refusals = (process.refusal(name, partial(claims_of, name)) for name in plan.system.instances)
-    return [why for why in refusals if why is not None]
+    return [*limited(plan), *(why for why in refusals if why is not None)]
+
+
+def limited(plan: Plan) -> list[str]:
+    """The instances of a plan that `process` gives limits or a sandbox, which only a process of their own has."""
+    config = plan.system.config
+    named = [name for name, own in config.instances.items() if config.process_of(own) != ProcessConfig()]
+    return [f"`process` limits '{name}', which needs a process of its own for that" for name in named]
 
 
 def claims_in(plan: Plan) -> ClaimsOf:

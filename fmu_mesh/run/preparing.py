@@ -17,7 +17,7 @@ from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig, PlainConfig, read_scenario
-from ..config.mesh import LimitsConfig
+from ..config.mesh import Config, LimitsConfig
 from ..config.ros_section import MeshTopic
 from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
@@ -42,6 +42,7 @@ from .allowed_code import check_code
 from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
+from .sandbox import why_no_sandbox
 
 __all__ = ["KnownModels", "OtherStartValues", "check_reset", "planned", "planned_reset", "without_keys"]
 
@@ -181,11 +182,7 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
-    if (group := loaded.config.runtime.share_with) is not None:
-        trusted = f"the members of the group '{group}' are trusted as you are: they can read, set and end this mesh"
-        warnings.add("runtime.share_with", trusted, "")
-        if (why_not := why_not_shared(group)) is not None:
-            obstacles.add("runtime.share_with", why_not, "a group of this host that you are a member of")
+    _check_host(loaded.config, obstacles, warnings)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
@@ -202,6 +199,17 @@ def planned(
     )
     obstacles.raise_any(run)
     return run
+
+
+def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:
+    """Find what this host cannot do for a mesh, and say whom the mesh trusts here."""
+    if (why := why_no_sandbox(config)) is not None:
+        obstacles.add("process.sandbox", *why)
+    if (group := config.runtime.share_with) is not None:
+        trusted = f"the members of the group '{group}' are trusted as you are: they can read, set and end this mesh"
+        warnings.add("runtime.share_with", trusted, "")
+        if (why_not := why_not_shared(group)) is not None:
+            obstacles.add("runtime.share_with", why_not, "a group of this host that you are a member of")
 
 
 class OtherStartValues:

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +32,7 @@ from ..results.record_files import open_results
 from ..results.recording import ResultFile
 from ..system.plan import MASTER, RECORDER, Plan
 from ..variables.value_types import PlainValue
+from ..wire.host_processes import ask_outside
 from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Stiff
@@ -38,6 +41,7 @@ from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_e
 from ..wire.session import Wiring, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
+from .limits import limit_process, strain
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
@@ -59,12 +63,14 @@ def job_of(role: str, plan: str, node: str = "", *others: str, forks: bool = Fal
         role: one of the three; or `copies`, which a batch starts.
         plan: the file of the run plan.
         node: name of the node, or the number of the process with copies.
-        others: what a process with copies needs besides.
+        others: what a process with copies needs besides; of a node in a sandbox, the socket for its questions.
         forks: whether the process is forked from this one. Then what several nodes need is done here, once, such as
             extracting the FMU of all.
     """
     file = Path(plan)
     if role == "node":
+        for channel in others:
+            ask_outside(int(channel))
         run = read_node(file, node)
         for item in run.plan.instances if forks else ():
             with suppress(FmuMeshError):  # the node says it
@@ -109,6 +115,9 @@ def run_node(run: NodeRun) -> None:
         text = f"node '{run.plan.node}' needs the Python '{python}', and this process is another one"
         command = shlex.join([python, "-m", "fmu_mesh", "node", str(run.config_file), run.plan.node])
         raise ConfigurationError(text, hint=f"Start it with `{command}`.")
+    if run.run == MANUAL and run.plan.process.is_sandboxed:  # it could ask nobody outside
+        text = f"`sandbox` of node '{run.plan.node}' has no effect where the node is started manually"
+        raise ConfigurationError(text, hint="`fmu-mesh launch` starts it in a sandbox; `sandbox: none` without.")
     with RunProcess(run.plan.mesh, run.run) as process:
         _NodeProcess(run, process).run()
 
@@ -130,12 +139,16 @@ class _NodeProcess:
         plan = run.plan
         process.cleans_up(self._remove_files)
         process.take_place(plan.node, f"node '{plan.node}' of mesh '{plan.mesh}'")
+        if plan.process.is_private:
+            (own_folder := fmu_folder(process.folder) / "work").mkdir(mode=0o700, parents=True)
+            os.chdir(own_folder)
         root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
         own = replace(patient(ends, plan.timeouts, is_node=True), publishes=f"{root}/**")
         own = certified(own, run.security, root)
         session = open_session(own)
         process.stack.callback(close_session, session)
+        limit_process(plan.process)
         self._watch = process.stack.enter_context(closing(CallWatch(self._take_hang, survives=True)))
         process.stack.callback(self._close_instances)
         router = RouterLink(session, run.zenoh.connect)
@@ -152,6 +165,7 @@ class _NodeProcess:
                 router=router,
                 launch=process.launch,
                 meeting=self._meeting,
+                strain=partial(strain, plan.process),
             )
             gc.collect()  # the memory of the run before a reset is in circles of objects
             if process.interruption.reason is not None:

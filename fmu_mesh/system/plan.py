@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.instance_sections import InstanceSection, placed
+from ..config.instance_sections import InstanceSection, ProcessConfig, placed
 from ..config.key_sections import KEY
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
@@ -141,6 +141,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shared_memory: whether processes of one host exchange messages through shared memory.
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder; ``secured``: whether those who set values have names.
+        process: what its process may take of its host.
     """
 
     mesh: str
@@ -167,6 +168,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     row_streams: bool = True
     restarts: int = 0
     secured: bool = False
+    process: ProcessConfig = ProcessConfig()
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -252,17 +254,7 @@ def make_plan(
     check_loops(initialization, connections, descriptions, findings)
     outputs = system.output_layouts(connections)
     points = window_of(system.config.simulation.window if window is None else window, outputs.values())
-    plan = Plan(
-        system=system,
-        connections=connections,
-        order=order,
-        cycles=cycles,
-        closing=closing,
-        initialization=initialization,
-        window=points,
-        digest="",
-        nodes={},
-    )
+    plan = Plan(system, connections, order, cycles, closing, initialization, window=points, digest="", nodes={})
     nodes = _nodes(plan, outputs)
     digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
@@ -274,6 +266,7 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
         replace(
             node,
             limits=LimitsConfig(),
+            process=ProcessConfig(),
             records=tuple(replace(record, file="") for record in node.records),
             instances=tuple(
                 replace(
@@ -342,6 +335,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             shared_memory=config.zenoh.shared_memory,
             row_streams=config.row_streams,
             secured=config.security is not None,
+            process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
         )
     return nodes
 

@@ -65,8 +65,8 @@ class SharedProcess:
 def automatic_nodes(config: Config, edges: Iterable[tuple[str, str]], claims: ClaimsOf) -> dict[str, str]:
     """The names of the nodes that several instances of a cycle share, by instance. Other instances are not in it.
 
-    An instance with a ``group`` of its own stays there. Instances with different hosts or interpreters never share a
-    node, nor do two that cannot share a process. The edges are those of all connections between instances.
+    An instance with a ``group`` of its own stays there. Instances with different hosts, interpreters or `process` never
+    share a node, nor do two that cannot share a process. The edges are those of all connections between instances.
     """
     position = {name: place for place, name in enumerate(config.instances)}
     taken = {*config.instances, *(instance.group for instance in config.instances.values() if instance.group)}
@@ -82,10 +82,11 @@ def automatic_nodes(config: Config, edges: Iterable[tuple[str, str]], claims: Cl
 
 
 def _together(config: Config, cycle: Sequence[str], claims: ClaimsOf) -> Iterable[list[str]]:
-    """The members of a cycle in as few nodes as hosts, interpreters and claims allow."""
-    parts: list[tuple[tuple[str | None, str | None], SharedProcess, list[str]]] = []
+    """The members of a cycle in as few nodes as hosts, interpreters, limits and claims allow."""
+    parts: list[tuple[object, SharedProcess, list[str]]] = []
     for name in cycle:
-        where = (config.instances[name].host, config.instances[name].interpreter)
+        section = config.instances[name]
+        where = (section.host, section.interpreter, config.process_of(section))
         own = partial(claims, name)
         part = next((part for part in parts if part[0] == where and part[1].refusal(name, own) is None), None)
         if part is None:

@@ -390,18 +390,18 @@ def _check_nodes(
         elif group in config.instances and config.instances[group].group != group:
             found = f"the group '{group}', which is the name of an instance outside the group"
             findings.add(path, found, "a name of its own")
-        if config.instances[first].host != instance.host:
-            found = f"{shown(instance.host)}, while '{first}' has {shown(config.instances[first].host)}"
-            expected = f"one host for all instances of the group '{group}'"
-            findings.add(f"instances.{name}.host", found, expected)
-        if instance.names_code:
-            first = first_with_code.setdefault(group, name)
-            if config.instances[first].interpreter != instance.interpreter:
-                found = (
-                    f"{shown(instance.interpreter)}, while '{first}' has {shown(config.instances[first].interpreter)}"
-                )
-                expected = f"one interpreter for all components of the group '{group}'"
-                findings.add(f"instances.{name}.interpreter", found, expected)
+        with_code = first_with_code.setdefault(group, name) if instance.names_code else name
+        own, theirs = config.process_of(instance), config.process_of(config.instances[first])
+        for what, other, mine, others in (
+            ("host", first, instance.host, config.instances[first].host),
+            ("process", first, msgspec.to_builtins(own), msgspec.to_builtins(theirs)),
+            ("interpreter", with_code, instance.interpreter, config.instances[with_code].interpreter),
+        ):
+            if mine != others:
+                found = f"{shown(mine)}, while '{other}' has {shown(others)}"
+                members = "components" if what == "interpreter" else "instances"
+                expected = f"one {what} for all {members} of the group '{group}'"
+                findings.add(f"instances.{name}.{what}", found, expected)
         if name in descriptions:
             process = processes.setdefault(group, SharedProcess())
             if (why := process.refusal(name, partial(claims, name))) is not None:

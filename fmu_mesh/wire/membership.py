@@ -12,7 +12,6 @@ There are three steps; each is a query with an answer:
 from __future__ import annotations
 
 import math
-import os
 import secrets
 import socket
 import threading
@@ -29,13 +28,13 @@ from msgspec.structs import replace
 from ..errors import DeadlineExceeded, MeshLost, MessageRefused
 from ..rings.host_memory import HostMemory, Offer
 from ..system.plan import MASTER, RECORDER, NodePlan
+from .host_processes import STOPPED, is_alive, is_stopped, opened_of, own_pid
 from .inbox import Inbox
 from .keys import RUN_ID_BYTES, Keys, RunKeys
 from .meeting import Door, Meeting
 from .messages import NodeReport, decode_json, sealed
 from .refusals import payload_of
 from .router_link import RouterLink
-from .runtime import STOPPED, is_alive, is_stopped
 from .session import Question, ask
 from .ways import Ways
 
@@ -358,13 +357,13 @@ class Membership:
         plan, stack = self._plan, self._stack
         seal, host = sealed(sealed(self._secret)), socket.gethostname()
         door = self._meeting.door_for(MASTER) if self._meeting is not None else None
-        registration = Registration(plan.node, plan.digest, os.getpid(), host, self._launch, seal, door)
+        registration = Registration(plan.node, plan.digest, own_pid(), host, self._launch, seal, door)
         payload = msgspec.json.encode(registration)
         question = Question(self._public.register, "the master", plan.timeouts.start, payload)
         admission = _understood(ask(self._session, question, lambda: self.given_up), Admission)
         self._keys = keys = self._public.run(admission.run)
         if self.memory is None and admission.offer is not None and plan.shared_memory:
-            self.memory = HostMemory.opened(admission.offer, plan.memory, plan.node)
+            self.memory = HostMemory.opened(admission.offer, plan.memory, plan.node, opened_of)
         if self._meeting is not None:
             self._meeting.knows(MASTER, admission.door if self.memory is None else None)
 

@@ -12,7 +12,6 @@ import grp
 import hashlib
 import itertools
 import os
-import signal
 import socket
 import stat
 import tempfile
@@ -27,14 +26,13 @@ import msgspec
 
 from ..errors import ConfigurationError, MeshLost
 from ..files import remove_tree
+from .host_processes import is_alive
 
 __all__ = [
-    "OR_CUT",
     "MeshNote",
+    "box_of",
     "enter_run_folder",
     "fmu_folder",
-    "is_alive",
-    "is_stopped",
     "leave_run_folder",
     "leave_shared",
     "meshes",
@@ -57,13 +55,6 @@ _SOCKET_PATH_LIMIT = 107
 _SOCKET = ".sock"
 _ROWS = ".rows"
 _FOLDER_HINT = "Set FMU_MESH_RUNTIME_DIR to a folder of your own."
-_PF_EXITING = 0x4
-STOPPED = "is stopped (state T)"
-OR_CUT = ", or the link between it and the master is cut"
-"""What a message says of such a process; see `is_stopped`."""
-
-_KILLED = 1 << (signal.SIGKILL - 1)
-"""Bits of a process in /proc."""
 _ENTRIES = 100
 """How often a process tries to enter a folder that others, who leave it, remove meanwhile."""
 _NAME_LIMIT = 40
@@ -236,7 +227,18 @@ def _made(folder: Path) -> os.stat_result:
 
 def fmu_folder(folder: Path) -> Path:
     """Where this process extracts FMUs in the folder of a run."""
-    return folder / "fmus" / _own_name(folder)
+    return (Path(_held[folder].name).parent if folder in _held else folder) / "fmus" / _own_name(folder)
+
+
+def box_of(folder: Path, node: str) -> Path:
+    """The part of the folder of a run that is there for a node in a sandbox, and that only this one can write."""
+    return folder / _socket_name(node).removesuffix(_SOCKET)
+
+
+def _place(folder: Path, node: str) -> Path:
+    """Where a node has its sockets and its note: its box, which the launcher has made, or the folder of the run."""
+    box = box_of(folder, node)
+    return box if box.is_dir() else folder
 
 
 def _own_name(folder: Path) -> str:
@@ -255,7 +257,7 @@ def enter_run_folder(folder: Path, node: str) -> None:
     """
     name, socket_name = str(os.getpid()), _socket_name(node)
     for number in range(2, _ENTRIES):
-        note = _private(folder) / f"{name}.{socket_name.removesuffix(_SOCKET)}.pid"
+        note = _place(_private(folder), node) / f"{name}.{socket_name.removesuffix(_SOCKET)}.pid"
         try:
             file = note.open("x", encoding="utf-8")
             fcntl.flock(file, fcntl.LOCK_EX)  # the lock ends with the process, however it ends
@@ -324,7 +326,7 @@ def socket_endpoint(folder: Path, node: str) -> str:
     Raises:
         ConfigurationError: the path is too long for a Unix socket.
     """
-    return _endpoint_at(folder / _socket_name(node))
+    return _endpoint_at(_place(folder, node) / _socket_name(node))
 
 
 def _endpoint_at(path: Path) -> str:
@@ -338,7 +340,7 @@ def _endpoint_at(path: Path) -> str:
 
 def rows_socket(folder: Path, node: str) -> Path:
     """The socket where a node waits for row streams, in the folder of a run."""
-    return folder / _socket_name(node).replace(_SOCKET, _ROWS)
+    return _place(folder, node) / _socket_name(node).replace(_SOCKET, _ROWS)
 
 
 def _socket_name(node: str) -> str:
@@ -399,34 +401,3 @@ def _own_note(file: Path) -> MeshNote | None:
     except (OSError, msgspec.DecodeError):
         return None
     return note if note.host == this_host() else None
-
-
-def is_alive(pid: int) -> bool:
-    """Whether this process still runs; one that has ended, or is about to end because it was killed, does not."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    try:
-        # Its children are told that it was killed before its state says so.
-        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
-        pending = int(status.partition("SigPnd:")[2].split()[0], 16)
-        state, *_, flags = _stat(pid)[:7]
-    except (OSError, IndexError, ValueError):  # it has ended meanwhile, or the system has no /proc
-        return not Path("/proc/self/stat").exists()
-    return state not in {"Z", "X"} and not int(flags) & _PF_EXITING and not pending & _KILLED
-
-
-def is_stopped(pid: int) -> bool:
-    """Whether a process is stopped by a signal, such as SIGSTOP or Ctrl-Z; False if it is gone."""
-    try:
-        return _stat(pid)[0] == "T"
-    except (OSError, IndexError):
-        return False
-
-
-def _stat(pid: int) -> list[str]:
-    """The fields of a process in /proc from its state on (proc(5))."""
-    return Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()

@@ -26,6 +26,7 @@ from fmu_mesh.rings import host_memory, native
 from fmu_mesh.rings.host_memory import Counter, HostMemory, Offer, can_share
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
+from fmu_mesh.wire.host_processes import opened_of
 
 pytestmark = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")
 
@@ -50,7 +51,7 @@ def memory() -> Iterator[HostMemory]:
 
 
 def opened(memory: HostMemory, process: str, map_: MemoryMap = MAP, **changes: object) -> HostMemory | None:
-    return HostMemory.opened(replace(memory.offer, **changes), map_, process)
+    return HostMemory.opened(replace(memory.offer, **changes), map_, process, opened_of)
 
 
 # --- opening
@@ -89,9 +90,9 @@ def test_memory_that_somebody_could_shrink_is_not_used() -> None:
         os.pwrite(descriptor, token, 0)
         offer = Offer(os.getpid(), descriptor, token.hex())
 
-        assert HostMemory.opened(offer, MAP, "a") is None
+        assert HostMemory.opened(offer, MAP, "a", opened_of) is None
         fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
-        assert HostMemory.opened(offer, MAP, "a") is not None
+        assert HostMemory.opened(offer, MAP, "a", opened_of) is not None
     finally:
         os.close(descriptor)
 
@@ -123,7 +124,7 @@ def test_closed_memory_cannot_be_opened_and_who_has_it_goes_on() -> None:
     offer, other = memory.offer, opened(memory, "a")
     memory.close()
 
-    assert HostMemory.opened(offer, MAP, "b") is None
+    assert HostMemory.opened(offer, MAP, "b", opened_of) is None
     assert other is not None
     other.grant.raise_to(4)
     assert memory.grant.value == 4
@@ -271,10 +272,11 @@ _PLAYER = """
 import json, sys
 import msgspec
 from fmu_mesh.rings.host_memory import HostMemory, Offer
+from fmu_mesh.wire.host_processes import opened_of
 from fmu_mesh.system.memory_map import MemoryMap
 from tests.property.test_host_memory import ball
 offer, map_ = (msgspec.convert(item, type) for item, type in zip(json.loads(sys.argv[1]), (Offer, MemoryMap)))
-memory = HostMemory.opened(offer, map_, "b")
+memory = HostMemory.opened(offer, map_, "b", opened_of)
 ball(memory, memory.progress["b"], memory.progress["a"], int(sys.argv[2]), 1)
 """
 
@@ -339,7 +341,7 @@ def test_without_the_library_no_offer_is_taken(memory: HostMemory, monkeypatch: 
     offer = memory.offer
     monkeypatch.setattr(native, "library", None)
 
-    assert HostMemory.opened(offer, MAP, "a") is None
+    assert HostMemory.opened(offer, MAP, "a", opened_of) is None
 
 
 def test_the_token_is_in_the_memory_and_is_another_one_each_time(memory: HostMemory) -> None:

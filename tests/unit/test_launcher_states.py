@@ -24,7 +24,7 @@ from fmu_mesh.run.launcher_states import (
     Start,
 )
 from fmu_mesh.run.outcome import Outcome
-from fmu_mesh.wire.runtime import STOPPED
+from fmu_mesh.wire.host_processes import STOPPED
 from fmu_mesh.wire.views import MeshState, MeshStatus
 
 LIMITS = Deadlines.of(TimeoutsConfig(start=60.0, step=5.0, link=30.0, stop=10.0))

@@ -71,6 +71,7 @@ def test_every_key_without_an_example_is_a_section(pages: ModuleType) -> None:
             "zenoh",
             "timeouts",
             "limits",
+            "process",
             "ros",
             "solver",
             "security",

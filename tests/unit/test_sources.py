@@ -18,8 +18,9 @@ import yaml
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import LoadFailed
+from fmu_mesh.files import cache_folder
 from fmu_mesh.instances.fmi.archive.reading import read_description
-from fmu_mesh.instances.fmi.archive.sources import cache_folder, extract
+from fmu_mesh.instances.fmi.archive.sources import extract
 from fmu_mesh.instances.fmi.opening import open_instance
 from fmu_mesh.variables.model_description import Kind
 from tests.fmus import event_fmus

@@ -22,6 +22,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    Process,
     StartValues,
     StepSize,
 )
@@ -106,6 +107,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    process: Process = None
     interpolation: Annotated[
         Literal["hold", "linear"] | None,
         Meta(

@@ -17,6 +17,7 @@ from ...config.instance_sections import (
     Inputs,
     NotFinitePolicy,
     PhysicsSection,
+    Process,
     StartValues,
     StepSize,
 )
@@ -44,3 +45,4 @@ class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_f
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    process: Process = None

@@ -17,6 +17,7 @@ from ...config.instance_sections import (
     Inputs,
     NotFinitePolicy,
     PhysicsSection,
+    Process,
     StartValues,
     StepSize,
 )
@@ -45,3 +46,4 @@ class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KI
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    process: Process = None

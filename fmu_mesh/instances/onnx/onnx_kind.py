@@ -22,6 +22,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    Process,
     StartValues,
     StepSize,
 )
@@ -44,6 +45,7 @@ class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIN
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    process: Process = None
 
 
 class OnnxKind(Kind[OnnxConfig]):

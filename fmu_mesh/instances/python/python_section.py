@@ -16,6 +16,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    Process,
     StartValues,
     StepSize,
 )
@@ -80,6 +81,7 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    process: Process = None
 
     names_code = True
 

@@ -37,7 +37,7 @@ from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed
 
-__all__ = ["cache_folder", "describe", "extract", "prepare"]
+__all__ = ["describe", "extract", "prepare"]
 
 log = logging.getLogger(__name__)
 
@@ -174,15 +174,6 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
             named.symlink_to(PurePosixPath(model.library or "").name)
 
 
-def cache_folder() -> Path:
-    """The user's cache folder: ``$FMU_MESH_CACHE_DIR``, or else a folder below ``$XDG_CACHE_HOME``."""
-    if chosen := os.environ.get("FMU_MESH_CACHE_DIR"):
-        return Path(chosen)
-    from platformdirs import user_cache_path  # noqa: PLC0415 only FMUs of sources need it
-
-    return user_cache_path("fmu_mesh")
-
-
 def _add_library(fmu: OpenFmu, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
     """Copy the compiled library of an FMU to where FMI expects it."""
     names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
@@ -255,7 +246,12 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     plus = any(not name.endswith(".c") for name in build.sources)
     compiler = _compiler(path, plus=plus)
     own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
-    target = cache_folder() / "sources" / _key(sources, build, own) / f"{build.identifier}{fmpy.sharedLibraryExtension}"
+    target = (
+        files.cache_folder()
+        / "sources"
+        / _key(sources, build, own)
+        / f"{build.identifier}{fmpy.sharedLibraryExtension}"
+    )
     if target.is_file():
         return target
     tell(f"'{path}' has no binary for this platform ({fmpy.platform}): compiling its sources into '{target.parent}'")
@@ -265,8 +261,8 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
             draft = Path(scratch) / target.name
             folders = [sources, *(sources / name for name in build.includes), _OWN_HEADERS, _HEADERS]
             searched = [f"-I{folder}" for folder in folders] + _other_folders(sources)
-            files = [str(sources / name) for name in build.sources]
-            command = [*own, *searched, "-o", str(draft), *files, *_LINK_FLAGS]
+            inputs = [str(sources / name) for name in build.sources]
+            command = [*own, *searched, "-o", str(draft), *inputs, *_LINK_FLAGS]
             _run(path, command, Path(scratch))
             if prefixed := _prefixed(draft.read_bytes()):
                 _run(path, [*command, *prefixed], Path(scratch))
