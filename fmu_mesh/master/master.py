@@ -60,7 +60,7 @@ from ..system.plan import MASTER, RECORDER, Plan
 from ..system.round_trip import round_trip_cost
 from ..variables.value_types import PlainValue
 from ..wire.inbox import Inbox
-from ..wire.keys import Keys, RunKeys
+from ..wire.keys import Keys, RunKeys, sender_in
 from ..wire.meeting import Meeting
 from ..wire.messages import FINISH, PROGRESS, NewStart, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
@@ -68,9 +68,10 @@ from ..wire.router_link import RouterLink
 from ..wire.runtime import this_host
 from ..wire.session import tokens, undeclare_all
 from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
-from ..wire.values import json_encoding
+from ..wire.values import json_encoding, who_sent
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from ..wire.ways import Ways
+from .audit import Audit
 from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
 from .master_streams import MasterStreams
 from .members import Followers, Members
@@ -128,6 +129,7 @@ class Master:
         self._inbox = Inbox(self._memory)
         self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
+        self.audit = Audit(session, self._keys, lambda: max(self._states.granting.slowest, 0))
         self._token: zenoh.LivelinessToken | None = None
         self._prepare(meeting)
         self._first_keys = self._run_keys
@@ -148,6 +150,7 @@ class Master:
         if meeting is not None:
             self.streams = MasterStreams(plan, self._memory.participant(STREAMS), meeting, self._fail_later)
         self._inbox.open(session, keys, MASTER, {keys.progress(node): node for node in plan.nodes})
+        self.audit.follow(keys)
         offer = self._memory.offer if self._shares else None
         self._members = Members(self._states.registrations, session, keys, offer, settings.launch, meeting)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
@@ -186,6 +189,7 @@ class Master:
         server.show("info", self._info)
         server.show("status", self.last_status)
         server.show("plan", lambda: self._states.plan.nodes)
+        server.show("audit", self.audit.view)
         for key in (self._keys.command, *([replace(self._keys, by="*").command] if self._is_secured else ())):
             server.serve(key, self._command)
         if self._is_secured:
@@ -252,6 +256,7 @@ class Master:
     def close(self) -> None:
         """Undeclare everything."""
         self._server.close()
+        self.audit.close()
         self._close_run()
 
     def _close_run(self) -> None:
@@ -383,23 +388,23 @@ class Master:
         if query.payload is None and "*" in str(query.key_expr):
             query.drop()  # a query for all keys
             return
-        data = payload_of(query)
-        if self._is_secured and str(query.key_expr) == self._keys.command:
-            named = replace(self._keys, by="NAME").command
-            raise MessageRefused(f"this mesh has security: '{named}' takes commands, with your name")
+        key = str(query.key_expr)
         try:
-            command = decode_json(data, Command)
-        except MessageRefused as error:
-            raise MessageRefused(f"not a command: {error}") from error
+            who, command = self._sent_command(query, key)
+        except MessageRefused as refused:
+            self.audit.note("refused", sender_in(key), key, str(refused))
+            raise
         states, resets = self._states, self._resets
         try:
             if states.takes_commands and command.command == "reset":
                 self._start, resets = self._new_start(command), resets + 1
         except ConfigurationError as error:  # nothing has changed
+            self.audit.note("refused", who, key, str(error))
             query.reply_err(str(error))
             query.drop()
             return
         if states.takes_commands:
+            self.audit.note("commanded", who, key, command.command)
             claimed = self._memory.withdraw_grant() if states.granting.sharing else 0
             answer = replace(states.command(command, claimed), resets=resets)
             if command.wait and answer.hold is not None and command.command != "reset":
@@ -407,8 +412,24 @@ class Master:
             else:
                 self._answer(query, answer)
         else:
+            self.audit.note("refused", who, key, f"'{command.command}' of a mesh that is {states.state}")
             query.reply_err(f"the mesh is {states.state}; there is nothing to {command.command}")
             query.drop()
+
+    def _sent_command(self, query: zenoh.Query, key: str) -> tuple[str, Command]:
+        """Who sent a command, and the command.
+
+        Raises:
+            MessageRefused: it is none, or has no name where the mesh has security.
+        """
+        data = payload_of(query)
+        if self._is_secured and key == self._keys.command:
+            named = replace(self._keys, by="NAME").command
+            raise MessageRefused(f"this mesh has security: '{named}' takes commands, with your name")
+        try:
+            return sender_in(key) or who_sent(query.attachment), decode_json(data, Command)
+        except MessageRefused as error:
+            raise MessageRefused(f"not a command: {error}") from error
 
     def _answer(self, query: zenoh.Query, answer: CommandAnswer) -> None:
         key = query.key_expr

@@ -104,7 +104,7 @@ class MasterServer:
         take = self._inbox.refusals.answering(answer, self._inbox.post)
         (self._of_run if of_run else self._entities).append(self._session.declare_queryable(key, take))
 
-    def show(self, what: Literal["info", "status", "plan", "log"], view: Callable[[], object]) -> None:
+    def show(self, what: Literal["info", "status", "plan", "log", "audit"], view: Callable[[], object]) -> None:
         """From now on queries of a key of the mesh are answered with a view."""
         key = self._keys.mesh_key(what)
 

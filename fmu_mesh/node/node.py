@@ -224,11 +224,10 @@ class Node:
 
     def tell_recorder(self, news: SetValue | Stiff | Sequence[KeyValue]) -> None:
         """On the main thread: what the metadata of results get, such as a value that another program has set."""
-        if RECORDER in dict(self._plan.windows):
-            if isinstance(news, SetValue | Stiff):
-                kind, point = (SET if isinstance(news, SetValue) else STIFF), news.point
-            else:
-                kind, point = KEYS, news[-1][1]
+        if isinstance(news, SetValue):  # the master hears it, too, for the audit
+            self._put_set(encode_json(SET, news, news.point))
+        elif RECORDER in dict(self._plan.windows):
+            kind, point = (STIFF, news.point) if isinstance(news, Stiff) else (KEYS, news[-1][1])
             self._put_set(encode_json(kind, news, point))
 
     def report_hang(self, error: FmuError) -> bool:

@@ -31,7 +31,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -109,6 +109,7 @@ class Recorder:
         notes: the folder of the run, if somebody counts the rows when this process was killed (`rows_left`).
         memory: that of the master's process, if others exchange rows through it or through its row streams.
         mirror_of: where the rows of a link come to that has a row stream.
+        audit: how often something has come from outside, and what, for the metadata.
 
     Use it as a context manager: the thread runs inside; afterwards the files have all complete rows.
     """
@@ -126,9 +127,10 @@ class Recorder:
         router: RouterLink | None = None,
         memory: HostMemory | None = None,
         mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
+        audit: Callable[[], tuple[int, Mapping[str, object]]] = lambda: (0, {}),
     ) -> None:
         self._plan = plan
-        self._mirror_of = mirror_of
+        self._mirror_of, self._audit, self._audited = mirror_of, audit, 0
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
@@ -174,6 +176,7 @@ class Recorder:
             try:
                 self._take_notes()
                 self._write_rows()
+                self._note_audit()
                 if isinstance(error, RunReset):
                     self._files.note({"ended_by": error.message})
             finally:
@@ -192,6 +195,12 @@ class Recorder:
         while (message := self._inbox.poll()) is not None:
             if message[1] in FOR_METADATA:
                 self._take(message)
+
+    def _note_audit(self) -> None:
+        changes, audit = self._audit()
+        if changes != self._audited:
+            self._audited = changes
+            self._files.note({"audit": to_builtins(audit)})
 
     def _end(self, cause: BaseException | None) -> None:
         self._finished, self._cause = True, cause
@@ -249,6 +258,7 @@ class Recorder:
                 self._tell_progress()
                 if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
                     self._flushed = now
+                    self._note_audit()
                     self._files.flush()
                     self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:

@@ -401,6 +401,7 @@ class _MasterRuns:
             router=RouterLink(self.session, self.run.loaded.config.zenoh.connect),
             memory=master.memory_for(RECORDER),
             mirror_of=streams.mirror if streams is not None else lambda _link: None,
+            audit=lambda: (master.audit.changes, master.audit.view()),
         )
         if streams is not None:
             streams.tell_last(recorder.note_last)

@@ -11,7 +11,18 @@ import msgspec
 
 from ..system.memory_map import MASTER, RECORDER
 
-__all__ = ["BY", "LOCAL", "RUN_ID_BYTES", "SUBSCRIBED", "Keys", "RunKeys", "VariableKind", "escape", "unescape"]
+__all__ = [
+    "BY",
+    "LOCAL",
+    "RUN_ID_BYTES",
+    "SUBSCRIBED",
+    "Keys",
+    "RunKeys",
+    "VariableKind",
+    "escape",
+    "sender_in",
+    "unescape",
+]
 
 VariableKind = Literal["out", "in", "param", "local"]
 
@@ -41,6 +52,11 @@ def escape(name: str) -> str:
 def unescape(chunk: str) -> str:
     """The variable name that `escape` made this chunk from."""
     return _ESCAPED.sub(lambda match: chr(int(match.group(1), 16)), chunk)
+
+
+def sender_in(key: str) -> str:
+    """The name of who sent something to a key with a name, which the rules let nobody else use; empty without one."""
+    return key.partition(f"/{BY}/")[2].partition("/")[0]
 
 
 class Keys(msgspec.Struct, frozen=True):

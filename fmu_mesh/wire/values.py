@@ -33,6 +33,7 @@ __all__ = [
     "encode_values",
     "json_encoding",
     "this_program",
+    "who_sent",
 ]
 
 MAX_VALUE_SIZE = 2 * MAX_TEXT_SIZE
@@ -86,6 +87,18 @@ def decode_origin(data: bytes) -> Origin:
     if origin.time is not None and not math.isfinite(origin.time):
         raise ValueRefused(f"the time {origin.time} in its attachment is not finite")
     return origin
+
+
+def who_sent(attachment: zenoh.ZBytes | None) -> str:
+    """Who sent a message, as its attachment says; `unknown` if it does not.
+
+    Raises:
+        MessageRefused: the attachment is no such object.
+    """
+    try:
+        return decode_origin(attachment.to_bytes()).who if attachment is not None else NO_ORIGIN.who
+    except ValueRefused as refused:
+        raise MessageRefused(str(refused)) from refused
 
 
 def encode_origin(time: float | None, who: str) -> bytes:

@@ -16,6 +16,7 @@ from .runtime import this_host
 
 __all__ = [
     "GOING_ON",
+    "AuditEntry",
     "Command",
     "CommandAnswer",
     "ConnectionView",
@@ -209,6 +210,31 @@ class LogLine(msgspec.Struct, frozen=True):
     message: str
     point: int
     number: int = 0
+
+
+class AuditEntry(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One line of `…/mesh/audit`, and of `audit` in the metadata of results: who did something from outside.
+
+    Attributes:
+        what: `joined` a network; `set` a value; `commanded`; or was `refused`.
+        who: the name of the certificate; without security, what the sender says of itself.
+        time: the wall-clock time of the first time, in ISO 8601 (UTC).
+        point: the communication point of the run then.
+        key: the key at which it arrived; nothing for who joined.
+        text: the command, the reason of a refusal, or the address of who joined.
+        number: how often, for values and refusals of the same kind.
+        last_time: when last; ``last_point``: at which point; both only if it was more than once.
+    """
+
+    what: Literal["joined", "set", "commanded", "refused"]
+    who: str
+    time: str
+    point: int
+    key: str = ""
+    text: str = ""
+    number: int = 1
+    last_time: str = ""
+    last_point: int = 0
 
 
 class SetAnswer(msgspec.Struct, frozen=True):

@@ -226,7 +226,8 @@ class MeshClient:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
         self.check_may(f"'{command.command}'")
         payload = msgspec.json.encode(command)
-        question = Question(self._command_key, self._who, timeout_s or self._timeout_s, payload, once=True)
+        who, limit_s = encode_origin(None, this_program()), timeout_s or self._timeout_s
+        question = Question(self._command_key, self._who, limit_s, payload, who, once=True)
         return _understood(self._ask(question)[0], CommandAnswer, self._who)
 
     def check_may(self, what: str) -> None:
