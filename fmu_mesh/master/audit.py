@@ -3,8 +3,8 @@
 What the rules of Zenoh drop is not seen here, nor anywhere else.
 """
 
-# Threads: links come and go on a thread of Zenoh, commands and values on the main thread of the master, and the
-# recorder reads on its own. They meet at `_lock`, which is held for one entry only; nothing waits under it.
+# Threads: links and values come on threads of Zenoh, commands on the main thread of the master, and the recorder reads
+# on its own. They meet at `_lock`, which is held for one entry only; nothing waits under it (ADR 81).
 
 from __future__ import annotations
 
