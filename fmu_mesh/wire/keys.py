@@ -83,7 +83,7 @@ class Keys(msgspec.Struct, frozen=True):
     def _by(self, key: str) -> str:
         return f"{key}/{BY}/{self.by}" if self.by is not None else key
 
-    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros", "audit", "hello"]) -> str:
+    def mesh_key(self, what: Literal["info", "status", "plan", "command", "log", "ros", "hello"]) -> str:
         """A queryable of the master; `ros` begins the keys of the gateways to ROS."""
         return f"{self.root}/mesh/{what}"
 

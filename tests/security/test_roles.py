@@ -59,7 +59,6 @@ ASKED: Final = {
     "mesh/status": SEES,
     "mesh/plan": SEES,
     "mesh/log": SEES,
-    "mesh/audit": SEES,
     "mesh/ros/*": SEES,
     "mesh/role/OWN": SEES,
     "mesh/role/operator": frozenset(("alice", "rig")),
@@ -94,7 +93,6 @@ PUT: Final = {
     "pump/log": PART,
     "mesh/status": PART,
     "mesh/log": PART,
-    "mesh/audit": PART,
     "@sync/0/frame/pump/to=tank": PART,
     "@sync/0/grant/to=pump": PART,
 }
@@ -104,7 +102,6 @@ SUBSCRIBED: Final = {
     "pump/log": SEES,
     "mesh/status": SEES,
     "mesh/log": SEES,
-    "mesh/audit": SEES,
     "pump/set/@by/carol/u": PART,
     "mesh/command/@by/carol": PART,
     "@sync/0/frame/pump/to=tank": PART,

@@ -59,7 +59,7 @@ class Action(NamedTuple):
     goes: tuple[str, ...]
 
 
-_OF_MESH: Final = ("info", "status", "plan", "log", "audit", "ros/*", "role/{role}")
+_OF_MESH: Final = ("info", "status", "plan", "log", "ros/*", "role/{role}")
 _ENDS: Final = ("{ends}",)
 _NAMED: Final = ("{mesh}/*/set/@by/**", "{mesh}/mesh/command/@by/**")
 """The keys with names: a router hands on what others send, and so whoever is a part of a run may use all names."""
@@ -83,7 +83,7 @@ ACTIONS: Final = (
         _ANSWERS,
     ),
     Action(
-        "read the plan, the state, the log and the audit of the mesh",
+        "read the plan, the state and the log of the mesh",
         ROLE_NAMES,
         tuple(f"{{mesh}}/mesh/{what}" for what in _OF_MESH),
         _READS,
