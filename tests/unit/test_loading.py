@@ -196,7 +196,7 @@ STRUCTURE = [
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
         "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, tolerance, "
-        "retry_discarded_steps, start_values, inputs, step_size and 7 more",
+        "retry_discarded_steps, start_values, inputs, step_size and 8 more",
         id="text for a mapping",
     ),
     pytest.param(
@@ -273,7 +273,7 @@ TEXTS = [
     pytest.param(
         "- 1\n",
         "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, initialization, "
-        "record, scenario and 8 more",
+        "record, scenario and 9 more",
         id="a list",
     ),
     pytest.param(
