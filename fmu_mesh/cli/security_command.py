@@ -44,7 +44,7 @@ def _security(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"`security {what}` needs a name after the folder.")
     if arguments.table:
         for action in ACTIONS:
-            print(f"{action.what:62} {', '.join(action.roles)}")
+            print(f"{action.what:62} {', '.join(action.roles) or 'every certificate'}")
         return 0
     from ..wire.security.authority import LIST, Authority  # noqa: PLC0415  it needs an optional library
 

@@ -17,8 +17,9 @@ from typing import Any, Final, Literal
 import pytest
 import zenoh
 
+from fmu_mesh.cli.main import main
 from fmu_mesh.wire.security.identity import CA, CERTIFICATE, KEY, Role
-from fmu_mesh.wire.security.rules import access_control
+from fmu_mesh.wire.security.rules import ACTIONS, access_control
 from tests.helpers import wait_until
 
 pytest.importorskip("cryptography")
@@ -319,3 +320,22 @@ class Cells:
             self._visitor.fence()
             replies = self._mesh.session.liveliness().get(key, timeout=_SILENCE_S)
             return any(reply.ok is not None for reply in replies)
+
+
+def test_the_rules_for_another_router_are_those_of_ours(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["security", "show", str(lab), "--zenohd"]) == 0
+    printed = capsys.readouterr().out
+    other = zenoh.Config.from_json5(printed)
+
+    ours = zenoh.Config()
+    ours.insert_json5("access_control", json.dumps(access_control("fmu_mesh/*", {**ROLES, MALLORY: "operator"})))
+    assert json.loads(other.get_json("access_control")) == json.loads(ours.get_json("access_control"))
+    assert json.loads(other.get_json("access_control/default_permission")) == "deny"
+
+
+def test_the_printed_table_has_every_action_with_its_roles(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["security", "show", str(lab), "--table"]) == 0
+
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.split("  ")[0] for row in rows] == [action.what for action in ACTIONS]
+    assert all(row.endswith(", ".join(own.roles) or "certificate") for row, own in zip(rows, ACTIONS, strict=True))
