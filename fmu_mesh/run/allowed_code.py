@@ -2,7 +2,9 @@
 
 A configuration of the user's own may name code. A result, the folder of a sweep, a package, and a configuration of
 another user may not, and code that other users can write does not run. `--allow-code` lifts both, and the user is told
-what runs. Models are no code in this sense: an FMU runs wherever it is named.
+what runs. Models are no code in this sense: an FMU runs wherever it is named. But its sources are compiled only where
+the user's own configuration, program or command names the FMU, or in its sandbox; one that is only looked at (by
+`inspect`, by `new` in a folder, by completion) is not compiled.
 """
 
 from __future__ import annotations
@@ -16,9 +18,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..config.findings import Findings
-from ..config.instance_sections import key_of
+from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
+from ..instances.registry import needs_compiler
 
 __all__ = ["check_code", "check_owner", "names_code"]
 
@@ -35,6 +38,9 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
     source = loaded.foreign or _other_owner(loaded.file)
     for name, section in loaded.config.instances.items():
         if not section.runs_code:
+            if source and not allowed and _compiles(loaded, section):
+                expected = "a binary for this platform, or `allow_code=True`"
+                findings.add(f"instances.{name}.{key_of(section)}", f"sources to compile, in {source}", expected)
             continue
         key, path = key_of(section), loaded.resolve(section.path) if section.path else None
         found, expected = f"Python code, in {source}", "a file of your own, or `allow_code=True`"
@@ -50,6 +56,13 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         code = str(getattr(section, key)).replace(section.path, str(path or ""), 1)
         by = f" with {section.interpreter}" if section.interpreter is not None else ""
         tell(f"instance '{name}' runs {code}{by}, {allowed} ({found})")
+
+
+def _compiles(loaded: LoadedConfig, section: InstanceSection) -> bool:
+    """Whether to plan a run compiles the model of an instance, outside of any sandbox."""
+    if not section.follows_fmi or not section.path or loaded.config.process_of(section).is_sandboxed:
+        return False
+    return needs_compiler(loaded.resolve(section.path), placed(section), loaded.config.limits)
 
 
 def names_code(loaded: LoadedConfig) -> bool:

@@ -410,7 +410,9 @@ def _descriptions(
             if not any(f"{other}.".startswith(f"instances.{name}.") for other in known_places):
                 findings.append(loaded.finding(place, "an empty path", expected_model(section)))
             continue
-        path, own = loaded.resolve(section.path) if section.path else Path(), placed(section)
+        process = loaded.config.process_of(section)
+        own = placed(section, process=process if section.follows_fmi and process.is_sandboxed else None)
+        path = loaded.resolve(section.path) if section.path else Path()
         model = (path, msgspec.json.encode(own))
         if model not in cache:
             try:
