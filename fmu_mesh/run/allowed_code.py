@@ -20,13 +20,20 @@ from pathlib import Path
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig
+from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError
 from ..instances.registry import needs_compiler
 
 __all__ = ["check_code", "check_owner", "names_code"]
 
 
-def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], None], allowed: str) -> None:
+def check_code(
+    loaded: LoadedConfig,
+    findings: Findings,
+    tell: Callable[[str], None],
+    allowed: str,
+    compiles: Callable[[Path, InstanceSection, LimitsConfig], bool] = needs_compiler,
+) -> None:
     """Check that all code of a configuration may run: add a finding for each instance whose code may not.
 
     Args:
@@ -34,11 +41,15 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         findings: those of the configuration.
         tell: called with what runs only because it is allowed.
         allowed: why it is allowed, in words, such as "because of `allow_code=True`"; empty if it is not.
+        compiles: whether to describe a model compiles it.
     """
     source = loaded.foreign or _other_owner(loaded.file)
     for name, section in loaded.config.instances.items():
         if not section.runs_code:
-            if source and not allowed and _compiles(loaded, section):
+            is_apart = not section.follows_fmi or loaded.config.process_of(section).is_sandboxed
+            if not source or allowed or is_apart or not section.path:
+                continue
+            if compiles(loaded.resolve(section.path), placed(section), loaded.config.limits):
                 expected = "a binary for this platform, or `allow_code=True`"
                 findings.add(f"instances.{name}.{key_of(section)}", f"sources to compile, in {source}", expected)
             continue
@@ -56,13 +67,6 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         code = str(getattr(section, key)).replace(section.path, str(path or ""), 1)
         by = f" with {section.interpreter}" if section.interpreter is not None else ""
         tell(f"instance '{name}' runs {code}{by}, {allowed} ({found})")
-
-
-def _compiles(loaded: LoadedConfig, section: InstanceSection) -> bool:
-    """Whether to plan a run compiles the model of an instance, outside of any sandbox."""
-    if not section.follows_fmi or not section.path or loaded.config.process_of(section).is_sandboxed:
-        return False
-    return needs_compiler(loaded.resolve(section.path), placed(section), loaded.config.limits)
 
 
 def names_code(loaded: LoadedConfig) -> bool:
