@@ -129,7 +129,9 @@ class Master:
         self._inbox = Inbox(self._memory)
         self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
-        self.audit = Audit(session, self._keys, lambda: max(self._states.granting.slowest, 0))
+        items = [(own.name, key) for node in plan.nodes.values() for own in node.instances for key in own.keys_in]
+        fed = {f"{name}.{key.variable}": key.key for name, key in items}
+        self.audit = Audit(session, self._keys, lambda: max(self._states.granting.slowest, 0), fed, self._server.say)
         self._token: zenoh.LivelinessToken | None = None
         self._prepare(meeting)
         self._first_keys = self._run_keys
