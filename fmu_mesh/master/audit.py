@@ -99,11 +99,8 @@ class Audit:
         if matches(self._publisher):
             self._publisher.put(msgspec.json.encode(new))
         if not is_logged:
-            status, text = (
-                "warning" if new.what == "refused" else "ok",
-                new.text + (f" at {new.key}" if new.key else ""),
-            )
-            self._say(LogLine("mesh", status, "audit", f"{new.who or 'somebody'} {new.what}: {text}", new.point))
+            status = "warning" if new.what == "refused" else "ok"
+            self._say(LogLine("mesh", status, "audit", str(new), new.point))
 
     def view(self) -> AuditView:
         """All that is known."""

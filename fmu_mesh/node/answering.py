@@ -249,19 +249,20 @@ class Answers:
             self._pending.append(pending)
         self._inbox.post(take)
 
-    def _refuse(self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None, reason: str) -> None:
-        if pending is not None:
-            pending.refuse(reason)
+    def _refuse(
+        self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None, reason: str
+    ) -> None:
         key, now, at = str(sent.key_expr), datetime.now(UTC).isoformat(timespec="milliseconds"), runner.point
         who = sender_in(key)
         with suppress(MessageRefused):
             who = who or who_sent(sent.attachment)
-        known = self._refused.get((who, key))
-        if known is not None:
+        if (known := self._refused.get((who, key))) is not None:
             self._refused[who, key] = replace(known, number=known.number + 1, last_time=now, last_point=at)
         elif len(self._refused) < _MOST_WARNED:
             self._refused[who, key] = AuditEntry("refused", who, now, at, key, reason)
             self._log(LogLine(runner.name, "warning", "set", reason, at))
+        if pending is not None:  # at last: nothing can be read of a query that was answered
+            pending.refuse(reason)
 
     def _confirm(self, runner: Runner, key: str, pending: _Pending, step: int, when: float | None) -> None:
         grid, points = self._plan.grid, runner.plan.step_points

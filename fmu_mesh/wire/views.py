@@ -237,6 +237,10 @@ class AuditEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     last_time: str = ""
     last_point: int = 0
 
+    def __str__(self) -> str:
+        more = f" ({self.number} times, the last at point {self.last_point})" if self.last_time else ""
+        return f"{self.who or 'somebody'} {self.what}: {self.text}{f' at {self.key}' if self.key else ''}{more}"
+
 
 class AuditView(msgspec.Struct, frozen=True):
     """Answer of `…/mesh/audit`: the newest entries in their order, and how many others are ``left_out``."""
