@@ -154,7 +154,8 @@ class Master:
         self._inbox.open(session, keys, MASTER, {keys.progress(node): node for node in plan.nodes})
         self.audit.follow(keys)
         offer = self._memory.offer if self._shares else None
-        self._members = Members(self._states.registrations, session, keys, offer, settings.launch, meeting)
+        own = settings.launch, meeting, settings.table
+        self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)

@@ -137,6 +137,7 @@ class Node:
         meeting: Meeting | None = None,
         engine: Callable[..., Engine] = make_engine,
         strain: Callable[[], str | None] = lambda: None,
+        table: int = 0,
     ) -> None:
         self._plan = plan
         self._session = session
@@ -158,9 +159,7 @@ class Node:
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
         silent_s = self._stream_silent_s
-        self._membership = Membership(
-            plan, session, self._inbox, launch, self._router, meeting=meeting, stream_silent_s=silent_s
-        )
+        self._membership = Membership(plan, session, self._inbox, launch, self._router, None, meeting, silent_s, table)
         self._meeting = meeting
         self._ways = Ways()
         self._streams: RowStreams | None = None
