@@ -35,7 +35,8 @@ from tests.certificates import CLIENT, SERVER, Signer, new_signer, write_folder
 Opened = Callable[..., str]
 
 _DAY = timedelta(days=1)
-_LIMIT_S = 2.0
+_LIMIT_S = 6.0
+"""It waits 1.9 s at most; a busy machine adds to that."""
 
 _LISTENING = """
 import json, sys, zenoh
