@@ -249,9 +249,7 @@ class Answers:
             self._pending.append(pending)
         self._inbox.post(take)
 
-    def _refuse(
-        self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None, reason: str
-    ) -> None:
+    def _refuse(self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None, reason: str) -> None:
         key, now, at = str(sent.key_expr), datetime.now(UTC).isoformat(timespec="milliseconds"), runner.point
         who = sender_in(key)
         with suppress(MessageRefused):

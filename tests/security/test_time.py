@@ -213,8 +213,9 @@ def test_only_the_user_reads_what_says_who_has_done_what(place: Place, lab: Auth
 
 
 def test_check_tells_programs_who_may_do_what(place: Place, lab: Authority) -> None:
-    sections = {"zenoh": {"listen": ["tls/localhost:7443"]}, "security": {"folder": "lab/lab"}}
-    checked = place.run("check", write_config(place.folder, **sections), "--json")
+    listening = {"listen": ["tls/localhost:7443"]}
+    config = write_config(place.folder, zenoh=listening, security={"folder": "lab/lab"})
+    checked = place.run("check", config, "--json")
 
     access = json.loads(checked.output)["access"]
 
