@@ -63,7 +63,7 @@ def test_the_audit_says_who_has_done_what(place: Place, record: dict[str, str | 
         assert (last["what"], last["text"]) == ("commanded", "resume")
 
 
-def test_what_a_node_refuses_is_in_the_audit_the_log_and_the_result(place: Place) -> None:
+def test_what_a_node_refuses_is_in_audit_log_and_result(place: Place) -> None:
     launched, config = paused(place, {"file": "pair.csv"})
     wrong = {"gain/set/k": (b"nothing", "it is no JSON value"), "gain/set/z": (b"1", "'gain' has no variable 'z'")}
     with place.session() as session:

@@ -92,7 +92,7 @@ def test_who_dials_takes_a_renewed_certificate_before_the_old_one_ends(place: Pl
     stopped(place, launched)
 
 
-def test_who_listens_takes_a_renewed_certificate_at_its_start_and_not_at_reset(place: Place, lab: Authority) -> None:
+def test_who_listens_takes_a_renewed_certificate_at_its_start_only(place: Place, lab: Authority) -> None:
     launched, endpoint = started(place)
     before = served(endpoint)
     assert before == kept(lab.folder / "lab")

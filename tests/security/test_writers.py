@@ -137,7 +137,7 @@ WRITERS: Final[dict[str, tuple[Callable[[Place, str], None], str]]] = {
 """By the instance that they set: what sets it, and in whose name; the gateway is a part of the run."""
 
 
-def test_every_writer_of_ours_sets_by_keys_with_names_and_is_one_entry(place: Place, endpoint: str) -> None:
+def test_every_writer_of_ours_sets_in_its_name_and_is_one_entry(place: Place, endpoint: str) -> None:
     for write, _ in WRITERS.values():
         write(place, endpoint)
     with fmu_mesh.attach(connect=endpoint, security=place.folder / "lab/alice") as run:
