@@ -65,12 +65,14 @@ class Stranger:
     Attributes:
         keys: the internal keys of the run, which any client of the same user can find out.
         asked: all that it has asked.
+        sent: keys and payloads that it has put.
     """
 
     def __init__(self, session: zenoh.Session, mesh: str, run: str | None = None) -> None:
         self.session = session
         self.public = Keys("fmu_mesh", mesh)
         self.asked: list[_Asked] = []
+        self.sent: set[tuple[str, bytes]] = set()
         if run is None:
             found = session.liveliness().get(self.public.run("*").master, timeout=DEADLINE_S)
             [token] = [str(reply.ok.key_expr) for reply in found if reply.ok is not None]
@@ -79,6 +81,7 @@ class Stranger:
 
     def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
         """Publish, and wait where queues are full: what is sent must not be lost on the way."""
+        self.sent.add((key, payload))
         self.session.put(key, payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def ask(self, key: str, payload: bytes | None = None) -> list[str]:
@@ -107,6 +110,7 @@ def config_of(
 ) -> Path:
     """A cycle with a free input: frames go both ways, and something can be set; with ``more`` sections."""
     ways = {"shared_memory": shared_memory, "row_streams": False}
+    sections: dict[str, Any] = {**more, "zenoh": {**ways, **more.get("zenoh", {})}}
     return write_config(
         place.folder,
         instances={
@@ -117,7 +121,7 @@ def config_of(
         connections=("left.y -> right.x", "right.y -> left.u"),
         stop_time=stop_time,
         simulation={"window": 256, "real_time_factor": real_time_factor},
-        **{**more, "zenoh": {**ways, **more.get("zenoh", {})}},
+        **sections,
     )
 
 

@@ -18,12 +18,12 @@ DIALS: Final = ("client", "peer", "router")
 """As what a program can dial."""
 
 
-def opened(folder: Path | None, mode: str, **settings: object) -> zenoh.Session:
-    """A plain session with the certificate of a folder; None: with none, and without a look at that of others."""
-    tls: dict[str, Any] = {"enable_mtls": folder is not None, "verify_name_on_connect": folder is not None}
-    if folder is not None:
-        own = {name: str(folder / name) for name in (CA, CERTIFICATE, KEY)}
-        tls |= {"root_ca_certificate": own[CA]}
+def opened(folder: Path, mode: str, **settings: object) -> zenoh.Session:
+    """A plain session with the certificate of a folder, or with none if there is none in it."""
+    own = {name: str(folder / name) for name in (CA, CERTIFICATE, KEY)}
+    comes = (folder / KEY).exists()
+    tls: dict[str, Any] = {"root_ca_certificate": own[CA], "enable_mtls": comes, "verify_name_on_connect": True}
+    if comes:
         tls |= {f"{end}_certificate": own[CERTIFICATE] for end in ("listen", "connect")}
         tls |= {f"{end}_private_key": own[KEY] for end in ("listen", "connect")}
     scouting = {f"scouting/{kind}/enabled": False for kind in ("multicast", "gossip")}
