@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from fmu_mesh.config.access_sections import host_of, port_of
 from fmu_mesh.errors import ConfigurationError, FmuMeshError, MeshLost
 from fmu_mesh.wire.refused_links import RefusedLinks
 from fmu_mesh.wire.security.identity import CA, CERTIFICATE, KEY, Identity
@@ -29,13 +30,14 @@ from cryptography.x509 import load_pem_x509_certificate
 
 from fmu_mesh.wire.security.authority import Authority
 from fmu_mesh.wire.security.certificates import identity_in
-from fmu_mesh.wire.security.handshake import check_link, host_and_port
+from fmu_mesh.wire.security.handshake import check_link
 from tests.certificates import CLIENT, SERVER, Signer, new_signer, write_folder
 
 Opened = Callable[..., str]
 
 _DAY = timedelta(days=1)
-_LIMIT_S = 2.0
+_LIMIT_S = 6.0
+"""It waits 1.9 s at most; a busy machine adds to that."""
 
 _LISTENING = """
 import json, sys, zenoh
@@ -340,7 +342,7 @@ def test_a_listener_takes_its_renewed_certificate_at_its_next_start(tmp_path: Pa
         with zenoh_session(**settings(endpoint, host)):
             before = (host / CERTIFICATE).read_text(encoding="utf-8")
             authority.renew("host1", 90)
-            shown.append(ssl.get_server_certificate(host_and_port(endpoint)))
+            shown.append(ssl.get_server_certificate((host_of(endpoint), port_of(endpoint))))
             assert shown[-1].split() == before.split()
 
     assert shown[0] != shown[1]
