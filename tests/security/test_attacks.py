@@ -16,7 +16,7 @@ from typing import Final, Literal, NamedTuple
 import pytest
 import zenoh
 
-from fmu_mesh.wire.security.handshake import host_and_port
+from fmu_mesh.config.access_sections import host_of, port_of
 from fmu_mesh.wire.security.identity import CA, Role
 from tests.helpers import DEADLINE_S, Launched, Place, wait_until
 from tests.strangers import ATTACKS, Stranger, config_of, local_result
@@ -201,5 +201,5 @@ def test_strangers_without_certificate_of_the_authority_reach_nothing(place: Pla
 
 def knock(endpoint: str, first: bytes) -> None:
     """Send something that is no TLS to a port, or less than a whole handshake, and hang up."""
-    with suppress(OSError), socket.create_connection(host_and_port(endpoint), DEADLINE_S) as connection:
+    with suppress(OSError), socket.create_connection((host_of(endpoint), port_of(endpoint))) as connection:
         connection.sendall(first)
