@@ -21,6 +21,7 @@ __all__ = [
     "ACCESS",
     "PACKAGE",
     "QUIET",
+    "RULED",
     "SSD",
     "ArgumentPart",
     "CommandParser",
@@ -134,6 +135,19 @@ ACCESS: tuple[ArgumentPart, ...] = (
     switch("--insecure", text="also use a network without TLS, where everybody can set values and end runs"),
 )
 """How a command reaches others at a network."""
+
+
+RULED: tuple[ArgumentPart, ...] = (
+    argument("--key-prefix", "PREFIX", "rules: what the keys of the meshes begin with (fmu_mesh)", default="fmu_mesh"),
+    argument(
+        "--end",
+        "KEY",
+        "rules: a key of other programs at an end of a connection; repeatable",
+        action="append",
+        default=[],
+    ),
+)
+"""For which keys the rules of a router are, which it has with a certificate."""
 
 
 def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ...]:

@@ -33,7 +33,8 @@ from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
 from ..run.wiring import identity_of, warnings_of
 from ..system.plan import Plan
-from ..wire.session import Wiring, refused_link, run_router
+from ..wire.refused_links import RefusedLinks
+from ..wire.session import Wiring, run_router
 from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
@@ -244,10 +245,12 @@ def _refusals_told() -> Iterator[None]:
 
     def read() -> None:
         with os.fdopen(reading, "rb") as lines:
+            links = RefusedLinks()
             for line in lines:
-                if (refused := refused_link(line.decode(errors="replace").rstrip())) is not None:
+                refused = links.told(line.decode(errors="replace").rstrip())
+                if refused:
                     say(refused)
-                else:
+                elif refused is None:
                     os.write(stdout, line)
 
     reader = threading.Thread(target=read, name="refusals", daemon=True)

@@ -21,6 +21,7 @@ import zenoh
 
 from fmu_mesh.config.access_sections import host_of, port_of
 from fmu_mesh.errors import ConfigurationError, FmuMeshError, MeshLost
+from fmu_mesh.wire.refused_links import RefusedLinks
 from fmu_mesh.wire.security.identity import CA, CERTIFICATE, KEY, Identity
 from tests.helpers import wait_until
 
@@ -210,6 +211,26 @@ def test_the_certificate_of_who_listens_is_refused_with_its_reason(
 
     assert isinstance(error, ConfigurationError)
     assert f"the certificate of who listens, {words}" in str(error)
+
+
+def test_a_reason_is_told_at_its_first_tenth_and_hundredth_time() -> None:
+    line = (
+        "2026-11-30T08:00:00.{}Z  WARN acc-0 ThreadId(07) zenoh_link_tls::unicast: {}, {} seconds ago. Hint: a limit."
+    )
+    links = RefusedLinks()
+    told = [links.told(line.format(number, "certificate expired", number)) for number in range(120)]
+
+    assert [links.told(line.format(7, "eof", 7)), links.told("another line")] == [
+        "a link was refused: eof, 7 seconds ago",
+        None,
+    ]
+    said = "a link was refused: certificate expired, {} seconds ago"
+    assert [one for one in told if one] == [
+        said.format(0),
+        f"{said.format(9)} (10 times)",
+        f"{said.format(99)} (100 times)",
+    ]
+    assert told.count("") == 117
 
 
 def test_zenoh_itself_refuses_what_the_handshake_refuses(folders: Path, listens: Opened) -> None:
