@@ -188,7 +188,9 @@ def reason_of(error: zenoh.ZError) -> str:
 
 
 def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
-    endpoint = next((endpoint for endpoint in wiring.listen if endpoint in reason), None)
+    # Of TLS, the reason has the address and the port, and neither the protocol nor the name of the host.
+    ends = {endpoint: f":{endpoint.rpartition(':')[2]}:" for endpoint in wiring.listen}
+    endpoint = next((endpoint for endpoint, port in ends.items() if endpoint in reason or port in reason), None)
     if endpoint is None:
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
         return ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {reason}")
