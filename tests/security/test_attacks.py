@@ -25,7 +25,14 @@ from tests.visitors import opened, secured_router
 pytest.importorskip("cryptography")
 from fmu_mesh.wire.security.authority import Authority
 
-ROLES: Final[dict[str, Role]] = {"lab": "node", "rig": "node", "alice": "operator", "bob": "observer"}
+ROLES: Final[dict[str, Role]] = {
+    "lab": "node",
+    "gate": "node",
+    "rig": "node",
+    "alice": "operator",
+    "carol": "operator",
+    "bob": "observer",
+}
 ROOT: Final = "fmu_mesh/pair"
 _CONNECT_MS: Final = 500
 _MOST_LINES: Final = 10
@@ -79,7 +86,7 @@ def scene(place: Place, way: Way) -> Iterator[Scene]:
 
     with ExitStack() as stack:
         door: dict[str, object] = {"listen": ["tls/127.0.0.1:0"]}
-        router, endpoint = secured_router(place, folder / "lab") if way == "router" else (None, "")
+        router, endpoint = secured_router(place, folder / "gate") if way == "router" else (None, "")
         if router is not None:
             door = {"mode": "client", "connect": [endpoint]}
         config = config_of(
