@@ -167,7 +167,7 @@ def dialled(own: Scene, name: str, mode: str) -> Iterator[zenoh.Session]:
     there: dict[str, object] = {"connect/endpoints": [own.endpoint]}
     with ExitStack() as stack:
         if mode == "relay":
-            plain = free_endpoint().replace("tls/", "tcp/")
+            plain = free_endpoint("tcp")
             stack.enter_context(opened(own.folder / name, "router", **there, **{"listen/endpoints": [plain]}))
             there, mode = {"connect/endpoints": [plain]}, "client"
         yield stack.enter_context(opened(own.folder / name, mode, **there))
