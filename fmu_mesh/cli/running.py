@@ -223,8 +223,11 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
     own = None
     if folder is not None and not arguments.insecure:
         from ..wire.security.certificates import identity_in  # noqa: PLC0415  most routers have no certificate
+        from ..wire.security.identity import warnings_about  # noqa: PLC0415  as above
 
         own = identity_in(folder)
+        for text in warnings_about(own):
+            say_warning(text)
     for _, text in why_open({"--listen": listen}, secured=own is not None):
         say_warning(text)
     root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)

@@ -31,7 +31,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -65,6 +65,7 @@ from ..wire.messages import (
     KEYS,
     LAST,
     PROGRESS,
+    REFUSED,
     RESET,
     SET,
     STIFF,
@@ -127,7 +128,7 @@ class Recorder:
         router: RouterLink | None = None,
         memory: HostMemory | None = None,
         mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
-        audit: Callable[[], tuple[int, Mapping[str, object]]] = lambda: (0, {}),
+        audit: Callable[[], tuple[int, object]] = lambda: (0, None),
     ) -> None:
         self._plan = plan
         self._mirror_of, self._audit, self._audited = mirror_of, audit, 0
@@ -306,7 +307,7 @@ class Recorder:
                 source.receiver.take(point, count, data)
         elif kind == LAST:
             self._ended.add(source.link.source)
-        elif kind != INITIAL:
+        elif kind not in (INITIAL, REFUSED):  # the latter is for the master
             raise MessageRefused(f"a message of kind {kind} is not one that a node sends")
 
     def _take_from_master(self, message: Message) -> None:

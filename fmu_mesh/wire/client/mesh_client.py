@@ -28,6 +28,7 @@ from ..messages import decode_json
 from ..session import Question, answer_of, answers, reason_of
 from ..values import encode_origin, encode_value, this_program
 from ..views import (
+    AuditView,
     Command,
     CommandAnswer,
     InstanceInfo,
@@ -303,6 +304,10 @@ class MeshClient:
             there = follow and self._is_there(follower, self._timeout_s)
             new = follower.to_the_last() if there else iter(())
             yield chain(kept, (line for line in new if line.number > last))
+
+    def audit(self) -> AuditView:
+        """Who has joined, set a value, commanded or was refused."""
+        return self._view(self.keys.mesh_key("audit"), AuditView, self._who)
 
     def _is_over(self) -> bool:
         """Raise `MeshLost` if the mesh has ended, in the words of who knows it; otherwise False."""
