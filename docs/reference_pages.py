@@ -58,8 +58,8 @@ Every key of a configuration file, version 1. [Your own FMUs](../../README.md#yo
 is the version that is not released yet. Any key can also be given by
 [`--set-config`](../commands.md#options-instead-of-keys).
 
-Who may reach a mesh (`security`, `runtime`, `zenoh`) is on [a page of its own](../security.md), and so is what an FMU may do to
-[its host](../fmi-support-protection.md#what-an-fmu-may-do-to-the-host) (`process`).
+Who may reach a mesh (`security`, `runtime`, `zenoh`) is on [a page of its own](../security.md), and so is what an FMU
+may do to [its host](../fmi-support-protection.md#what-an-fmu-may-do-to-the-host) (`process`).
 """
 
 
