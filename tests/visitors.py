@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import zenoh
 
@@ -34,11 +34,11 @@ def opened(folder: Path, mode: str, **settings: object) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def free_endpoint() -> str:
-    """An endpoint of this host with TLS and a free port."""
-    with socket.socket() as probe:
+def free_endpoint(kind: Literal["tls", "quic", "tcp"] = "tls") -> str:
+    """An endpoint of this host with a free port."""
+    with socket.socket(type=socket.SOCK_DGRAM if kind == "quic" else socket.SOCK_STREAM) as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tls/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{kind}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def secured_router(place: Place, folder: Path, *ends: str) -> tuple[Launched, str]:

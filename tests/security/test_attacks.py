@@ -17,15 +17,28 @@ import pytest
 import zenoh
 
 from fmu_mesh.config.access_sections import host_of, port_of
-from fmu_mesh.wire.security.identity import CA, Role
+from fmu_mesh.wire.security.identity import CA, CA_KEY, Role
+from tests.faults.test_doors import ports
 from tests.helpers import DEADLINE_S, Launched, Place, wait_until
 from tests.strangers import ATTACKS, Stranger, config_of, local_result
 from tests.visitors import opened, secured_router
 
 pytest.importorskip("cryptography")
-from fmu_mesh.wire.security.authority import Authority
+from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509 import load_pem_x509_certificate
 
-ROLES: Final[dict[str, Role]] = {"lab": "node", "rig": "node", "alice": "operator", "bob": "observer"}
+from fmu_mesh.wire.security.authority import Authority
+from tests.certificates import Signer, write_folder
+
+ROLES: Final[dict[str, Role]] = {
+    "lab": "node",
+    "gate": "node",
+    "rig": "node",
+    "alice": "operator",
+    "carol": "operator",
+    "bob": "observer",
+}
 ROOT: Final = "fmu_mesh/pair"
 _CONNECT_MS: Final = 500
 _MOST_LINES: Final = 10
@@ -77,9 +90,14 @@ def scene(place: Place, way: Way) -> Iterator[Scene]:
     for visitor in (eve, folder / "nobody"):  # they take the mesh for what it is
         (visitor / CA).write_bytes((folder / CA).read_bytes())
 
+    ca = load_pem_x509_certificate((folder / CA).read_bytes())
+    key = load_pem_private_key((folder / CA_KEY).read_bytes(), None)
+    assert isinstance(key, EllipticCurvePrivateKey)
+    write_folder(folder / "nameless", Signer(ca, key), [])
+
     with ExitStack() as stack:
         door: dict[str, object] = {"listen": ["tls/127.0.0.1:0"]}
-        router, endpoint = secured_router(place, folder / "lab") if way == "router" else (None, "")
+        router, endpoint = secured_router(place, folder / "gate") if way == "router" else (None, "")
         if router is not None:
             door = {"mode": "client", "connect": [endpoint]}
         config = config_of(
@@ -135,6 +153,7 @@ def answers_instead(stranger: Stranger) -> None:
         ("bob", "router", ("bob", "alice", "local")),
         ("alice", "peer", ("bob", "rig", "local")),
         ("mallory", "client", ("mallory", "alice", "local")),
+        ("nameless", "client", ("*", "alice", "local")),
     ],
 )
 def test_no_attack_has_an_effect_beyond_the_role(
@@ -180,6 +199,7 @@ def answered(session: zenoh.Session, key: str) -> bool:
 def test_strangers_without_certificate_of_the_authority_reach_nothing(place: Place, way: Way) -> None:
     with scene(place, way) as own, ExitStack() as stack:
         before, lines = own.state(), own.listener.errors.count("\n")
+        assert ports(place) == [own.endpoint.removeprefix("tls/")]
         plain = own.endpoint.replace("tls/", "tcp/")
         for name, endpoint in (("nobody", own.endpoint), ("eve", own.endpoint), ("nobody", plain)):
             settings = {"connect/endpoints": [endpoint], "connect/timeout_ms": _CONNECT_MS}

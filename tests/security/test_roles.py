@@ -119,7 +119,7 @@ TOKENS: Final = {"**/mesh": SEES, f"{ROOT}/*": SEES, f"{ROOT}/mesh": SEES, f"{RO
 FOREIGN: Final = {"plant/flow": ACTS, "twin/y": ACTS, "plant/other": NOBODY, "other/pair/pump/set/u": NOBODY}
 FOREIGN_READ: Final = {"plant/flow": SEES, "twin/y": SEES, "plant/other": NOBODY, "**": NOBODY, "@/**": NOBODY}
 
-Way = Literal["direct", "router"]
+Way = Literal["direct", "quic", "router"]
 
 
 @pytest.fixture(scope="module")
@@ -189,8 +189,8 @@ def meeting(place: Place, lab: Path, way: Way, mode: str, name: str) -> Iterator
             stack.callback(own.close)
             return own
 
-        if way == "direct":
-            endpoint = free_endpoint()
+        if way != "router":
+            endpoint = free_endpoint("quic" if way == "quic" else "tls")
             wiring = Wiring(listen=(endpoint,), identity=identity_in(lab / "lab"), root=ROOT, ends=ENDS)
             own = open_session(wiring)
             stack.callback(own.close)
@@ -204,8 +204,9 @@ def meeting(place: Place, lab: Path, way: Way, mode: str, name: str) -> Iterator
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
-@pytest.mark.parametrize("mode", DIALS)
-@pytest.mark.parametrize("way", ["direct", "router"])
+@pytest.mark.parametrize(
+    ("way", "mode"), [("quic", "client"), *((way, mode) for way in ("direct", "router") for mode in DIALS)]
+)
 def test_each_role_does_what_the_table_says_and_nothing_else(
     place: Place, lab: Path, way: Way, mode: str, name: str
 ) -> None:
