@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from ..errors import ConfigurationError, Finding
 from ..instances.registry import check_engines
@@ -19,7 +20,42 @@ from ..ssp.naming import WORLD
 from ..system.round_trip import round_trip_cost
 from ..text import counted, listed
 
-__all__ = ["Check", "check_of", "together"]
+__all__ = ["AccessView", "Check", "check_of", "together"]
+
+
+class AccessView(msgspec.Struct, frozen=True):
+    """Who reaches a mesh beyond its user, and what they may do. Whoever comes by its sockets may do everything.
+
+    Attributes:
+        shared_with: the group of this host whose members come by a socket.
+        name: of the certificate with which the mesh comes to others; empty without `security`, as are those below.
+        authority: who has signed it.
+        until: its end, in ISO 8601.
+        table: number of the table of roles; 0: no authority of ours has made it.
+        roles: the names by their role; none where the mesh listens nowhere.
+    """
+
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    shared_with: str | None = None
+    name: str = ""
+    authority: str = ""
+    until: str = ""
+    table: int = 0
+    roles: dict[str, tuple[str, ...]] = {}
+
+    @property
+    def lines(self) -> list[str]:
+        """In words."""
+        lines = [f"listens at {listed(self.listen)}"] if self.listen else []
+        lines += [f"connects to {listed(self.connect)}"] if self.connect else []
+        lines += [f"members of the group '{self.shared_with}' may do what you may"] if self.shared_with else []
+        lines += (
+            [f"certificate of '{self.name}', signed by '{self.authority}', until {self.until}"] if self.name else []
+        )
+        lines += [f"table {self.table} of roles"] if self.table else []
+        lines += [f"{role}: {listed(names)}" for role, names in self.roles.items()]
+        return ["", "Access", *(f"  {line}" for line in lines)]
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -42,13 +78,13 @@ class Check(msgspec.Struct, frozen=True):
         file: the configuration, as messages name it.
         error: why the mesh cannot run; None if it can.
         run: the plan of the run; None if the configuration is wrong. It is there if only this host lacks something.
-        access: with which certificate it is reached at a network, and who may do what, in lines.
+        access: who may do what; None if only its user reaches it, or everybody (`warnings`), or if it cannot be used.
     """
 
     file: str
     error: ConfigurationError | None = None
     run: RunPlan | None = None
-    access: tuple[str, ...] = ()
+    access: AccessView | None = None
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -70,7 +106,8 @@ class Check(msgspec.Struct, frozen=True):
     @property
     def page(self) -> str:
         """What would run, as text; empty if the configuration is wrong."""
-        return page([*plan_page(self.run.plan, self.run.loaded), *self.access]) if self.run is not None else ""
+        access = self.access.lines if self.access is not None else ()
+        return page([*plan_page(self.run.plan, self.run.loaded), *access]) if self.run is not None else ""
 
     def at_round_trip(self, seconds: float) -> list[str]:
         """What a network with this round trip between hosts costs the run at least, in sentences.
@@ -117,7 +154,7 @@ class Check(msgspec.Struct, frozen=True):
 
 def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
     """Check what ``plan`` makes of the file, and that this host has what the run needs."""
-    run, errors, access = None, [], tuple[str, ...]()
+    run, errors, access = None, [], None
     try:
         run = plan()
     except ConfigurationError as error:
@@ -135,32 +172,30 @@ def check_of(file: str, plan: Callable[[], RunPlan]) -> Check:
             except ConfigurationError as error:
                 errors.append(error)
         try:
-            access = tuple(_access(run))
+            access = _access(run)
         except ConfigurationError as error:
             errors.append(error)
     return Check(file, together(file, errors) if errors else None, run, access)
 
 
-def _access(run: RunPlan) -> Iterator[str]:
-    """Who may do what at the network of a run.
+def _access(run: RunPlan) -> AccessView | None:
+    """Who may do what with a run.
 
     Raises:
         ConfigurationError: its certificate cannot be used.
     """
-    if run.loaded.config.security is None:
-        return
+    config = run.loaded.config
+    if config.security is None and config.runtime.share_with is None:
+        return None
     from ..run.wiring import identity_of  # noqa: PLC0415  a check needs no Zenoh
 
+    view = AccessView(tuple(config.zenoh.listen), tuple(config.zenoh.connect), config.runtime.share_with)
     if (own := identity_of(run)) is None:
-        return
-    zenoh = run.loaded.config.zenoh
-    yield from ("", "Access")
-    yield f"  listens at {listed(zenoh.listen)}" if zenoh.listen else f"  connects to {listed(zenoh.connect)}"
-    yield f"  certificate of '{own.name}', signed by '{own.authority}', until {own.until:%Y-%m-%d %H:%M} UTC"
-    if own.table is not None:
-        yield f"  {own.table}"
-        for role in sorted({*own.table.roles.values()}):
-            yield f"  {role}: {listed([name for name, its in own.table.roles.items() if its == role])}"
+        return view
+    table = own.table.roles if own.table is not None else {}
+    roles = {role: tuple(name for name, its in table.items() if its == role) for role in sorted({*table.values()})}
+    until, number = own.until.isoformat(timespec="minutes"), own.table.number if own.table is not None else 0
+    return replace(view, name=own.name, authority=own.authority, until=until, table=number, roles=roles)
 
 
 def together(file: str, errors: Sequence[ConfigurationError]) -> ConfigurationError:

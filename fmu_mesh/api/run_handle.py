@@ -28,6 +28,7 @@ from ..wire.client.readings import Target
 from ..wire.client.waiting import begun_again, replay, wait_for, wait_for_start
 from ..wire.views import (
     GOING_ON,
+    AuditView,
     Command,
     CommandAnswer,
     InstanceInfo,
@@ -311,6 +312,10 @@ class Run:
         """
         with self._client().logs(follow=follow) as lines:
             yield from lines
+
+    def audit(self) -> AuditView:
+        """Who has joined the mesh at a network, set a value, commanded, or was refused, the oldest first."""
+        return self._client().audit()
 
     @takes(PlayOptions)
     def play(self, bag: str | Path | Bag, options: PlayOptions) -> Played:

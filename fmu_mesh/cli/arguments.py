@@ -13,14 +13,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
+from ..config.access_sections import why_open
 from ..config.base import ENDPOINT_PATTERN
 from ..errors import ConfigurationError
 from ..text import listed, meant, nearest
+from .output.terminal import say_warning
 
 __all__ = [
     "ACCESS",
     "PACKAGE",
     "QUIET",
+    "RULED",
     "SSD",
     "ArgumentPart",
     "CommandParser",
@@ -136,6 +139,19 @@ ACCESS: tuple[ArgumentPart, ...] = (
 """How a command reaches others at a network."""
 
 
+RULED: tuple[ArgumentPart, ...] = (
+    argument("--key-prefix", "PREFIX", "rules: what the keys of the meshes begin with (fmu_mesh)", default="fmu_mesh"),
+    argument(
+        "--end",
+        "KEY",
+        "rules: a key of other programs at an end of a connection; repeatable",
+        action="append",
+        default=[],
+    ),
+)
+"""For which keys the rules of a router are, which it has with a certificate."""
+
+
 def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ...]:
     """The flags of all commands for running meshes; ``timeout_s`` is the default deadline of a query in s."""
     where = "Zenoh endpoint of a mesh or a router; repeatable; default: the meshes of this user on this host"
@@ -149,7 +165,10 @@ def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ...]:
 
 
 def reach(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The flags of `reaching`, as the library takes them."""
+    """The flags of `reaching`, as the library takes them; warns of a network without TLS."""
+    if arguments.insecure:
+        for _, text in why_open({"--connect": arguments.connect}, secured=False):
+            say_warning(text)
     return {name: getattr(arguments, name) for name in ("connect", "timeout", "security", "insecure")}
 
 

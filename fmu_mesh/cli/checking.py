@@ -7,6 +7,7 @@ import sys
 
 import msgspec
 
+from ..api.mesh_check import AccessView
 from ..config.structure import schema_text
 from ..errors import FmuMeshError
 from ..instances.configuration import installed_config
@@ -27,12 +28,14 @@ class CheckReport(msgspec.Struct, frozen=True):
     plan: PlanView | msgspec.Raw | None = None  # what would run; None if the configuration is wrong
     error: Failure | None = None  # what is wrong, with all findings
     round_trip: list[str] = []  # what --round-trip costs, in sentences
+    access: AccessView | None = None  # who may do what
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    plan, costs = None, []
+    plan, access, costs = None, None, []
     try:
         check = mesh_of(arguments).check(**given_options(arguments))
+        access = check.access
         if arguments.json and check.run is not None:
             plan = msgspec.Raw(in_flags(msgspec.json.encode(check.plan).decode()).encode())
         elif check.run is not None:
@@ -42,10 +45,10 @@ def _check(arguments: argparse.Namespace) -> int:
             costs = check.at_round_trip(arguments.round_trip)
     except FmuMeshError as error:
         if arguments.json:
-            print_json(CheckReport(str(arguments.config), error.exit_code, plan, failure_of(error)))
+            print_json(CheckReport(str(arguments.config), error.exit_code, plan, failure_of(error), access=access))
         raise
     if arguments.json:
-        print_json(CheckReport(str(arguments.config), 0, plan, round_trip=costs))
+        print_json(CheckReport(str(arguments.config), 0, plan, round_trip=costs, access=access))
     elif costs:
         print("", f"Between hosts, with a round trip of {arguments.round_trip:g} s", *costs, sep="\n")
     return 0

@@ -8,6 +8,7 @@ from typing import Final
 from .arguments import (
     PACKAGE,
     QUIET,
+    RULED,
     SSD,
     Parsers,
     argument,
@@ -155,6 +156,7 @@ PARSERS: Parsers = {
             "show",
             switch("--table", text="what each role may do"),
             switch("--zenohd", text="the rules for a router of your own, as JSON of Zenoh"),
+            *RULED,
             json_switch("JSON, one object for each name"),
         ),
     ),

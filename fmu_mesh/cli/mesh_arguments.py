@@ -108,6 +108,7 @@ PARSERS: Parsers = {
         argument("--instance", "NAME", "only the messages of this instance"),
         argument("--level", "STATUS", f"from this status on: {', '.join(LEVELS)} (ok)", choices=LEVELS, default="ok"),
         switch("-f", "--follow", text="also show new messages, until the mesh ends"),
+        switch("--audit", text="instead, show who joined, set, commanded or was refused, each kind with its number"),
     ),
     **dict.fromkeys(("pause", "resume", "stop"), _COMMAND),
     "step": (*_COMMAND, argument("points", "N", "points (1)", nargs="?")),

@@ -33,7 +33,8 @@ from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
 from ..run.wiring import identity_of, warnings_of
 from ..system.plan import Plan
-from ..wire.session import Wiring, refused_link, run_router
+from ..wire.refused_links import RefusedLinks
+from ..wire.session import Wiring, run_router
 from .arguments import Runs
 from .output.display import Display, summary, warn
 from .output.profile_table import show_profile
@@ -207,6 +208,8 @@ def _router(arguments: argparse.Namespace) -> int:
         _refusals_told() if wiring.identity is not None else nullcontext(),
         run_router(wiring) as where,
     ):
+        for _, text in why_open({"--listen": wiring.listen}, secured=wiring.identity is not None):
+            say_warning(text)
         print(f"router at {', '.join(where)}", flush=True)
         stop.wait()
     sys.stdout.flush()
@@ -214,7 +217,7 @@ def _router(arguments: argparse.Namespace) -> int:
 
 
 def _router_wiring(arguments: argparse.Namespace) -> Wiring:
-    """Where a router listens, and who may do what there; warns of what is open to others."""
+    """Where a router listens, and who may do what there; warns of a certificate that ends soon."""
     if arguments.insecure and arguments.security is not None:
         raise ConfigurationError("--security and --insecure do not go together", hint="Leave one of them out.")
     listen = tuple(arguments.listen or ["tcp/127.0.0.1:7447"])
@@ -222,10 +225,11 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
     own = None
     if folder is not None and not arguments.insecure:
         from ..wire.security.certificates import identity_in  # noqa: PLC0415  most routers have no certificate
+        from ..wire.security.identity import warnings_about  # noqa: PLC0415  as above
 
         own = identity_in(folder)
-    for _, text in why_open({"--listen": listen}, secured=own is not None):
-        say_warning(text)
+        for text in warnings_about(own):
+            say_warning(text)
     root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)
     return Wiring(listen=listen, insecure=arguments.insecure, identity=own, root=root, ends=ends)
 
@@ -241,10 +245,12 @@ def _refusals_told() -> Iterator[None]:
 
     def read() -> None:
         with os.fdopen(reading, "rb") as lines:
+            links = RefusedLinks()
             for line in lines:
-                if (refused := refused_link(line.decode(errors="replace").rstrip())) is not None:
+                refused = links.told(line.decode(errors="replace").rstrip())
+                if refused:
                     say(refused)
-                else:
+                elif refused is None:
                     os.write(stdout, line)
 
     reader = threading.Thread(target=read, name="refusals", daemon=True)

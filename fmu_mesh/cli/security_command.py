@@ -30,13 +30,13 @@ _OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "add": ("name", "role", "days", "host"),
     "renew": ("name", "days", "host"),
     "remove": ("name",),
-    "show": ("table", "zenohd", "json"),
+    "show": ("table", "zenohd", "json", "end"),
 }
 
 
 def _security(arguments: argparse.Namespace) -> int:
     what, given = arguments.what, vars(arguments)
-    for option in ("name", "role", "days", "host", "table", "zenohd", "json"):
+    for option in ("name", "role", "days", "host", "table", "zenohd", "json", "end"):
         if given[option] and option not in _OPTIONS[what]:
             shown = f"'{arguments.name}'" if option == "name" else f"--{option}"
             raise ConfigurationError(f"`security {what}` takes no {shown}")
@@ -85,7 +85,8 @@ def _remove(authority: Authority, arguments: argparse.Namespace) -> None:
 
 def _show(authority: Authority, arguments: argparse.Namespace) -> None:
     if arguments.zenohd:
-        print(json.dumps({"access_control": access_control("fmu_mesh/*", authority.table.roles)}, indent=2))
+        rules = access_control(f"{arguments.key_prefix}/*", authority.table.roles, arguments.end)
+        print(json.dumps({"access_control": rules}, indent=2))
         return
     if arguments.json:
         for name, member in authority.members.items():

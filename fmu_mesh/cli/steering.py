@@ -12,10 +12,11 @@ from typing import Final
 from ..api.attaching import attach
 from ..api.run_handle import Run
 from ..errors import ConfigurationError, Interrupted
+from ..printing import printable
 from ..ros.bags.play_options import PlayOptions
 from ..run.options import ResetOptions
 from ..text import did_you_mean, listed
-from ..wire.views import CommandAnswer
+from ..wire.views import AuditView, CommandAnswer
 from .arguments import Runs, reach, whole
 from .mesh_arguments import LEVELS
 from .output.json_output import print_json
@@ -69,9 +70,11 @@ def _wait(arguments: argparse.Namespace) -> int:
 
 def _logs(arguments: argparse.Namespace) -> int:
     with attach(arguments.mesh, **reach(arguments)) as run:
-        if arguments.instance is not None and arguments.instance not in (names := run.info().instances):
+        if arguments.instance not in {None, "mesh"} and arguments.instance not in (names := run.info().instances):
             hint = did_you_mean(arguments.instance, names, f"There are: {listed(names)}.")
             raise ConfigurationError(f"mesh '{run.name}' has no instance '{arguments.instance}'.", hint=hint)
+        if arguments.audit:
+            return _audit(run.audit(), as_json=arguments.json)
         try:
             for line in run.logs(follow=arguments.follow):
                 if arguments.instance in (None, line.instance) and _rank(line.status) >= _rank(arguments.level):
@@ -83,6 +86,14 @@ def _logs(arguments: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             sys.stdout.flush()
             os._exit(Interrupted.exit_code)  # as `watch` does: closing a session in order can take long
+    return 0
+
+
+def _audit(audit: AuditView, *, as_json: bool) -> int:
+    if audit.left_out:
+        print(f"fmu-mesh: {audit.left_out} older entries are left out", file=sys.stderr)
+    for entry in audit.entries:
+        print_json(entry) if as_json else print(printable(f"{entry.time} at point {entry.point}: {entry}"))
     return 0
 
 

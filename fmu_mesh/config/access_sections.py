@@ -29,6 +29,7 @@ __all__ = [
     "host_of",
     "is_socket",
     "leaves_host",
+    "port_of",
     "why_closed",
     "why_open",
 ]
@@ -148,9 +149,19 @@ def has_tls(endpoint: str) -> bool:
 
 
 def host_of(endpoint: str) -> str:
-    """The address or the name of the host in an endpoint of a network."""
+    """The address or the name of the host in an endpoint of a network, such as `tls/[::1]:7447?...`."""
+    return _host_and_port(endpoint)[0]
+
+
+def port_of(endpoint: str) -> int:
+    """The port in an endpoint of a network."""
+    return int(_host_and_port(endpoint)[1])
+
+
+def _host_and_port(endpoint: str) -> tuple[str, str]:
     address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    return address.rpartition(":")[0].strip("[]")
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), port
 
 
 def leaves_host(endpoint: str) -> bool:

@@ -1,4 +1,4 @@
-"""Who joined, set, commanded or was refused: kept for queries, for subscribers, and for the metadata of results.
+"""Who joined, set, commanded or was refused: kept for queries, subscribers, the log, and the metadata of results.
 
 What the rules of Zenoh drop is not seen here, nor anywhere else.
 """
@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import msgspec
 import zenoh
@@ -21,10 +21,10 @@ from msgspec.structs import replace
 from ..config.access_sections import is_socket
 from ..errors import MessageRefused
 from ..wire.keys import Keys, RunKeys
-from ..wire.messages import HEADER, SET, SetValue, decode_json
+from ..wire.messages import HEADER, KEYS, REFUSED, SET, SetValue, decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import AuditEntry
+from ..wire.views import AuditEntry, AuditView, LogLine
 
 __all__ = ["Audit"]
 
@@ -40,15 +40,25 @@ class Audit:
 
     Args:
         point: the communication point that all instances have reached.
+        fed: the keys of other programs that feed inputs, by `instance.variable`.
+        say: adds a line to the log of the mesh; from any thread.
 
     Attributes:
         changes: how often something was added.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, point: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        point: Callable[[], int],
+        fed: Mapping[str, str],
+        say: Callable[[LogLine], None],
+    ) -> None:
         self.changes = 0
-        self._session, self._point = session, point
+        self._session, self._point, self._fed, self._say = session, point, fed, say
         self._newest: dict[tuple[str, ...], AuditEntry] = {}
+        self._command = "", "", ""
         self._left_out = 0
         self._lock = threading.Lock()
         drop = zenoh.CongestionControl.DROP
@@ -63,27 +73,39 @@ class Audit:
         self._of_run.append(self._session.declare_subscriber(keys.settings("*"), self._value))
 
     def note(self, what: _What, who: str, key: str = "", text: str = "", point: int | None = None) -> None:
-        """Add an entry; values, or refusals, of one sender at one key are one entry."""
-        at, now = self._point() if point is None else point, datetime.now(UTC).isoformat(timespec="milliseconds")
-        who, key, text = who[:_LONGEST], key[:_LONGEST], text[:_LONGEST]
-        same = (what, who, key) if what in {"set", "refused"} else (what, who, key, str(self.changes))
+        """Add an entry of this moment, by default at the point of the mesh."""
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        self._add(AuditEntry(what, who, now, self._point() if point is None else point, key, text))
+
+    def _add(self, new: AuditEntry, *, is_logged: bool = False) -> None:
+        """Values, or refusals, of one sender at one key are one entry, and so is a command that follows itself."""
+        new = replace(new, who=new.who[:_LONGEST], key=new.key[:_LONGEST], text=new.text[:_LONGEST])
         with self._lock:
-            self.changes += 1
+            if new.what == "commanded" and (new.who, new.text) != self._command[:2]:
+                self._command = new.who, new.text, str(self.changes)
+            own = {"commanded": self._command, "joined": (new.who, new.text)}
+            same = new.what, *own.get(new.what, (new.who, new.key))
             known = self._newest.get(same)
+            self.changes += 1
             if known is not None:
-                self._newest[same] = replace(known, number=known.number + 1, last_time=now, last_point=at)
+                number, at = known.number + new.number, (new.last_time or new.time, new.last_point or new.point)
+                self._newest[same] = replace(known, number=number, last_time=at[0], last_point=at[1])
                 return
-            entry = self._newest[same] = AuditEntry(what, who, now, at, key, text)
+            self._newest[same] = new
             if len(self._newest) > _MOST:
-                del self._newest[next(iter(self._newest))]
+                # Whoever is refused again and again must not hide what was done.
+                del self._newest[next((key for key in self._newest if key[0] == "refused"), next(iter(self._newest)))]
                 self._left_out += 1
         if matches(self._publisher):
-            self._publisher.put(msgspec.json.encode(entry))
+            self._publisher.put(msgspec.json.encode(new))
+        if not is_logged:
+            status = "warning" if new.what == "refused" else "ok"
+            self._say(LogLine("mesh", status, "audit", str(new), new.point))
 
-    def view(self) -> dict[str, object]:
-        """All that is known: the ``entries`` in their order, and how many of them, the oldest, are ``left_out``."""
+    def view(self) -> AuditView:
+        """All that is known."""
         with self._lock:
-            return {"left_out": self._left_out, "entries": [*self._newest.values()]}
+            return AuditView(tuple(self._newest.values()), self._left_out)
 
     def close(self) -> None:
         """Undeclare everything."""
@@ -96,13 +118,21 @@ class Audit:
 
     def _value(self, sample: zenoh.Sample) -> None:
         data = sample.payload.to_bytes()
+        if len(data) < HEADER.size or "*" in str(sample.key_expr):  # no node sends it
+            return
         try:
-            if HEADER.unpack_from(data)[0] != SET:
-                return
-            value = decode_json(data[HEADER.size :], SetValue)
+            kind, content = HEADER.unpack_from(data)[0], data[HEADER.size :]
+            if kind == SET:
+                value = decode_json(content, SetValue)
+                name = f"{value.instance}.{value.variable}"
+                self.note("set", value.by or value.who, value.key, name, value.point)
+            elif kind == REFUSED:
+                self._add(decode_json(content, AuditEntry), is_logged=True)
+            elif kind == KEYS:
+                for name, point, *_ in decode_json(content, list[tuple[str, int, Any, Any]]):
+                    self.note("set", "", self._fed.get(name, ""), name, point)
         except (MessageRefused, ValueError):  # the recorder refuses it, too, and counts it
             return
-        self.note("set", value.by or value.who, value.key, f"{value.instance}.{value.variable}", value.point)
 
     def _link(self, event: zenoh.LinkEvent) -> None:
         link = event.link

@@ -129,7 +129,9 @@ class Master:
         self._inbox = Inbox(self._memory)
         self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
         self._server = MasterServer(session, self._keys, self._inbox, events, self.last_status, plan.system.instances)
-        self.audit = Audit(session, self._keys, lambda: max(self._states.granting.slowest, 0))
+        items = [(own.name, key) for node in plan.nodes.values() for own in node.instances for key in own.keys_in]
+        fed = {f"{name}.{key.variable}": key.key for name, key in items}
+        self.audit = Audit(session, self._keys, lambda: max(self._states.granting.slowest, 0), fed, self._server.say)
         self._token: zenoh.LivelinessToken | None = None
         self._prepare(meeting)
         self._first_keys = self._run_keys
@@ -152,7 +154,8 @@ class Master:
         self._inbox.open(session, keys, MASTER, {keys.progress(node): node for node in plan.nodes})
         self.audit.follow(keys)
         offer = self._memory.offer if self._shares else None
-        self._members = Members(self._states.registrations, session, keys, offer, settings.launch, meeting)
+        own = settings.launch, meeting, settings.table
+        self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)

@@ -52,12 +52,13 @@ class Members:
         offer: Offer | None,
         launch: str | None,
         meeting: Meeting | None = None,
+        table: int = 0,
     ) -> None:
         self._nodes = nodes
         self._session = session
         self._keys = keys
         self._offer = offer
-        self._launch = launch
+        self._launch, self._table = launch, table
         self._meeting = meeting
         self._waiting: dict[str, zenoh.Query] = {}
         self._shared: tuple[str, ...] = ()
@@ -79,7 +80,8 @@ class Members:
                 if self._meeting is not None and registration.door is not None:
                     self._meeting.knows(registration.node, registration.door)
                     door = self._meeting.door_for(registration.node)
-                admission = Admission(self._keys.run, self._grant_keys[registration.node], self._offer, door)
+                grants = self._grant_keys[registration.node]
+                admission = Admission(self._keys.run, grants, self._offer, door, self._table)
                 query.reply(query.key_expr, msgspec.json.encode(admission))
             else:
                 log.info("node_refused", extra={"reason": reason})

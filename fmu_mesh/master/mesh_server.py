@@ -159,11 +159,16 @@ class MasterServer:
             if key != f"{self._keys.instance(line.instance)}/log" or line.instance not in self._instances:
                 raise MessageRefused("it is not the log of an instance of this mesh")
             self._events.log(line)
-            self._log_lines += 1
-            self._keep(msgspec.json.encode(replace(line, number=self._log_lines)))
+            self._keep(line)
 
-    def _keep(self, line: bytes) -> None:
+    def say(self, line: LogLine) -> None:
+        """From any thread: add a line of the mesh itself to the log of all instances."""
+        self._inbox.post(lambda: self._keep(line))
+
+    def _keep(self, new: LogLine) -> None:
         """Publish a line of the log of all instances, and keep it; forget the oldest ones beyond the limits."""
+        self._log_lines += 1
+        line = msgspec.json.encode(replace(new, number=self._log_lines))
         self._log_publisher.put(line)
         self._newest_lines.append(msgspec.Raw(line))
         self._newest_bytes += len(line)

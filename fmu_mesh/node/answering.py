@@ -10,6 +10,8 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
 from functools import partial
 from typing import Final
 
@@ -26,7 +28,7 @@ from ..variables.value_conversion import to_plain
 from ..variables.value_types import is_text
 from ..wire.host_processes import own_pid
 from ..wire.inbox import Inbox
-from ..wire.keys import BY, Keys, VariableKind, escape, unescape
+from ..wire.keys import BY, Keys, VariableKind, escape, sender_in, unescape
 from ..wire.messages import SetValue, decode_json
 from ..wire.values import (
     NO_ORIGIN,
@@ -37,8 +39,9 @@ from ..wire.values import (
     decode_value,
     encode_value,
     json_encoding,
+    who_sent,
 )
-from ..wire.views import ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView, Way
+from ..wire.views import AuditEntry, ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView, Way
 from ..wire.ways import Ways
 from .activity import Activity
 from .inputs import set_input
@@ -80,7 +83,7 @@ class Answers:
     Args:
         post: lets the server thread do something; may be called from any thread.
         log: publishes a log message; on the server's thread.
-        tell: tells the recorder, if there is one, which value was set; on the main thread.
+        tell: tells the recorder and the master which value was set, or was refused.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
@@ -90,7 +93,7 @@ class Answers:
         activity: Activity,
         post: Callable[[Job], None],
         log: Callable[[LogLine], None],
-        tell: Callable[[SetValue], None],
+        tell: Callable[[SetValue | AuditEntry], None],
     ) -> None:
         self._plan = plan
         self._keys = Keys(plan.key_prefix, plan.mesh)
@@ -105,6 +108,7 @@ class Answers:
         self._put: deque[tuple[Runner, zenoh.Sample]] = deque()
         self._without_time: set[str] = set()
         self._old: set[str] = set()
+        self._refused: dict[tuple[str, str], AuditEntry] = {}
 
     def begin(self) -> None:
         """On the main thread, at point 0: set the values that came before; the initialization is as without them."""
@@ -119,7 +123,7 @@ class Answers:
             if runner is None:
                 pending.refuse(f"'{name}' is still being loaded")
             else:
-                self._set(runner, query, pending.refuse, pending)
+                self._set(runner, query, pending)
             return
         views: dict[str, Callable[[], object]] = {"status": lambda: self._activity.status(name)}
         if runner is not None:
@@ -168,7 +172,7 @@ class Answers:
         return tuple(f"{key}/**" for key in (*own, *([f"{own[-1]}/{BY}"] if self._plan.secured else ())))
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
-        """On a thread of Zenoh: accept a value that was put; if it is refused, the reason is logged."""
+        """On a thread of Zenoh: accept a value that was put."""
         if len(self._put) >= _MOST_PUT:
             self._inbox.refusals.add(str(sample.key_expr), f"{_MOST_PUT} other values wait")
         else:
@@ -179,11 +183,7 @@ class Answers:
         runner, sample = self._put.popleft()
         if len(self._put) == _FEW_PUT:
             self._inbox.post(lambda: None)  # wakes the main thread for those before: all that follow may be refused
-
-        def refuse(reason: str) -> None:
-            self._log(LogLine(runner.name, "warning", "set", reason, runner.point))
-
-        self._set(runner, sample, refuse)
+        self._set(runner, sample)
 
     def turn(self, now: float) -> None:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
@@ -193,6 +193,14 @@ class Answers:
         for pending in [p for p in self._pending if now - p.asked > _ANSWER_S]:
             pending.refuse(f"not at a point yet: {self._activity.status(pending.instance).activity}")
         self._pending = [pending for pending in self._pending if not pending.is_answered]
+        self.tell_refused()
+
+    def tell_refused(self) -> None:
+        """Tell what was refused since the last time; of one sender at one key at once."""
+        if self._before is None:  # the links are there
+            refused, self._refused = self._refused, {}
+            for entry in refused.values():
+                self._tell(entry)
 
     def _from_rows(self, runner: Runner, wanted: list[tuple[str, Variable]]) -> tuple[list[tuple[str, Value]], int]:
         """The outputs in the rows of the newest own step, and that step; what only the FMU has is not included.
@@ -220,17 +228,13 @@ class Answers:
         for key, value in values:
             query.reply(key, encode_value(value), encoding=json_encoding, attachment=stamp)
 
-    def _set(
-        self,
-        runner: Runner,
-        sent: zenoh.Query | zenoh.Sample,
-        refuse: Callable[[str], None],
-        pending: _Pending | None = None,
-    ) -> None:
+    def _set(self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None = None) -> None:
         """Let the main thread set variables between two steps, if all values that were sent are allowed.
 
-        The ``pending`` query, if they were sent with one, is answered with the point from which on they hold.
+        The ``pending`` query, if they were sent with one, is answered with the point from which on they hold. If they
+        are refused, the log and the audit have the reason, too.
         """
+        refuse = partial(self._refuse, runner, sent, pending)
 
         def take() -> None:
             if self._before is not None:
@@ -260,6 +264,19 @@ class Answers:
             self._pending.append(pending)
         # Where more values wait, the last of them wake the main thread for all.
         self._inbox.post(take, later=len(self._put) > _FEW_PUT)
+
+    def _refuse(self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None, reason: str) -> None:
+        key, now, at = str(sent.key_expr), datetime.now(UTC).isoformat(timespec="milliseconds"), runner.point
+        who = sender_in(key)
+        with suppress(MessageRefused):
+            who = who or who_sent(sent.attachment)
+        if (known := self._refused.get((who, key))) is not None:
+            self._refused[who, key] = replace(known, number=known.number + 1, last_time=now, last_point=at)
+        elif len(self._refused) < _MOST_WARNED:
+            self._refused[who, key] = AuditEntry("refused", who, now, at, key, reason)
+            self._log(LogLine(runner.name, "warning", "set", reason, at))
+        if pending is not None:  # at last: nothing can be read of a query that was answered
+            pending.refuse(reason)
 
     def _confirm(self, runner: Runner, key: str, pending: _Pending, step: int, when: float | None) -> None:
         grid, points = self._plan.grid, runner.plan.step_points

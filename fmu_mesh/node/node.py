@@ -51,22 +51,19 @@ from ..wire.messages import (
     GRANT,
     HEADER,
     INITIAL,
-    KEYS,
     PROGRESS,
     RESET,
-    SET,
-    STIFF,
     NewStart,
     NodeReport,
     SetValue,
     Stiff,
     decode_json,
-    encode_json,
+    encode_news,
 )
 from ..wire.router_link import RouterLink
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.streamed_rows import why_not
-from ..wire.views import LogLine
+from ..wire.views import AuditEntry, LogLine
 from ..wire.ways import Ways
 from .activity import Activity
 from .burst_engine import make_engine
@@ -140,6 +137,7 @@ class Node:
         meeting: Meeting | None = None,
         engine: Callable[..., Engine] = make_engine,
         strain: Callable[[], str | None] = lambda: None,
+        table: int = 0,
     ) -> None:
         self._plan = plan
         self._session = session
@@ -161,9 +159,7 @@ class Node:
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
         silent_s = self._stream_silent_s
-        self._membership = Membership(
-            plan, session, self._inbox, launch, self._router, meeting=meeting, stream_silent_s=silent_s
-        )
+        self._membership = Membership(plan, session, self._inbox, launch, self._router, None, meeting, silent_s, table)
         self._meeting = meeting
         self._ways = Ways()
         self._streams: RowStreams | None = None
@@ -222,13 +218,9 @@ class Node:
 
         self._inbox.post(end, first=True)
 
-    def tell_recorder(self, news: SetValue | Stiff | Sequence[KeyValue]) -> None:
-        """On the main thread: what the metadata of results get, such as a value that another program has set."""
-        if isinstance(news, SetValue):  # the master hears it, too, for the audit
-            self._put_set(encode_json(SET, news, news.point))
-        elif RECORDER in dict(self._plan.windows):
-            kind, point = (STIFF, news.point) if isinstance(news, Stiff) else (KEYS, news[-1][1])
-            self._put_set(encode_json(kind, news, point))
+    def tell_recorder(self, news: SetValue | AuditEntry | Stiff | Sequence[KeyValue]) -> None:
+        """What the metadata of results and the audit get, such as a value that another program has set."""
+        self._put_set(encode_news(news))
 
     def report_hang(self, error: FmuError) -> bool:
         """On a watching thread, while an FMU does not return: report to the master; return whether it knows now."""

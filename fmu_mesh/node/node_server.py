@@ -24,7 +24,7 @@ from ..wire.keys import BY, SUBSCRIBED, Keys
 from ..wire.messages import SetValue, decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import LogLine
+from ..wire.views import AuditEntry, LogLine
 from .activity import Activity
 from .answering import Answers, Job
 from .key_ends import KeyEnds
@@ -66,7 +66,7 @@ class NodeServer:
 
     Args:
         on_hang: called on the server thread if a step does not return in time.
-        tell: tells the recorder, if there is one, which value was set, or which have come by keys; on the main thread.
+        tell: tells the recorder and the master which value was set or refused, or which have come by keys.
 
     Attributes:
         keys: the Zenoh keys at ends of connections.
@@ -79,7 +79,7 @@ class NodeServer:
         inbox: Inbox,
         activity: Activity,
         on_hang: Callable[[FmuError], None],
-        tell: Callable[[SetValue | Sequence[KeyValue]], None],
+        tell: Callable[[SetValue | AuditEntry | Sequence[KeyValue]], None],
     ) -> None:
         self._on_hang = on_hang
         self._plan = plan
@@ -184,6 +184,7 @@ class NodeServer:
         while True:
             with suppress(queue.Empty):
                 if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
+                    self._answers.tell_refused()
                     return
                 with self._inbox.refusals.guard("a query or a value"):
                     job()

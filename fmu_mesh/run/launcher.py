@@ -37,8 +37,8 @@ from ..errors import Interrupted, MeshLost
 from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.plan import MASTER, RECORDER
+from ..wire.refused_links import RefusedLinks
 from ..wire.runtime import box_of, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
-from ..wire.session import refused_link
 from .child import Child, Process
 from .events import Event, OutputLine, Reachable, WasReset, decode_event
 from .fork_server import ForkServer, executed, executed_command, fork_server
@@ -84,6 +84,7 @@ class Launcher:
         self._files: tuple[tuple[str, int], ...] | None = None
         self._shares: dict[str, float | None] = {}
         self._clock = AwakeClock()
+        self._refused_links = RefusedLinks()
         config, plan = run.loaded.config, run.plan
         self._states = LaunchStates(
             LaunchTerms(
@@ -165,7 +166,9 @@ class Launcher:
             node = self._run.plan.nodes[name]
             process: Process
             if node.process.is_sandboxed:
-                process = Sandboxed(node, self._folder, executed_command("node", self._file, name), self._is_own)
+                own, command = self._run.loaded.config.security, executed_command("node", self._file, name)
+                keys = own.folder if own is not None else None
+                process = Sandboxed(node, self._folder, command, self._is_own, keys)
             elif node.interpreter is not None and is_other_python(node.interpreter):
                 process = executed("node", self._file, name, interpreter=node.interpreter)
             else:
@@ -219,7 +222,9 @@ class Launcher:
 
     def _take_output(self, name: str, line: bytes) -> None:
         text = line.decode(errors="replace").rstrip()
-        self._on_event(OutputLine(name, (refused_link(text) if name == THE_MASTER else None) or text))
+        refused = self._refused_links.told(text) if name == THE_MASTER else None
+        if refused != "":
+            self._on_event(OutputLine(name, refused or text))
 
     # --- the end
 

@@ -46,7 +46,7 @@ from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
-from .wiring import certified, patient, wiring
+from .wiring import certified, patient, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
     from .preparing import KnownModels
@@ -166,6 +166,7 @@ class _NodeProcess:
                 launch=process.launch,
                 meeting=self._meeting,
                 strain=partial(strain, plan.process),
+                table=table_of(own),
             )
             gc.collect()  # the memory of the run before a reset is in circles of objects
             if process.interruption.reason is not None:
@@ -263,6 +264,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
     zenoh = run.zenoh(config.zenoh.listen)
     with RunProcess(config.mesh, run.run) as process:
         process.take_place(MASTER, f"the master of mesh '{config.mesh}'")
+        if config.security is not None:  # results say which persons, at which addresses, have done what
+            process.stack.callback(os.umask, os.umask(0o077))
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
             own = certified(own, config.security, Keys(config.zenoh.key_prefix, config.mesh).root, config.ends)
@@ -279,7 +282,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 launch=process.launch,
                 profile=run.profile,
                 paused=run.paused,
-                table=table.number if (table := own.identity and own.identity.table) else 0,
+                table=table_of(own),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())

@@ -29,7 +29,7 @@ from .run_plan import RunPlan
 if TYPE_CHECKING:  # as below
     from ..wire.security.identity import Identity
 
-__all__ = ["certified", "identity_of", "name_of", "patient", "warnings_of", "wiring"]
+__all__ = ["certified", "identity_of", "name_of", "patient", "table_of", "warnings_of", "wiring"]
 
 
 _ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=|\bruntime\.share_with")
@@ -132,6 +132,11 @@ def name_of(made: Wiring, security: SecurityConfig | None) -> str | None:
     if made.identity is not None:
         return made.identity.name
     return LOCAL if security is not None else None
+
+
+def table_of(own: Wiring) -> int:
+    """Number of the table of roles of a process; 0: it needs none, or has none of our authority."""
+    return own.identity.table.number if own.identity is not None and own.identity.table is not None else 0
 
 
 def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:

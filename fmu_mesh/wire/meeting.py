@@ -12,13 +12,14 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Protocol
 
 import msgspec
 
+from ..config.access_sections import host_of
 from ..errors import ConfigurationError
 from ..rings import native
 from .runtime import rows_socket
@@ -337,7 +338,7 @@ def meeting_of(name: str, folder: Path, wiring: Wiring, address: str | None = No
     """
     if native.library is None:
         return None
-    connected = [host for endpoint in wiring.connect if (host := _host_of(endpoint)) is not None]
+    connected = _hosts(wiring.connect)
     if address is not None:
         try:
             socket.create_server((address, 0), family=_family(address)).close()
@@ -345,7 +346,7 @@ def meeting_of(name: str, folder: Path, wiring: Wiring, address: str | None = No
             text = f"cannot listen for row streams at '{address}': {error.strerror or error}"
             raise ConfigurationError(text, hint="`zenoh.rows_address` is an address of this host.") from error
         return Meeting(name, [rows_socket(folder, name), address], dict.fromkeys(connected))
-    listening = [host for endpoint in wiring.listen if (host := _host_of(endpoint)) is not None]
+    listening = _hosts(wiring.listen)
     hosts = dict.fromkeys([*listening, *filter(None, map(_own_address, connected))])
     return Meeting(name, [rows_socket(folder, name), *hosts], dict.fromkeys(connected))
 
@@ -354,10 +355,9 @@ def _family(host: str) -> socket.AddressFamily:
     return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
-def _host_of(endpoint: str) -> str | None:
-    """The host in an endpoint of Zenoh; None for a Unix socket or a serial line."""
-    protocol, _, place = endpoint.partition("/")
-    return place.split("?")[0].rpartition(":")[0].strip("[]") if protocol in _NETWORKS else None
+def _hosts(endpoints: Sequence[str]) -> list[str]:
+    """The hosts in those of a network; a Unix socket and a serial line have none."""
+    return [host_of(endpoint) for endpoint in endpoints if endpoint.partition("/")[0] in _NETWORKS]
 
 
 def _own_address(host: str) -> str | None:

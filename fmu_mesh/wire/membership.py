@@ -11,6 +11,7 @@ There are three steps; each is a query with an answer:
 
 from __future__ import annotations
 
+import logging
 import math
 import secrets
 import socket
@@ -39,6 +40,8 @@ from .session import Question, ask
 from .ways import Ways
 
 __all__ = ["Admission", "Membership", "NodeReady", "Registration", "Welcome"]
+
+log = logging.getLogger(__name__)
 
 # Threads: `register` starts one that asks the master, so that FMUs are loaded meanwhile; it sets `_admitted` (a
 # future) and `_keys` and ends. The owner's thread calls `keys`, `join`, `check_silence`. A thread of Zenoh answers
@@ -99,12 +102,14 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         grants: the key of the master's messages to this node.
         offer: the memory that processes on the master's host share; None if there is none.
         door: where the process reaches the master for a row stream.
+        table: number of the table of roles that the master has; 0: it has none of our authority.
     """
 
     run: Annotated[str, msgspec.Meta(pattern=f"^[0-9a-f]{{{2 * RUN_ID_BYTES}}}$")]
     grants: str
     offer: Offer | None = None
     door: Door | None = None
+    table: int = 0
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -148,6 +153,7 @@ class Membership:
         inbox: its inbox; opened by `join`.
         memory: the shared memory, for a participant in the process of the master.
         meeting: where it meets others for row streams; None: all of its rows go by rings and by Zenoh.
+        table: number of the table of roles of this process; 0: it needs none.
         stream_silent_s: for how long the master has sent nothing by a row stream, in s.
 
     Attributes:
@@ -169,9 +175,10 @@ class Membership:
         memory: HostMemory | None = None,
         meeting: Meeting | None = None,
         stream_silent_s: Callable[[], float] = lambda: math.inf,
+        table: int = 0,
     ) -> None:
         self._plan = plan
-        self._meeting = meeting
+        self._meeting, self._table = meeting, table
         self._router = router or RouterLink(session)
         self.lost_master = self.lost_link = self.doubts_master = False
         self._asked_at = -math.inf
@@ -361,6 +368,10 @@ class Membership:
         payload = msgspec.json.encode(registration)
         question = Question(self._public.register, "the master", plan.timeouts.start, payload)
         admission = _understood(ask(self._session, question, lambda: self.given_up), Admission)
+        if self._table and admission.table and self._table != admission.table:
+            from .security.identity import other_table  # noqa: PLC0415  most runs have no certificate
+
+            log.warning("%s", other_table(self._table, admission.table))
         self._keys = keys = self._public.run(admission.run)
         if self.memory is None and admission.offer is not None and plan.shared_memory:
             self.memory = HostMemory.opened(admission.offer, plan.memory, plan.node, opened_of)

@@ -3,8 +3,9 @@
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
 four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), and in these as JSON: in an ABORT an
 `ErrorReport`, in a RESET a `NewStart`, and for the recorder (`FOR_METADATA`) in a SET a `SetValue`, in a STIFF a
-`Stiff`, and in a KEYS values that have come by keys. LAST says that no more rows of a link come, because the run has
-ended early. Every decoder checks sizes before it reads anything, and raises only `MessageRefused`.
+`Stiff`, in a KEYS values that have come by keys, and for the audit in a REFUSED an `AuditEntry`. LAST says that no more
+rows of a link come, because the run has ended early. Every decoder checks sizes before it reads anything, and raises
+only `MessageRefused`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ..system.input_timeouts import InputTimeout
 from ..system.live_keys import KeyValue
 from ..variables.value_types import PlainValue
 from .time_profile import NodeProfile
+from .views import AuditEntry
 
 __all__ = [
     "ABORT",
@@ -36,6 +38,7 @@ __all__ = [
     "LAST",
     "MAX_MESSAGE_SIZE",
     "PROGRESS",
+    "REFUSED",
     "RESET",
     "SET",
     "STIFF",
@@ -45,6 +48,7 @@ __all__ = [
     "Stiff",
     "decode_json",
     "encode_json",
+    "encode_news",
     "sealed",
 ]
 
@@ -63,6 +67,7 @@ ALIVE: Final = 10
 RESET: Final = 11
 KEYS: Final = 12
 STIFF: Final = 13
+REFUSED: Final = 14
 FOR_METADATA: Final = (SET, KEYS, STIFF)
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
@@ -137,10 +142,22 @@ def sealed(secret: str) -> str:
 
 
 def encode_json(
-    kind: int, content: ErrorReport | NewStart | SetValue | Stiff | Sequence[KeyValue], point: int = 0
+    kind: int, content: ErrorReport | NewStart | SetValue | AuditEntry | Stiff | Sequence[KeyValue], point: int = 0
 ) -> bytes:
-    """An ABORT, RESET, SET, STIFF or KEYS message."""
+    """An ABORT, RESET, SET, REFUSED, STIFF or KEYS message."""
     return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
+
+
+def encode_news(news: SetValue | AuditEntry | Stiff | Sequence[KeyValue]) -> bytes:
+    """What has happened at a node, for the metadata of results and the audit: a SET, REFUSED, STIFF or KEYS message."""
+    match news:
+        case SetValue():
+            return encode_json(SET, news, news.point)
+        case AuditEntry():
+            return encode_json(REFUSED, news, news.point)
+        case Stiff():
+            return encode_json(STIFF, news, news.point)
+    return encode_json(KEYS, news, news[-1][1])
 
 
 def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:

@@ -39,7 +39,6 @@ __all__ = [
     "matches",
     "open_session",
     "own_endpoints",
-    "refused_link",
     "run_router",
     "tokens",
     "undeclare_all",
@@ -67,10 +66,8 @@ _STUCK_S = 4.0
 _LARGE_US = 2_000_000
 """How long the pieces of one large sample or answer may wait for a client in all."""
 
-_LOG_OF_LISTENER = "error,zenoh_link_tls=warn,zenoh_link_quic=warn"
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-_REFUSED = re.compile(r"WARN.* zenoh_link_(?:tls|quic)\S*: (.*?)(?:\. Hint: .*)?$")
-"""Why who listens has refused a link; the hint is about something else."""
+_LOG_OF_LISTENER = "error,zenoh::net::routing=off,zenoh_link_tls=warn,zenoh_link_quic=warn"
+"""What is undeclared was never declared where the rules have dropped that: one error each, as often as others like."""
 
 _OWN_SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
 _CANNOT_LISTEN = (
@@ -190,19 +187,10 @@ def reason_of(error: zenoh.ZError) -> str:
     return _OWN_SOURCE.sub("", str(error))
 
 
-def refused_link(line: str) -> str | None:
-    """What a line that Zenoh has written says of a link that it has refused; None if it is another line.
-
-    Example:
-        >>> refused_link("... WARN acc-0 zenoh_link_tls::unicast: peer sent no certificates. Hint: increase the limit.")
-        'a link was refused: peer sent no certificates'
-    """
-    found = _REFUSED.search(_COLOUR.sub("", line))
-    return f"a link was refused: {found[1]}" if found is not None else None
-
-
 def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
-    endpoint = next((endpoint for endpoint in wiring.listen if endpoint in reason), None)
+    # Of TLS, the reason has the address and the port, and neither the protocol nor the name of the host.
+    ends = {endpoint: f":{endpoint.rpartition(':')[2]}:" for endpoint in wiring.listen}
+    endpoint = next((endpoint for endpoint, port in ends.items() if endpoint in reason or port in reason), None)
     if endpoint is None:
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
         return ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {reason}")

@@ -17,6 +17,7 @@ from .runtime import this_host
 __all__ = [
     "GOING_ON",
     "AuditEntry",
+    "AuditView",
     "Command",
     "CommandAnswer",
     "ConnectionView",
@@ -222,7 +223,7 @@ class AuditEntry(msgspec.Struct, frozen=True, omit_defaults=True):
         point: the communication point of the run then.
         key: the key at which it arrived; nothing for who joined.
         text: the command, the reason of a refusal, or the address of who joined.
-        number: how often, for values and refusals of the same kind.
+        number: how often, for values and refusals at one key, and for a command that follows itself.
         last_time: when last; ``last_point``: at which point; both only if it was more than once.
     """
 
@@ -235,6 +236,17 @@ class AuditEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     number: int = 1
     last_time: str = ""
     last_point: int = 0
+
+    def __str__(self) -> str:
+        more = f" ({self.number} times, the last at point {self.last_point})" if self.last_time else ""
+        return f"{self.who or 'somebody'} {self.what}: {self.text}{f' at {self.key}' if self.key else ''}{more}"
+
+
+class AuditView(msgspec.Struct, frozen=True):
+    """Answer of `…/mesh/audit`: the newest entries in their order, and how many others are ``left_out``."""
+
+    entries: tuple[AuditEntry, ...]
+    left_out: int = 0
 
 
 class SetAnswer(msgspec.Struct, frozen=True):

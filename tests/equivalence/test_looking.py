@@ -302,7 +302,7 @@ def test_log_messages_from_before_are_shown_and_chosen_by_instance_and_level(
     call: Call, session: zenoh.Session
 ) -> None:
     refused = Samples(session, f"{ROOT}/mesh/log")
-    for key in ("gain/set/u", "gain/set/u", "pendulum/set/l"):
+    for key in ("gain/set/u", "gain/set/y", "pendulum/set/l"):
         session.put(f"{ROOT}/{key}", "1")
     told = [json.loads(refused.until(lambda _: True).payload.to_bytes()) for _ in range(3)]
 
@@ -319,8 +319,9 @@ def test_log_messages_from_before_are_shown_and_chosen_by_instance_and_level(
 
 def test_of_a_long_log_the_newest_messages_are_kept(call: Call, session: zenoh.Session) -> None:
     published = Samples(session, f"{ROOT}/mesh/log")
+    line = {"instance": "gain", "status": "warning", "category": "test", "message": "again", "point": 0}
     for _ in range(1100):
-        session.put(f"{ROOT}/gain/set/u", "1")
+        session.put(f"{ROOT}/gain/log", json.dumps(line))
     first = json.loads(published.until(lambda _: True).payload.to_bytes())["number"]
     published.until(lambda sample: json.loads(sample.payload.to_bytes())["number"] >= first + 1099)
 
@@ -643,6 +644,22 @@ def test_a_refused_put_is_in_the_log(session: zenoh.Session) -> None:
     line = json.loads(next(iter(lines)).payload.to_bytes())
     assert (line["instance"], line["status"], line["category"]) == ("gain", "warning", "set")
     assert "is connected to 'pendulum'" in line["message"]
+
+
+def test_what_is_refused_again_and_again_is_one_line_at_a_time(session: zenoh.Session) -> None:
+    lines = Samples(session, f"{ROOT}/gain/log")
+    audit = Samples(session, f"{ROOT}/mesh/audit")
+    ask_one(session, f"{ROOT}/gain/status")
+    for _ in range(300):
+        session.put(f"{ROOT}/gain/set/again", "1.0")
+    session.put(f"{ROOT}/gain/set/last", "1.0")
+    told: list[str] = []
+    while not any("'last'" in message for message in told):
+        told.append(json.loads(lines.until(lambda _: True).payload.to_bytes())["message"])
+
+    assert len(told) < 100
+    entry = json.loads(audit.until(lambda sample: b"set/again" in sample.payload.to_bytes()).payload.to_bytes())
+    assert (entry["what"], entry["text"]) == ("refused", "'gain' has no variable 'again'")
 
 
 def test_a_stream_is_what_is_recorded_point_by_point() -> None:

@@ -15,79 +15,38 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import yaml
-import zenoh
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from fmu_mesh.errors import ErrorReport
 from fmu_mesh.rings.host_memory import can_share
 from fmu_mesh.rings.native import NEVER
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.run.options import PlanOptions
-from fmu_mesh.wire.keys import Keys, RunKeys
-from fmu_mesh.wire.messages import ABORT, FINISH, FRAME, GRANT, HEADER, LAST, PROGRESS, NodeReport
+from fmu_mesh.wire.messages import HEADER, PROGRESS
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
-from tests.plain_run import PlainRun
 from tests.planning import prepare
+from tests.strangers import (
+    FAR,
+    Attack,
+    Stranger,
+    abort,
+    any_bytes,
+    config_of,
+    few_wrong_rows,
+    finish,
+    grant,
+    local_result,
+    malformed,
+    many_declarations,
+    other_keys,
+    progress,
+    reports,
+    too_many_rows,
+)
 
 WAYS = pytest.mark.parametrize("shared_memory", [True, False], ids=["shared memory", "Zenoh"])
 needs_memory = pytest.mark.skipif(not can_share(), reason="needs Linux with memfd_create, and the library")
-FAR = 2**62
-
-
-class Stranger:
-    """A plain client in the one mesh that runs here.
-
-    Attributes:
-        keys: the internal keys of the run, which any client can find out.
-    """
-
-    def __init__(self, session: zenoh.Session, mesh: str) -> None:
-        self.session = session
-        self.public = Keys("fmu_mesh", mesh)
-        found = session.liveliness().get(self.public.run("*").master, timeout=DEADLINE_S)
-        [token] = [str(reply.ok.key_expr) for reply in found if reply.ok is not None]
-        self.keys = RunKeys(self.public.root, token.split("/")[-2])
-
-    def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
-        """Publish, and wait where queues are full: what is sent must not be lost on the way."""
-        self.session.put(key, payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
-
-    def ask(self, key: str, payload: bytes | None = None) -> list[str]:
-        """The texts of the refusals that a query gets."""
-        replies = self.session.get(key, payload=payload, timeout=DEADLINE_S)
-        return [reply.err.payload.to_bytes().decode() for reply in replies if reply.err is not None]
-
-    def refused(self) -> int:
-        """How many messages the processes of the mesh have refused."""
-        replies = self.session.get(f"{self.public.root}/*/status", timeout=DEADLINE_S)
-        return sum(int(json.loads(reply.ok.payload.to_bytes())["refused"]) for reply in replies if reply.ok is not None)
-
-
-def config_of(place: Place, *, shared_memory: bool, stop_time: float = 2.0, **simulation: float) -> Path:
-    """A cycle with a free input: frames go both ways, and something can be set."""
-    return write_config(
-        place.folder,
-        instances={
-            "left": {"fmu": "Gain", "start_values": {"k": 0.9}},
-            "right": {"fmu": "TransportDelay", "start_values": {"d": 0.01}},
-            "free": {"fmu": "Gain"},
-        },
-        connections=("left.y -> right.x", "right.y -> left.u"),
-        stop_time=stop_time,
-        simulation={"window": 256, **simulation},
-        zenoh={"shared_memory": shared_memory, "row_streams": False},
-    )
-
-
-def local_result(place: Place, config: Path) -> bytes:
-    output = place.folder / "local.csv"
-    PlainRun(prepare(config, PlanOptions(output=output))).run()
-    return output.read_bytes()
 
 
 @contextmanager
@@ -112,94 +71,29 @@ def assert_unharmed(place: Place, config: Path, launched: Launched) -> None:
 # ---- what is malformed, or comes by another key than exactly the expected one
 
 
+def all_refused(stranger: Stranger) -> None:
+    """There are questions, and each of them is refused."""
+    assert stranger.asked
+    assert not [asked.key for asked in stranger.asked if not asked.refusals]
+
+
 @WAYS
 def test_the_messages_that_once_ended_run_are_refused_and_it_goes_on(place: Place, *, shared_memory: bool) -> None:
     config = config_of(place, shared_memory=shared_memory)
     with paused(place, config) as (launched, stranger):
-        public, keys = stranger.public, stranger.keys
+        malformed(stranger)
 
-        assert stranger.ask(f"{public.root}/@sync/**")
-        assert stranger.ask(public.mesh_key("command"), b'{"command":"\xff"}')
-        assert stranger.ask(public.mesh_key("command"), b'{"command":"step","points":1' + b"0" * 400 + b"}")
-        for key in (
-            public.register,
-            keys.ready("left"),
-            keys.report("left"),
-            keys.report("@record"),
-            keys.hello("left"),
-        ):
-            for payload in (b"", b"\xff", b"{}", b"[" * 3000, b'{"node":"left"}'):
-                assert stranger.ask(key, payload), key
-        stranger.put(public.setting("free", "u"), b"1.0", b'{"time":"soon"}')
-        stranger.put(f"{public.root}/left/log", b'{"instance":"\xff"}')
-        stranger.put(f"{public.root}/left/log", b"\xff" * 100)
-        for key in (keys.frames("left", "right"), keys.frames("right", "@record"), keys.progress("left")):
-            for payload in (
-                b"",
-                b"\x01",
-                bytes(HEADER.size - 1),
-                HEADER.pack(FRAME, 99, 1, 0),
-                HEADER.pack(77, 0, 0, 0),
-            ):
-                stranger.put(key, payload)
-            stranger.session.delete(key)
-
+        all_refused(stranger)
         wait_until(lambda: stranger.refused() >= 40, "refused messages")
         assert "was refused" in launched.errors
     assert_unharmed(place, config, launched)
-
-
-def keys_of(stranger: Stranger) -> list[str]:
-    """Every key of the mesh that means something to one of its processes."""
-    public, keys = stranger.public, stranger.keys
-    nodes = ["left", "right", "free", "@record", "@mesh", "nobody"]
-    of_nodes = [key(node) for key in (keys.node, keys.ready, keys.report, keys.hello, keys.progress) for node in nodes]
-    frames = [keys.frames(source, target) for source in ("left", "right") for target in nodes]
-    views = [public.mesh_key(what) for what in ("info", "status", "plan", "command")]
-    of_left = [
-        f"{public.root}/left/{what}"
-        for what in ("info", "status", "log", "out/y", "set/u", "set/k", "set", "in/u", "param/k")
-    ]
-    return [public.register, keys.master, *of_nodes, *frames, *keys.grants(nodes).values(), *views, *of_left]
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
-    max_leaves=8,
-).map(lambda value: json.dumps(value).encode())
-HEADERS = st.builds(
-    lambda kind, link, count, point, rest: HEADER.pack(kind, link, count, point) + rest,
-    st.integers(9, 255),  # what is right in every respect is for access control
-    st.integers(0, 2**32 - 1),
-    st.integers(0, 2**32 - 1),
-    st.integers(-(2**63), 2**63 - 1),
-    st.binary(max_size=64),
-)
-PAYLOADS = st.none() | st.binary(max_size=HEADER.size - 1) | JSON | HEADERS | st.just(b"[" * 5000)
-WILDCARDS = st.sampled_from(["@sync/**", "@sync/*/**", "**", "*/*", "*/**", "@sync/*/report/**", "@sync/*/frame/**"])
 
 
 @WAYS
 def test_no_bytes_on_any_key_do_harm(place: Place, *, shared_memory: bool) -> None:
     config = config_of(place, shared_memory=shared_memory)
     with paused(place, config) as (launched, stranger):
-        known = st.sampled_from(keys_of(stranger))
-        wild = WILDCARDS.map(lambda rest: f"{stranger.public.root}/{rest}")
-        run = f"/{stranger.keys.run}/"
-        of_any_run = known.map(lambda key: key.replace(run, "/*/"))
-
-        @settings(max_examples=400, deadline=None, database=None, suppress_health_check=list(HealthCheck))
-        @given(known | wild | of_any_run, PAYLOADS, st.none() | st.binary(max_size=40) | JSON, st.booleans())
-        def send(key: str, payload: bytes | None, attachment: bytes | None, asks: bool) -> None:  # noqa: FBT001  hypothesis draws it
-            if asks:
-                stranger.session.get(key, payload=payload, attachment=attachment, timeout=DEADLINE_S)
-            elif payload is None:
-                stranger.session.delete(key)
-            elif not key.endswith(("in/u", "param/k")):  # a value that fits is rightly taken
-                stranger.put(key, payload, attachment)
-
-        send()
+        any_bytes(stranger)
         wait_until(lambda: stranger.refused() >= 40, "40 refused messages")
     assert_unharmed(place, config, launched)
 
@@ -207,21 +101,9 @@ def test_no_bytes_on_any_key_do_harm(place: Place, *, shared_memory: bool) -> No
 @WAYS
 def test_what_is_right_in_every_respect_but_its_key_is_refused(place: Place, *, shared_memory: bool) -> None:
     config = config_of(place, shared_memory=shared_memory)
-    error = ErrorReport("StepFailed", "a lie", 3, instance="left", point=0)
     with paused(place, config) as (launched, stranger):
-        root = stranger.public.root
-        for kind in (GRANT, FINISH, ABORT, PROGRESS, LAST):
-            for node in ("left", "right", "@record", "@mesh"):
-                message = HEADER.pack(kind, 0, 0, FAR) + (msgspec.json.encode(error) if kind == ABORT else b"")
-                for key in (f"{root}/@sync/*/**/to={node}", f"{root}/@sync/{stranger.keys.run}/x/to={node}"):
-                    stranger.put(key, message)
-        for report in (NodeReport("left", 0), NodeReport("left", 0, error)):
-            assert stranger.ask(f"{root}/@sync/*/report/of=left", msgspec.json.encode(report))
-            assert stranger.ask(f"{root}/@sync/**", msgspec.json.encode(report))
-        assert stranger.ask(f"{root}/@sync/*/report/of=nobody", msgspec.json.encode(NodeReport("nobody", 0)))
-        # Whose token a stranger takes back is there all the same; that of the recorder is in the session that looks.
-        for key in (stranger.keys.node("left"), stranger.keys.node("@record"), stranger.keys.master):
-            stranger.session.liveliness().declare_token(key).undeclare()
+        other_keys(stranger)
+        all_refused(stranger)
     assert_unharmed(place, config, launched)
 
 
@@ -234,13 +116,10 @@ def test_no_stranger_reports_the_end_of_a_node(place: Place, *, shared_memory: b
     with paused(place, config) as (launched, stranger):
         place.run("step", "pair", "500")
         wait_until(lambda: json.loads(place.run("status", "pair", "--json").output)["point"] == 500, "point 500")
-        for point in (0, 100, 500, 1500, 2000):  # of the past, now, and beyond what is granted
-            for kind in ("TerminationRequested", "NotFinite", "StepFailed", "MeshLost"):
-                error = ErrorReport(kind, "that is all", 3, instance="left", point=point, time=point / 1000)
-                for report in (NodeReport("left", point, error), NodeReport("left", point)):
-                    [refusal] = stranger.ask(stranger.keys.report("left"), msgspec.json.encode(report))
-                    assert refusal == "its sender is not the process that has registered"
-        assert stranger.ask(stranger.keys.report("@record"), msgspec.json.encode(NodeReport("@record", 100)))
+        reports(stranger)
+        all_refused(stranger)
+        refusals = {text for asked in stranger.asked if asked.key.endswith("of=left") for text in asked.refusals}
+        assert refusals == {"its sender is not the process that has registered"}
         assert stranger.refused() >= 41
     assert_unharmed(place, config, launched)
 
@@ -344,14 +223,7 @@ def test_ten_thousand_open_queries_of_a_client_end_no_run(place: Place, *, share
 def test_many_subscribers_and_tokens_of_a_stranger_do_no_harm(place: Place, *, shared_memory: bool) -> None:
     config = config_of(place, shared_memory=shared_memory)
     with paused(place, config) as (launched, stranger):
-        root, keys, session = stranger.public.root, stranger.keys, stranger.session
-        for key in (f"{root}/**", f"{root}/left/out/y", f"{keys.base}/**", f"{root}/mesh/log"):
-            for _ in range(500):
-                session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
-        for number in range(500):
-            session.liveliness().declare_token(f"{root}/x{number}")
-            session.liveliness().declare_token(keys.node("left")).undeclare()
-            session.liveliness().declare_token(keys.node(f"x{number}"))
+        many_declarations(stranger)
     assert_unharmed(place, config, launched)
 
 
@@ -395,33 +267,6 @@ def assert_no_row_is_wrong(place: Place, config: Path, launched: Launched, *name
     place.assert_nothing_left()
 
 
-def grant(stranger: Stranger) -> None:
-    for key in {*stranger.keys.grants(["left", "right", "free", "@record"]).values()}:
-        stranger.put(key, HEADER.pack(GRANT, 0, 0, FAR))
-
-
-def progress(stranger: Stranger) -> None:
-    for node in ("left", "right", "free", "@record"):
-        stranger.put(stranger.keys.progress(node), HEADER.pack(PROGRESS, 0, 0, 2000))
-
-
-def finish(stranger: Stranger) -> None:
-    for key in {*stranger.keys.grants(["left", "right", "free", "@record"]).values()}:
-        stranger.put(key, HEADER.pack(FINISH, 0, 0, 0))
-
-
-def abort(stranger: Stranger) -> None:
-    error = ErrorReport("StepFailed", "a lie", 3, instance="left", point=0)
-    for key in {*stranger.keys.grants(["left", "right", "free", "@record"]).values()}:
-        stranger.put(key, HEADER.pack(ABORT, 0, 0, 0) + msgspec.json.encode(error))
-
-
-def too_many_rows(stranger: Stranger) -> None:
-    rows = 1 << 20  # more than its ring has
-    for index in range(5):
-        stranger.put(stranger.keys.frames("left", "right"), HEADER.pack(FRAME, index, rows, 0) + bytes(8 * rows))
-
-
 @pytest.mark.parametrize(
     ("forge", "names"),
     [
@@ -429,12 +274,13 @@ def too_many_rows(stranger: Stranger) -> None:
         (finish, ("says that it has ended at point 0, and the master has granted point ",)),
         (abort, (" was lost",)),
         (progress, ("says that it is at point 2000, and the master has granted point ",)),
+        (few_wrong_rows, ("the values of 'left' came twice and differ",)),
         (too_many_rows, ("'left' sends its values up to point 1048575 to node 'right', more than was granted",)),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_a_registered_peer_that_breaks_the_protocol_ends_run_with_both_names(
-    place: Place, forge: Callable[[Stranger], None], names: tuple[str, ...]
+    place: Place, forge: Attack, names: tuple[str, ...]
 ) -> None:
     """A forgery that is sent exactly as a peer sends its messages cannot be told from a peer; it must do no harm."""
     config = config_of(place, shared_memory=False)
@@ -548,13 +394,3 @@ def test_whoever_rings_bells_and_writes_needs_delays_run_and_changes_no_number(p
         for number in range(len(intruder.map.processes)):
             intruder.write(intruder.map.bells + 64 * number, number + 1)
     assert_unharmed(place, config, launched)
-
-
-def test_a_forged_value_is_found_when_the_real_peer_sends_its_value(place: Place) -> None:
-    config = config_of(place, shared_memory=False)
-    with paused(place, config) as (launched, stranger):
-        for index in range(5):
-            message = HEADER.pack(FRAME, index, 2, 0) + b"\x3f" * 16
-            stranger.put(stranger.keys.frames("left", "right"), message)
-        place.run("resume", "pair")
-    assert_ends_with_names(place, config, launched, "the values of 'left' came twice and differ")

@@ -7,7 +7,6 @@ message of the same link has come, so nothing is on its way any more.
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -18,12 +17,15 @@ import pytest
 import zenoh
 
 from fmu_mesh.cli.main import main
-from fmu_mesh.wire.security.identity import CA, CERTIFICATE, KEY, Role
-from fmu_mesh.wire.security.rules import ACTIONS, access_control
-from tests.helpers import wait_until
+from fmu_mesh.wire.security.identity import Role
+from fmu_mesh.wire.security.rules import ACTIONS
+from fmu_mesh.wire.session import Wiring, open_session
+from tests.helpers import Place, wait_until
+from tests.visitors import DIALS, free_endpoint, opened, secured_router
 
 pytest.importorskip("cryptography")
 from fmu_mesh.wire.security.authority import Authority
+from fmu_mesh.wire.security.certificates import identity_in
 
 ROOT: Final = "fmu_mesh/pair"
 ROLES: Final[dict[str, Role]] = {
@@ -117,8 +119,7 @@ TOKENS: Final = {"**/mesh": SEES, f"{ROOT}/*": SEES, f"{ROOT}/mesh": SEES, f"{RO
 FOREIGN: Final = {"plant/flow": ACTS, "twin/y": ACTS, "plant/other": NOBODY, "other/pair/pump/set/u": NOBODY}
 FOREIGN_READ: Final = {"plant/flow": SEES, "twin/y": SEES, "plant/other": NOBODY, "**": NOBODY, "@/**": NOBODY}
 
-Way = Literal["direct", "router"]
-Opened = Callable[..., zenoh.Session]
+Way = Literal["direct", "quic", "router"]
 
 
 @pytest.fixture(scope="module")
@@ -127,31 +128,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     authority = Authority.made(tmp_path_factory.mktemp("lab") / "lab")
     for name, role in ROLES.items():
         authority.add(name, role, 2.0)
-    authority.add(MALLORY, "operator", 2.0)
-    return authority.folder
-
-
-def opened(folder: Path, mode: str, **settings: object) -> zenoh.Session:
-    """A plain session with the certificate of a folder."""
-    config, own = zenoh.Config(), {name: str(folder / name) for name in (CA, CERTIFICATE, KEY)}
-    tls = {
-        "root_ca_certificate": own[CA],
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        **{f"{end}_certificate": own[CERTIFICATE] for end in ("listen", "connect")},
-        **{f"{end}_private_key": own[KEY] for end in ("listen", "connect")},
-    }
-    scouting = {f"scouting/{kind}/enabled": False for kind in ("multicast", "gossip")}
-    ends: dict[str, list[str]] = {"listen/endpoints": [], "connect/endpoints": []}
-    for key, value in {"mode": mode, **ends, "transport/link/tls": tls, **scouting, **settings}.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tls/127.0.0.1:{probe.getsockname()[1]}"
+    kept = authority.add(MALLORY, "operator", 2.0).rename(authority.folder / "kept")
+    authority.remove(MALLORY)
+    return kept.rename(authority.folder / MALLORY).parent
 
 
 class Mesh:
@@ -201,39 +180,43 @@ class Visitor:
 
 
 @contextmanager
-def meeting(lab: Path, way: Way, mode: str, name: str) -> Iterator[tuple[Mesh, Visitor]]:
-    """A mesh that listens with the rules, or behind a router with them, and a visitor."""
-    endpoint = free_endpoint()
+def meeting(place: Place, lab: Path, way: Way, mode: str, name: str) -> Iterator[tuple[Mesh, Visitor]]:
+    """A mesh that listens with the rules, or behind our router with them, and a visitor."""
     with ExitStack() as stack:
 
-        def session(whose: str, own_mode: str, **settings: object) -> zenoh.Session:
-            own = opened(lab / whose, own_mode, **settings)
+        def session(whose: str, own_mode: str) -> zenoh.Session:
+            own = opened(lab / whose, own_mode, **{"connect/endpoints": [endpoint]})
             stack.callback(own.close)
             return own
 
-        listens = {"listen/endpoints": [endpoint]}
-        if way == "direct":
-            rules = access_control(ROOT, ROLES, ENDS)
-            mesh = Mesh(session("lab", "peer", **listens, access_control=rules))
+        if way != "router":
+            endpoint = free_endpoint("quic" if way == "quic" else "tls")
+            wiring = Wiring(listen=(endpoint,), identity=identity_in(lab / "lab"), root=ROOT, ends=ENDS)
+            own = open_session(wiring)
+            stack.callback(own.close)
+            mesh = Mesh(own)
         else:
-            session("lab", "router", **listens, access_control=access_control("fmu_mesh/*", ROLES, ENDS))
-            mesh = Mesh(session("lab", "client", **{"connect/endpoints": [endpoint]}))
-        visitor = Visitor(session(name, mode, **{"connect/endpoints": [endpoint]}), name)
+            _, endpoint = secured_router(place, lab / "lab", *ENDS)
+            mesh = Mesh(session("lab", "client"))
+        visitor = Visitor(session(name, mode), name)
         wait_until(lambda: visitor.answered(f"{ROOT}/mesh/hello"), "the mesh")
         yield mesh, visitor
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
-@pytest.mark.parametrize("mode", ["client", "peer", "router"])
-@pytest.mark.parametrize("way", ["direct", "router"])
-def test_each_role_does_what_the_table_says_and_nothing_else(lab: Path, way: Way, mode: str, name: str) -> None:
+@pytest.mark.parametrize(
+    ("way", "mode"), [("quic", "client"), *((way, mode) for way in ("direct", "router") for mode in DIALS)]
+)
+def test_each_role_does_what_the_table_says_and_nothing_else(
+    place: Place, lab: Path, way: Way, mode: str, name: str
+) -> None:
     def below(table: Mapping[str, frozenset[str]]) -> dict[str, bool]:
         return {f"{ROOT}/{key}": name in names for key, names in table.items()}
 
     def others(table: Mapping[str, frozenset[str]]) -> dict[str, bool]:
         return {key: name in names for key, names in table.items()}
 
-    with meeting(lab, way, mode, name) as (mesh, visitor):
+    with meeting(place, lab, way, mode, name) as (mesh, visitor):
         cells = Cells(mesh, visitor)
         wrong = [
             f"{attempt.__name__} {key}: {'does not work' if allowed else 'works'}"
@@ -322,15 +305,34 @@ class Cells:
             return any(reply.ok is not None for reply in replies)
 
 
-def test_the_rules_for_another_router_are_those_of_ours(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["security", "show", str(lab), "--zenohd"]) == 0
-    printed = capsys.readouterr().out
-    other = zenoh.Config.from_json5(printed)
+@pytest.mark.parametrize("options", [(), ("--end", "plant/flow", "--end", "twin/y", "--key-prefix", "plants")])
+def test_the_rules_for_another_router_are_those_of_ours(
+    lab: Path, options: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours: list[zenoh.Config] = []
 
-    ours = zenoh.Config()
-    ours.insert_json5("access_control", json.dumps(access_control("fmu_mesh/*", {**ROLES, MALLORY: "operator"})))
-    assert json.loads(other.get_json("access_control")) == json.loads(ours.get_json("access_control"))
-    assert json.loads(other.get_json("access_control/default_permission")) == "deny"
+    def open_none(config: zenoh.Config) -> zenoh.Session:
+        ours.append(config)
+        raise zenoh.ZError("not now")
+
+    monkeypatch.setattr(zenoh, "open", open_none)
+    assert main(["router", "--listen", free_endpoint(), "--security", str(lab / "lab"), *options]) == 2
+    assert "not now" in capsys.readouterr().err
+    assert main(["security", "show", str(lab), "--zenohd", *options]) == 0
+    theirs, empty = zenoh.Config.from_json5(printed := capsys.readouterr().out), zenoh.Config()
+
+    assert set(json.loads(printed)) == {section for section in RULING if differs(ours[0], empty, section)}
+    for section in RULING:
+        assert not differs(ours[0], theirs, section)
+    assert json.loads(theirs.get_json("access_control/default_permission")) == "deny"
+
+
+RULING: Final = ("access_control", "downsampling", "low_pass_filter")
+"""The sections of a configuration of Zenoh that are for messages of others."""
+
+
+def differs(first: zenoh.Config, second: zenoh.Config, section: str) -> bool:
+    return bool(json.loads(first.get_json(section)) != json.loads(second.get_json(section)))
 
 
 def test_the_printed_table_has_every_action_with_its_roles(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:

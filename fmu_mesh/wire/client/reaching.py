@@ -6,11 +6,13 @@ in client mode: they connect to the master, which routes their messages to and f
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar, cast, get_args
 
@@ -31,6 +33,8 @@ if TYPE_CHECKING:  # as above
     from ..security.identity import Identity
 
 __all__ = ["Meshes"]
+
+log = logging.getLogger(__name__)
 
 # Threads: a session is opened on a thread of its own (`_Opening`), so that one mesh that does not answer does not
 # hold the others, and no wait is longer than its deadline; the thread is a daemon, because what it waits for cannot
@@ -290,9 +294,15 @@ class _Opening:
     def _identity(self) -> Identity | None:
         """The certificate with which this process comes."""
         from ..security.certificates import identity_in  # noqa: PLC0415  most meshes need no certificate
+        from ..security.identity import warnings_about  # noqa: PLC0415  as above
 
         folder = given_folder(self._security)
-        return identity_in(folder) if folder is not None and not self._wiring.insecure else None
+        if folder is None or self._wiring.insecure:
+            return None
+        own = identity_in(folder)
+        for text in warnings_about(own):
+            _tell(text)
+        return own
 
     def _silence(self) -> DeadlineExceeded:
         where = ", ".join(self._wiring.connect)
@@ -300,6 +310,12 @@ class _Opening:
             f"{self._else} at {where} within {self._timeout_s:g} s.",
             hint="`launch` and `ls` show where a mesh can be reached, on the host where it runs.",
         )
+
+
+@cache
+def _tell(text: str) -> None:
+    """Once in a process, which may look for meshes again and again."""
+    log.warning("%s", text)
 
 
 class _Found(NamedTuple):

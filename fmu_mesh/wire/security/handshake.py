@@ -19,13 +19,14 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 
+from ...config.access_sections import host_of, port_of
 from ...errors import ConfigurationError, MeshLost
 from .identity import Identity
 
 if TYPE_CHECKING:
     from cryptography.x509 import Certificate
 
-__all__ = ["check_link", "host_and_port", "shake_hands"]
+__all__ = ["check_link", "shake_hands"]
 
 _DEADLINE_S: Final = 1.9
 _DIAL_S: Final = 0.1
@@ -49,13 +50,6 @@ _BY_ALERT: Final = {
 """What the other end says of our certificate."""
 
 
-def host_and_port(endpoint: str) -> tuple[str, int]:
-    """The address of `tls/host:port`."""
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    host, _, port = address.rpartition(":")
-    return host.strip("[]"), int(port)
-
-
 def check_link(endpoint: str, own: Identity | None) -> None:
     """Shake hands with who listens at an endpoint, and hang up.
 
@@ -69,7 +63,7 @@ def check_link(endpoint: str, own: Identity | None) -> None:
     """
     if not endpoint.startswith(("tls/", "quic/")):
         return
-    (host, port), quic = host_and_port(endpoint), endpoint.startswith("quic/")
+    host, port, quic = host_of(endpoint), port_of(endpoint), endpoint.startswith("quic/")
     end = time.monotonic() + _DEADLINE_S
     try:
         with _connection(host, port, end, socket.SOCK_DGRAM if quic else socket.SOCK_STREAM) as connection:

@@ -27,6 +27,7 @@ __all__ = [
     "Role",
     "RoleTable",
     "ends_soon",
+    "other_table",
     "time_left",
     "warnings_about",
     "wrong_name",
@@ -109,6 +110,15 @@ def wrong_name(name: str) -> str | None:
     if not _NAME.fullmatch(name):
         return "expected 1 to 64 letters, digits, `.`, `_` and `-`, beginning with a letter or a digit"
     return f"'{LOCAL}' is who comes by the Unix socket of a mesh" if name.lower() == LOCAL else None
+
+
+def other_table(own: int, theirs: int) -> str:
+    """What to do where two processes of a mesh have tables of roles with other numbers."""
+    which, whose = ("this one", "this host") if own < theirs else ("that one", "the host of the master")
+    return (
+        f"here is table {own} of roles, and at the master table {theirs}: {which} is older. Copy the newest {ROLES} "
+        f"from the folder of {whose} at the authority to {whose}; the next start takes it"
+    )
 
 
 def time_left(until: datetime) -> str:
