@@ -21,7 +21,7 @@ from fmu_mesh.errors import MeshLost
 from fmu_mesh.wire.messages import MAX_MESSAGE_SIZE
 from fmu_mesh.wire.session import Wiring, close_session, matches, open_session
 from tests.helpers import DEADLINE_S, Place, wait_until
-from tests.security.test_roles import free_endpoint, opened
+from tests.visitors import free_endpoint, opened
 
 pytest.importorskip("cryptography")
 from fmu_mesh.wire.security.authority import Authority
