@@ -40,6 +40,7 @@ KEYS: Final = 200
 
 _ROOT: Final = "fmu_mesh/flood"
 _EVERY: Final = 100
+_MOST_S: Final = 600.0
 _expected: Final[dict[tuple[int, float], str]] = {}
 _LARGE: Final = 100_000_000
 _CONNECTIONS: Final = 200
@@ -261,9 +262,9 @@ def flooded(flood: str | None, way: str, points: int, factor: float, seen: Flood
 
 def _most(mesh: Launched, listener: Sequence[psutil.Process], before: int) -> int:
     """Wait for the end of a mesh, and return what its processes had at most beyond ``before``, in bytes."""
-    most, pause = 0, threading.Event()
+    most, pause, end = 0, threading.Event(), time.monotonic() + _MOST_S
     with suppress(psutil.Error):
-        while mesh.running and mesh.output.count("points in") == 0:
+        while mesh.running and mesh.output.count("points in") == 0 and time.monotonic() < end:
             most = max(most, sum(own.memory_info().rss for own in listener) - before)
             pause.wait(0.01)
     return most

@@ -56,7 +56,7 @@ _LAST_ROWS_S = 1.0
 _LAST_WORDS_S = 0.5
 _STREAM_SHARE = 4.0
 _FLOOD = 8
-"""Where so many jobs wait, all of them get a share of the node's time, and steps the rest."""
+"""Where more jobs wait, those for others get a share of the node's time, and steps the rest."""
 _EARLY_LINES = 1000
 """Largest number of log messages that are kept until this node has joined the mesh."""
 
@@ -94,13 +94,13 @@ class NodeServer:
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self.keys = KeyEnds(plan.node, plan.timeouts, session, inbox.post, self.log_message, tell)
-        self._answers = Answers(plan, inbox, activity, self._jobs.put, self._publish_log, tell)
+        self._answers = Answers(plan, inbox, activity, self._serve_others, self._publish_log, tell)
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None] | zenoh.LivelinessToken] = []
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._early_lines: list[LogLine] = []
         self._visible = threading.Event()
-        self._closing = threading.Event()
+        self._closing, self._hurries = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
         self._thread.start()
 
@@ -168,6 +168,7 @@ class NodeServer:
         """Publish what is waiting, for a second at most, and undeclare everything."""
         if self._closing.is_set():
             return
+        self._hurries.set()
         self._jobs.put(None)
         self._thread.join(_LAST_ROWS_S)
         self._closing.set()
@@ -185,11 +186,8 @@ class NodeServer:
                 if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
                     self._answers.tell_refused()
                     return
-                began = time.monotonic()
                 with self._inbox.refusals.guard("a query or a value"):
                     job()
-                if self._jobs.qsize() > _FLOOD:
-                    self._closing.wait(_STREAM_SHARE * (time.monotonic() - began))
             now = time.monotonic()
             if self._searches and now >= self._next_search:
                 self._search()
@@ -212,13 +210,24 @@ class NodeServer:
 
     # --- queries
 
+    def _serve_others(self, job: Job) -> None:
+        """From any thread: let the server's thread do something for somebody else; in a flood it rests after each."""
+
+        def serve() -> None:
+            began = time.monotonic()
+            job()
+            if self._jobs.qsize() > _FLOOD:
+                self._hurries.wait(_STREAM_SHARE * (time.monotonic() - began))
+
+        self._jobs.put(serve)
+
     def _declare(self) -> None:
         session = self._session
         try:
             for name in (instance.name for instance in self._plan.instances):
                 root = self._names.instance(name)
                 self._entities.append(session.liveliness().declare_token(root))
-                take = self._inbox.refusals.answering(partial(self._answer, name), self._jobs.put)
+                take = self._inbox.refusals.answering(partial(self._answer, name), self._serve_others)
                 for key in (f"{root}/**", *([f"{root}/set/{BY}/**"] if self._plan.secured else ())):
                     self._entities.append(session.declare_queryable(key, take))
                 publisher = partial(session.declare_publisher, encoding=json_encoding)
@@ -244,6 +253,7 @@ class NodeServer:
         With ``heard``, wait as long again for any answer of the master: then it has them.
         """
         said = threading.Event()
+        self._hurries.set()
         self._jobs.put(said.set)
         said.wait(_LAST_WORDS_S)
         if heard:
