@@ -91,9 +91,9 @@ def scene(place: Place, way: Way) -> Iterator[Scene]:
         (visitor / CA).write_bytes((folder / CA).read_bytes())
 
     ca = load_pem_x509_certificate((folder / CA).read_bytes())
-    key = load_pem_private_key((folder / CA_KEY).read_bytes(), None)
-    assert isinstance(key, EllipticCurvePrivateKey)
-    write_folder(folder / "nameless", Signer(ca, key), [])
+    ca_key = load_pem_private_key((folder / CA_KEY).read_bytes(), None)
+    assert isinstance(ca_key, EllipticCurvePrivateKey)
+    write_folder(folder / "nameless", Signer(ca, ca_key), [])
 
     with ExitStack() as stack:
         door: dict[str, object] = {"listen": ["tls/127.0.0.1:0"]}
