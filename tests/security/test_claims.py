@@ -219,3 +219,18 @@ def test_joins_and_acts_of_names_are_in_the_audit_of_the_result(place: Place, wa
     ]
     kept = Result.read(own.config.with_suffix(".csv")).metadata["audit"]["entries"]
     assert msgspec.convert(kept, list[AuditEntry])[: len(told)] == told
+
+
+def test_who_joins_again_and_again_is_one_entry_and_one_line(place: Place) -> None:
+    with scene(place, "direct") as own:
+        for _ in range(20):
+            with dialled(own, "bob", "client") as bob:
+                [seen] = bob.get(f"{ROOT}/mesh/audit", timeout=DEADLINE_S)
+                assert seen.ok is not None
+
+        def of_bob() -> list[int]:
+            return [entry.number for entry in entries(own) if (entry.what, entry.who) == ("joined", "bob")]
+
+        wait_until(lambda: of_bob() == [20], "20 joins in one entry")
+        lines = [payload for key, payload in own.heard if key == f"{ROOT}/mesh/log" and b"bob joined" in payload]
+        assert len(lines) == 1
