@@ -48,6 +48,7 @@ BLOCKS = {
     "far": "benchmarks.far",
     "ros topics": "benchmarks.ros_topics",
     "live data": "benchmarks.live_data",
+    "floods": "benchmarks.floods",
     "recording": "benchmarks.recording",
     "formats": "benchmarks.formats",
     "scale": "benchmarks.scale",

@@ -319,9 +319,12 @@ def variables_of_instance(loaded: LoadedConfig, name: str) -> tuple[Variable, ..
     section = loaded.config.instances.get(name)
     if section is None or section.runs_code:
         return ()
-    return describe(loaded.resolve(section.path), section, loaded.config.limits).variables
+    path = loaded.resolve(section.path)
+    return variables_of_fmu(path) if section.follows_fmi else describe(path, section, loaded.config.limits).variables
 
 
 def variables_of_fmu(path: Path) -> tuple[Variable, ...]:
-    """The variables of an FMU."""
-    return describe(path, msgspec.convert({KIND: "fmu", "fmu": str(path)}, KINDS.section("fmu"))).variables
+    """The variables of an FMU, which is not compiled."""
+    from ..instances.fmi.archive.reading import read_description  # noqa: PLC0415  as above
+
+    return read_description(path, to_run=False).variables

@@ -29,12 +29,12 @@ from .mesh_builder import Mesh
 from .result import Result
 from .run_handle import Run
 
-__all__ = ["PlannedRerun", "planned_rerun", "rerun"]
+__all__ = ["ALONE", "PlannedRerun", "planned_rerun", "rerun"]
 
 log = logging.getLogger("fmu_mesh.run")
 
 _SET = "set"
-_ALONE: Mapping[str, Any] = {
+ALONE: Mapping[str, Any] = {
     "zenoh": {"mode": "peer", "listen": [], "connect": [], "rows_address": None, "config": None},
     "ros": None,
     "security": None,
@@ -117,7 +117,7 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     output = Path(options.output) if options.output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
     if output.absolute() == path.absolute():
         raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with `output=...`.")
-    data = {**metadata.configuration, **_ALONE}
+    data = {**metadata.configuration, **ALONE}
     sections = data.get("record") or {}
     section = sections[metadata.section] if isinstance(sections, list) else sections
     data["record"] = {**section, "file": str(output.absolute())}

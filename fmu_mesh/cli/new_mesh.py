@@ -21,12 +21,12 @@ from .. import files
 from ..config.findings import Findings
 from ..config.instance_sections import KIND
 from ..config.loading import read_text
-from ..config.mesh import ConnectionConfig
+from ..config.mesh import ConnectionConfig, LimitsConfig
 from ..config.structure import SCHEMA_ID, schema_text
 from ..config.yaml_text import read
 from ..errors import ConfigurationError, LoadFailed
 from ..instances.configuration import installed_config
-from ..instances.registry import KINDS, describe
+from ..instances.registry import KINDS, describe, needs_compiler
 from ..run.options import PlanOptions
 from ..run.preparing import planned
 from ..simtime import steps_between
@@ -66,7 +66,7 @@ def _new(arguments: argparse.Namespace) -> int:
     schema = file.with_suffix(".schema.json")
     if not arguments.force:
         _refuse_to_overwrite(file, schema)
-    models = _models(paths, file.absolute().parent, quiet=arguments.quiet)
+    models = _models(paths, arguments.models, file.absolute().parent, quiet=arguments.quiet)
     text = configuration_for(models, mesh=_name(file.absolute().parent.name, ()), file=file, schema=schema.name)
     plan = planned(read_text(text, file), PlanOptions()).plan
     files.write_whole(file, text)
@@ -104,13 +104,16 @@ def _fmus(given: Sequence[Path]) -> list[Path]:
     return found
 
 
-def _models(paths: Sequence[Path], folder: Path, *, quiet: bool) -> list[Model]:
+def _models(paths: Sequence[Path], named: Sequence[Path], folder: Path, *, quiet: bool) -> list[Model]:
     models: list[Model] = []
     for path in paths:
         name = _name(path.stem, {_RESERVED, *(model.name for model in models)})
         absolute = path.absolute()
         written = os.path.relpath(absolute, folder)
         section = msgspec.convert({KIND: "fmu", "fmu": str(absolute)}, KINDS.section("fmu"))
+        if path not in named and needs_compiler(absolute, section, LimitsConfig()):
+            models.append(Model(name, written, None, "sources are compiled only if you name the file itself"))
+            continue
         try:
             models.append(Model(name, written, describe(absolute, section, tell=teller(quiet=quiet))))
         except LoadFailed as error:

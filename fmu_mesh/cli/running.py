@@ -208,6 +208,8 @@ def _router(arguments: argparse.Namespace) -> int:
         _refusals_told() if wiring.identity is not None else nullcontext(),
         run_router(wiring) as where,
     ):
+        for _, text in why_open({"--listen": wiring.listen}, secured=wiring.identity is not None):
+            say_warning(text)
         print(f"router at {', '.join(where)}", flush=True)
         stop.wait()
     sys.stdout.flush()
@@ -215,7 +217,7 @@ def _router(arguments: argparse.Namespace) -> int:
 
 
 def _router_wiring(arguments: argparse.Namespace) -> Wiring:
-    """Where a router listens, and who may do what there; warns of what is open to others."""
+    """Where a router listens, and who may do what there; warns of a certificate that ends soon."""
     if arguments.insecure and arguments.security is not None:
         raise ConfigurationError("--security and --insecure do not go together", hint="Leave one of them out.")
     listen = tuple(arguments.listen or ["tcp/127.0.0.1:7447"])
@@ -228,8 +230,6 @@ def _router_wiring(arguments: argparse.Namespace) -> Wiring:
         own = identity_in(folder)
         for text in warnings_about(own):
             say_warning(text)
-    for _, text in why_open({"--listen": listen}, secured=own is not None):
-        say_warning(text)
     root, ends = f"{arguments.key_prefix}/*", tuple(arguments.end)
     return Wiring(listen=listen, insecure=arguments.insecure, identity=own, root=root, ends=ends)
 

@@ -70,7 +70,7 @@ def _wait(arguments: argparse.Namespace) -> int:
 
 def _logs(arguments: argparse.Namespace) -> int:
     with attach(arguments.mesh, **reach(arguments)) as run:
-        if arguments.instance is not None and arguments.instance not in (names := run.info().instances):
+        if arguments.instance not in {None, "mesh"} and arguments.instance not in (names := run.info().instances):
             hint = did_you_mean(arguments.instance, names, f"There are: {listed(names)}.")
             raise ConfigurationError(f"mesh '{run.name}' has no instance '{arguments.instance}'.", hint=hint)
         if arguments.audit:

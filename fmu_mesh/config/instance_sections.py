@@ -266,8 +266,12 @@ def keys_of(section: type[InstanceSection]) -> tuple[str, ...]:
     return cast("type[msgspec.Struct]", section).__struct_fields__
 
 
-def placed(section: InstanceSection, not_finite: Literal["stop", "record"] | None = None) -> InstanceSection:
-    """A section without the common keys, which a plan has in fields of its own, but with what ``not_finite`` means."""
+def placed(
+    section: InstanceSection,
+    not_finite: Literal["stop", "record"] | None = None,
+    process: ProcessConfig | None = None,
+) -> InstanceSection:
+    """A section without the common keys, which a plan has in fields of its own, but with what those given here mean."""
     common: dict[str, Any] = {
         "start_values": {},
         "inputs": {},
@@ -275,7 +279,7 @@ def placed(section: InstanceSection, not_finite: Literal["stop", "record"] | Non
         "group": None,
         "host": None,
         "not_finite": not_finite,
-        "process": None,
+        "process": process,
     }
     return _replaced(section, common)
 

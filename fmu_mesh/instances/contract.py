@@ -156,6 +156,14 @@ class Kind(ABC, Generic[Section]):
             OSError, LoadFailed: a file cannot be read.
         """
 
+    def needs_compiler(self, path: Path, section: Section, limits: LimitsConfig) -> bool:
+        """Whether `describe` would compile what the model contains; no by default, and nothing is compiled here.
+
+        Raises:
+            LoadFailed: the model cannot be read.
+        """
+        return False
+
     def claims(self, path: Path, section: Section, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """What such an instance uses of which a process has only one; nothing by default.
 

@@ -7,6 +7,7 @@ are. A kind is imported when a configuration has its key, and what it needs when
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ __all__ = [
     "decode_section",
     "describe",
     "expected_model",
+    "needs_compiler",
     "open_instance",
     "preload",
     "prepare",
@@ -96,6 +98,13 @@ def describe(
 ) -> ModelDescription:
     """The model description of an instance; see `Kind.describe`."""
     return _kind_of(section).describe(path, section, limits, tell)
+
+
+def needs_compiler(path: Path, section: InstanceSection, limits: LimitsConfig) -> bool:
+    """Whether `describe` would compile something; see `Kind.needs_compiler`. No, where it would say what is wrong."""
+    with suppress(LoadFailed):
+        return _kind_of(section).needs_compiler(path, section, limits)
+    return False
 
 
 def content(path: Path, section: InstanceSection) -> str:

@@ -75,11 +75,11 @@ class Audit:
     def note(self, what: _What, who: str, key: str = "", text: str = "", point: int | None = None) -> None:
         """Add an entry of this moment, by default at the point of the mesh."""
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        who, key, text = who[:_LONGEST], key[:_LONGEST], text[:_LONGEST]
         self._add(AuditEntry(what, who, now, self._point() if point is None else point, key, text))
 
     def _add(self, new: AuditEntry, *, is_logged: bool = False) -> None:
         """One entry: values or refusals of one sender at one key, commands in a row, joins from one host."""
+        new = replace(new, who=new.who[:_LONGEST], key=new.key[:_LONGEST], text=new.text[:_LONGEST])
         with self._lock:
             if new.what == "commanded" and (new.who, new.text) != self._command[:2]:
                 self._command = new.who, new.text, str(self.changes)

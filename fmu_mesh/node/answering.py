@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -57,6 +58,9 @@ _OLD_KINDS: Final[tuple[VariableKind, ...]] = ("in", "param")
 """On the keys of such values they could be set, before there was a key for it; for two more minor versions."""
 
 _LOOKS = 3
+_FEW_PUT, _MOST_PUT = 8, 1 << 14
+"""Values that were put: so few are no flood, and no more than so many wait."""
+
 _MOST_WARNED = 100
 """Largest number of senders that are warned of."""
 
@@ -101,6 +105,7 @@ class Answers:
         self._before: list[Job] | None = []
         self._pending: list[_Pending] = []
         self._early: list[_Pending] = []
+        self._put: deque[tuple[Runner, zenoh.Sample]] = deque()
         self._without_time: set[str] = set()
         self._old: set[str] = set()
         self._refused: dict[tuple[str, str], AuditEntry] = {}
@@ -168,7 +173,17 @@ class Answers:
 
     def put_arrived(self, runner: Runner, sample: zenoh.Sample) -> None:
         """On a thread of Zenoh: accept a value that was put."""
-        self._post(partial(self._set, runner, sample))
+        if len(self._put) >= _MOST_PUT:
+            self._inbox.refusals.add(str(sample.key_expr), f"{_MOST_PUT} other values wait")
+        else:
+            self._put.append((runner, sample))
+            self._post(self._take_put)
+
+    def _take_put(self) -> None:
+        runner, sample = self._put.popleft()
+        if len(self._put) == _FEW_PUT:
+            self._inbox.post(lambda: None)  # wakes the main thread for those before: all that follow may be refused
+        self._set(runner, sample)
 
     def turn(self, now: float) -> None:
         """Answer queries that waited for the first point; refuse those that have waited too long for a point."""
@@ -247,7 +262,8 @@ class Answers:
             return
         if pending is not None:
             self._pending.append(pending)
-        self._inbox.post(take)
+        # Where more values wait, the last of them wake the main thread for all.
+        self._inbox.post(take, later=len(self._put) > _FEW_PUT)
 
     def _refuse(self, runner: Runner, sent: zenoh.Query | zenoh.Sample, pending: _Pending | None, reason: str) -> None:
         key, now, at = str(sent.key_expr), datetime.now(UTC).isoformat(timespec="milliseconds"), runner.point

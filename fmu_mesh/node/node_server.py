@@ -55,6 +55,8 @@ _LOOK_SHARE = 20
 _LAST_ROWS_S = 1.0
 _LAST_WORDS_S = 0.5
 _STREAM_SHARE = 4.0
+_FLOOD = 8
+"""Where so many jobs wait, all of them get a share of the node's time, and steps the rest."""
 _EARLY_LINES = 1000
 """Largest number of log messages that are kept until this node has joined the mesh."""
 
@@ -183,8 +185,11 @@ class NodeServer:
                 if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
                     self._answers.tell_refused()
                     return
+                began = time.monotonic()
                 with self._inbox.refusals.guard("a query or a value"):
                     job()
+                if self._jobs.qsize() > _FLOOD:
+                    self._closing.wait(_STREAM_SHARE * (time.monotonic() - began))
             now = time.monotonic()
             if self._searches and now >= self._next_search:
                 self._search()

@@ -97,6 +97,8 @@ _MOST_KEYS = 8 * MAX_TEXT_SIZE
 """How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 
 _FLUSH_S = 0.2
+_AUDIT_S = 10.0
+"""Time in s between two notes of the audit, but for the last one."""
 
 
 class Recorder:
@@ -131,7 +133,7 @@ class Recorder:
         audit: Callable[[], tuple[int, object]] = lambda: (0, None),
     ) -> None:
         self._plan = plan
-        self._mirror_of, self._audit, self._audited = mirror_of, audit, 0
+        self._mirror_of, self._audit, self._audited, self._audit_at = mirror_of, audit, 0, -math.inf
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
@@ -197,10 +199,11 @@ class Recorder:
             if message[1] in FOR_METADATA:
                 self._take(message)
 
-    def _note_audit(self) -> None:
+    def _note_audit(self, now: float = math.inf) -> None:
+        """Some formats keep all that was noted, so a stream of values is not noted whenever its number has changed."""
         changes, audit = self._audit()
-        if changes != self._audited:
-            self._audited = changes
+        if changes != self._audited and now - self._audit_at >= _AUDIT_S:
+            self._audited, self._audit_at = changes, now
             self._files.note({"audit": to_builtins(audit)})
 
     def _end(self, cause: BaseException | None) -> None:
@@ -259,7 +262,7 @@ class Recorder:
                 self._tell_progress()
                 if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
                     self._flushed = now
-                    self._note_audit()
+                    self._note_audit(now)
                     self._files.flush()
                     self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:

@@ -2,7 +2,9 @@
 
 A configuration of the user's own may name code. A result, the folder of a sweep, a package, and a configuration of
 another user may not, and code that other users can write does not run. `--allow-code` lifts both, and the user is told
-what runs. Models are no code in this sense: an FMU runs wherever it is named.
+what runs. Models are no code in this sense: an FMU runs wherever it is named. But its sources are compiled only where
+the user's own configuration, program or command names the FMU, or in its sandbox; one that is only looked at (by
+`inspect`, by `new` in a folder, by completion) is not compiled.
 """
 
 from __future__ import annotations
@@ -16,14 +18,22 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..config.findings import Findings
-from ..config.instance_sections import key_of
+from ..config.instance_sections import InstanceSection, key_of, placed
 from ..config.loading import LoadedConfig
+from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError
+from ..instances.registry import needs_compiler
 
 __all__ = ["check_code", "check_owner", "names_code"]
 
 
-def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], None], allowed: str) -> None:
+def check_code(
+    loaded: LoadedConfig,
+    findings: Findings,
+    tell: Callable[[str], None],
+    allowed: str,
+    compiles: Callable[[Path, InstanceSection, LimitsConfig], bool] = needs_compiler,
+) -> None:
     """Check that all code of a configuration may run: add a finding for each instance whose code may not.
 
     Args:
@@ -31,10 +41,17 @@ def check_code(loaded: LoadedConfig, findings: Findings, tell: Callable[[str], N
         findings: those of the configuration.
         tell: called with what runs only because it is allowed.
         allowed: why it is allowed, in words, such as "because of `allow_code=True`"; empty if it is not.
+        compiles: whether to describe a model compiles it.
     """
     source = loaded.foreign or _other_owner(loaded.file)
     for name, section in loaded.config.instances.items():
         if not section.runs_code:
+            is_apart = not section.follows_fmi or loaded.config.process_of(section).is_sandboxed
+            if not source or allowed or is_apart or not section.path:
+                continue
+            if compiles(loaded.resolve(section.path), placed(section), loaded.config.limits):
+                expected = "a binary for this platform, or `allow_code=True`"
+                findings.add(f"instances.{name}.{key_of(section)}", f"sources to compile, in {source}", expected)
             continue
         key, path = key_of(section), loaded.resolve(section.path) if section.path else None
         found, expected = f"Python code, in {source}", "a file of your own, or `allow_code=True`"

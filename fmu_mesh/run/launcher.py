@@ -166,7 +166,9 @@ class Launcher:
             node = self._run.plan.nodes[name]
             process: Process
             if node.process.is_sandboxed:
-                process = Sandboxed(node, self._folder, executed_command("node", self._file, name), self._is_own)
+                own, command = self._run.loaded.config.security, executed_command("node", self._file, name)
+                keys = own.folder if own is not None else None
+                process = Sandboxed(node, self._folder, command, self._is_own, keys)
             elif node.interpreter is not None and is_other_python(node.interpreter):
                 process = executed("node", self._file, name, interpreter=node.interpreter)
             else:

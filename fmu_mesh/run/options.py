@@ -26,7 +26,9 @@ Values = Mapping[str, Any] | Iterable[Any] | None
 File = str | Path | None
 Number = float | None
 
-AllowCode = Annotated[bool, Option("run Python code that a file of others names, or others can write", "--allow-code")]
+AllowCode = Annotated[
+    bool, Option("run Python code, and compile FMUs, that a file of others names, or others can write", "--allow-code")
+]
 OnNotice = Annotated[Callable[[str], None] | None, Option("called with a sentence before something that takes long")]
 Output = Annotated[File, Option("result file; its ending chooses the format", "--output", "FILE", "record.file")]
 StartValues = Annotated[Values, Option("start values by `instance.variable`", "--set", "INSTANCE.VARIABLE=VALUE")]

@@ -23,7 +23,7 @@ from ..errors import ConfigurationError, Finding, LoadFailed
 from ..instances.configuration import examine_data
 from ..instances.contract import Showing
 from ..instances.python.unit_names import base_unit_of
-from ..instances.registry import check_showing, claims, content, describe, expected_model
+from ..instances.registry import check_showing, claims, content, describe, expected_model, needs_compiler
 from ..results.formats import check_record, warn_of_endings
 from ..results.keys_file import KEYS_ENDING, keys_beside, recorded_keys
 from ..ros_wire.key_messages import check_messages
@@ -102,6 +102,10 @@ class KnownModels:
             return describe(path, section, limits, tell)
         return self._known("description", path, section, limits, lambda: describe(path, section, limits, tell))
 
+    def needs_compiler(self, path: Path, section: InstanceSection, limits: LimitsConfig) -> bool:
+        """Whether to describe a model compiles it."""
+        return self._known("compiling", path, section, limits, lambda: needs_compiler(path, section, limits))
+
     def claims(
         self, path: Path, section: InstanceSection, description: ModelDescription, limits: LimitsConfig
     ) -> Claims:
@@ -152,14 +156,15 @@ def planned(
         security = replace(security, folder=str(folder / security.folder))
     loaded = replace(loaded, config=replace(loaded.config, instances=located, security=security))
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
-    check_code(loaded, findings, tell, "because of `allow_code=True`" if options.allow_code else "")
+    known = known or KnownModels()
+    allowed = "because of `allow_code=True`" if options.allow_code else ""
+    check_code(loaded, findings, tell, allowed, known.needs_compiler)
     obstacles = loaded.findings()
     if not len(findings):  # otherwise the world may be what is wrong
         try:
             check_showing(loaded.config.instances, showing)
         except ConfigurationError as error:
             obstacles.add("`view=True`" if options.view else f"`video={options.video}`", str(error), "")
-    known = known or KnownModels()
     descriptions, unreadable = _descriptions(loaded, findings.places, tell, known)
     findings.merge(unreadable)
     warnings, topics = loaded.findings(), tuple[MeshTopic, ...]()
@@ -410,7 +415,9 @@ def _descriptions(
             if not any(f"{other}.".startswith(f"instances.{name}.") for other in known_places):
                 findings.append(loaded.finding(place, "an empty path", expected_model(section)))
             continue
-        path, own = loaded.resolve(section.path) if section.path else Path(), placed(section)
+        process = loaded.config.process_of(section)
+        own = placed(section, process=process if section.follows_fmi and process.is_sandboxed else None)
+        path = loaded.resolve(section.path) if section.path else Path()
         model = (path, msgspec.json.encode(own))
         if model not in cache:
             try:

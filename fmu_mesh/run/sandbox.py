@@ -29,6 +29,7 @@ from typing import Final
 import msgspec
 
 from .. import files
+from ..config.access_sections import given_folder
 from ..config.mesh import Config
 from ..system.plan import NodePlan
 from ..wire.host_processes import STATES, Answered, Asked, is_alive, is_stopped
@@ -82,18 +83,29 @@ class Sandboxed(subprocess.Popen[bytes]):
         folder: that of the run, where the node has a box.
         command: what starts it without a sandbox; its last argument comes here.
         is_of_run: whether a process belongs to the run.
+        security: the folder of the certificate of this host, which the node needs not; None: there is none.
     """
 
-    def __init__(self, node: NodePlan, folder: Path, command: Sequence[str], is_of_run: Callable[[int], bool]) -> None:
+    def __init__(
+        self,
+        node: NodePlan,
+        folder: Path,
+        command: Sequence[str],
+        is_of_run: Callable[[int], bool],
+        security: str | None = None,
+    ) -> None:
         self._is_of_run = is_of_run
         self._inside: int | None = None
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         box, runtime = box_of(folder, node.node), str(runtime_folder())
         prefix = ["bwrap", *_APART, *_system(), *_bound("--ro-bind", _of_models(node))]
+        if (own_keys := given_folder(security)) is not None:
+            prefix += _without_keys(own_keys)
         prefix += ["--perms", "0700", "--dir", runtime, *_bound("--ro-bind", [folder]), *_bound("--bind", [box])]
         own = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
         own |= {"HOME": str(box), "TMPDIR": _TEMPORARY, "FMU_MESH_RUNTIME_DIR": runtime, "SPT_NOENV": "1"}
+        own["FMU_MESH_CACHE_DIR"] = str(box / ".cache")  # what it compiles is for itself
         with theirs:
             super().__init__(
                 [*prefix, "--remount-ro", "/", "--chdir", str(box), *command, str(theirs.fileno())],
@@ -162,10 +174,19 @@ def _system() -> Iterator[str]:
 
 def _of_models(node: NodePlan) -> Iterator[Path]:
     """The files of the models of a node: an FMU alone, and of other kinds the folder, where further ones may be."""
-    yield files.cache_folder() / "sources"
     for item in node.instances:
         path = Path(item.fmu)
         yield (files.archive_on_the_way(path) or path) if item.section.follows_fmi else path.parent
+
+
+def _without_keys(folder: Path) -> Iterator[str]:
+    """The options that hide the keys of certificates, which may be in the folder of a model or below one of Python."""
+    from ..wire.security.identity import CA_KEY, KEY  # noqa: PLC0415  most runs have no certificate
+
+    real = folder.resolve()  # a link in a folder that is bound leads to where nothing is
+    for key in (*real.parent.glob(f"*/{KEY}"), real.parent / CA_KEY):
+        if key.exists():
+            yield from ("--ro-bind", os.devnull, str(key))
 
 
 def _bound(option: str, paths: Iterable[Path]) -> Iterator[str]:

@@ -31,6 +31,7 @@ import numpy as np
 from .. import __version__
 from ..api.mesh_builder import Mesh
 from ..api.repeated_mesh import RepeatedMesh
+from ..api.rerunning import ALONE
 from ..api.result import Result
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, NotInOneProcess, from_report
@@ -135,8 +136,10 @@ class _Loaded:
         self._task = msgspec.msgpack.decode(task, type=SweepTask, dec_hook=path_of)
         self._reductions = [read_reduction(text) for text in self._task.reductions]
         data = self._task.data
-        if isinstance(data, dict) and isinstance(records := data.get("record"), list):
-            data = {**data, "record": records[:1]}  # variants must not write into the same files
+        if isinstance(data, dict):  # variants must not listen at the same ports, nor write into the same files
+            data = {**data, **{name: ALONE[name] for name in ("zenoh", "runtime")}}
+            if isinstance(records := data.get("record"), list):
+                data["record"] = records[:1]
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
         self._jobs: _Jobs = SimpleQueue()
         self.hung = _Hung()

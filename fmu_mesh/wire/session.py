@@ -8,7 +8,7 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
@@ -188,7 +188,9 @@ def reason_of(error: zenoh.ZError) -> str:
 
 
 def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
-    endpoint = next((endpoint for endpoint in wiring.listen if endpoint in reason), None)
+    # Of TLS, the reason has the address and the port, and neither the protocol nor the name of the host.
+    ends = {endpoint: f":{endpoint.rpartition(':')[2]}:" for endpoint in wiring.listen}
+    endpoint = next((endpoint for endpoint, port in ends.items() if endpoint in reason or port in reason), None)
     if endpoint is None:
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
         return ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {reason}")
@@ -248,7 +250,7 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
             "close_link_on_expiration": True,
         }
     if own is not None and wiring.asks_itself:
-        settings |= _rules(own, wiring)
+        settings |= _rules(own, wiring, settings["qos/network"])
     elif wiring.asks_itself and json.loads(config.get_json("access_control/enabled")) is not True:
         settings["access_control"] = _ADMIN_SPACE_IS_OURS
     for key, value in settings.items():
@@ -256,14 +258,14 @@ def _configuration(wiring: Wiring) -> zenoh.Config:
     return config
 
 
-def _rules(own: Identity, wiring: Wiring) -> dict[str, Any]:
+def _rules(own: Identity, wiring: Wiring, priorities: Sequence[Any]) -> dict[str, Any]:
     """What Zenoh lets others do who come by a network: the place of all rules and limits for them."""
-    from .security.rules import access_control  # noqa: PLC0415  as above
+    from .security.rules import for_networks  # noqa: PLC0415  as above
 
     if own.table is None:
         text = f"'{own.name}' cannot listen: there are no roles in '{own.folder}'"
         raise ConfigurationError(text, hint="`security.roles` in the file, or roles.json in the folder, has them.")
-    return {"access_control": access_control(wiring.root, own.table.roles, wiring.ends)}
+    return for_networks(wiring.root, own.table.roles, wiring.ends, priorities)
 
 
 def close_session(session: zenoh.Session) -> None:

@@ -3,7 +3,7 @@
 Readers do not see the notes. There are four:
 
     <!-- not run: REASON -->    the block is not run; `test_pages.py` lists all of these
-    <!-- needs: MODULE -->      it is run where this Python module is installed
+    <!-- needs: MODULE -->      it is run where this Python module, or this program, is installed
     <!-- meanwhile -->          its command goes on while the blocks after it are run
     <!-- file: NAME -->         the block is a file that commands of any page name
 """

@@ -190,10 +190,23 @@ class FmuKind(Kind[FmuConfig]):
     def describe(
         self, path: Path, section: FmuConfig, limits: LimitsConfig, tell: Callable[[str], None]
     ) -> ModelDescription:
-        """Read the model description; compile the FMU if it has no binary for this platform."""
-        from .archive.sources import describe  # noqa: PLC0415  FMPy is slow to import
+        """Read the model description; compile the FMU if it has no binary for this platform.
 
-        return describe(path, Terms(limits, section.sha256), section.kind, tell)
+        What runs in a sandbox is compiled there: a source can include any file that the compiler can read.
+        """
+        from .archive.reading import read_description  # noqa: PLC0415  FMPy is slow to import
+        from .archive.sources import describe  # noqa: PLC0415  as above
+
+        terms = Terms(limits, section.sha256)
+        if section.process is not None and section.process.is_sandboxed:
+            return read_description(path, terms, section.kind)
+        return describe(path, terms, section.kind, tell)
+
+    def needs_compiler(self, path: Path, section: FmuConfig, limits: LimitsConfig) -> bool:
+        """Whether it has neither a binary for this platform, nor one that was compiled before."""
+        from .archive.sources import needs_compiler  # noqa: PLC0415  as above
+
+        return needs_compiler(path, Terms(limits, section.sha256), section.kind)
 
     def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
         """Look for the libraries of the system that the FMU needs."""

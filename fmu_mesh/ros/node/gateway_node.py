@@ -91,6 +91,7 @@ class GatewayNode:
         loaded = replace(loaded, config=replace(loaded.config, ros=section))
         with ExitStack() as stack:
             client = stack.enter_context(meshes_of(self._node, loaded, _TIMEOUT_S)).named(loaded.config.mesh)
+            client.check_may("a gateway to ROS", needs="node")
             info = client.info()
             infos = {name: client.instance_info(name) for name in info.instances}
             findings = loaded.findings()

@@ -231,14 +231,14 @@ class MeshClient:
         question = Question(self._command_key, self._who, limit_s, payload, who, once=True)
         return _understood(self._ask(question)[0], CommandAnswer, self._who)
 
-    def check_may(self, what: str) -> None:
-        """Check that the role of this process may set and command: what is not allowed would vanish without an answer.
+    def check_may(self, what: str, needs: Role = "operator") -> None:
+        """Check that the role of this process may do something: what is not allowed would vanish without an answer.
 
         Raises:
-            ConfigurationError: it may only read.
+            ConfigurationError: it may only read, or only read, set and command.
         """
-        if self._role == "observer":
-            raise ConfigurationError(f"you are observer '{self.keys.by}'; {what} needs operator.")
+        if self._role not in (None, needs, "node"):
+            raise ConfigurationError(f"you are {self._role} '{self.keys.by}'; {what} needs {needs}.")
 
     def rest(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause or step the mesh; the answer comes when it has paused, and has the point at which it has.

@@ -11,9 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 from ..keys import LOCAL
+from ..messages import MAX_MESSAGE_SIZE
 from .identity import Role
 
-__all__ = ["ACTIONS", "HELLO", "ROLE_NAMES", "Action", "access_control"]
+__all__ = ["ACTIONS", "HELLO", "ROLE_NAMES", "Action", "access_control", "for_networks"]
 
 HELLO: Final = "**/mesh/hello"
 """What meshes answer to every certificate."""
@@ -60,7 +61,8 @@ class Action(NamedTuple):
 
 
 _OF_MESH: Final = ("info", "status", "plan", "log", "audit", "ros/*", "role/{role}")
-_ENDS: Final = ("{ends}",)
+_END: Final = "{ends}"
+_ENDS: Final = (_END,)
 _NAMED: Final = ("{mesh}/*/set/@by/**", "{mesh}/mesh/command/@by/**")
 """The keys with names: a router hands on what others send, and so whoever is a part of a run may use all names."""
 
@@ -130,6 +132,50 @@ def access_control(root: str, roles: Mapping[str, Role], ends: Iterable[str] = (
         "policies": policies,
     }
 
+
+def for_networks(
+    root: str, roles: Mapping[str, Role], ends: Iterable[str], priorities: Iterable[Any]
+) -> dict[str, Any]:
+    """The sections of Zenoh's configuration for who accepts links: the rules, and what messages may have beside them.
+
+    Args:
+        root: as of `access_control`.
+        roles: as of it.
+        ends: as of it.
+        priorities: what else there is in the section `qos/network`.
+    """
+    read = [
+        key.format(mesh=root, role="*") for own in ACTIONS if own.comes == _READS for key in own.keys if key != _END
+    ]
+    at_networks = {"link_protocols": ["tls", "quic"]}
+    asked = {"messages": ["query"], "flows": ["ingress"], **at_networks}
+    status = f"{root}/*/status"
+    return {
+        "access_control": access_control(root, roles, ends),
+        # A message is put together before any rule: of one that is larger, nobody would take the content.
+        "transport/link/rx/max_message_size": MAX_MESSAGE_SIZE + _KEY_BYTES,
+        # Whoever reads sends no payload, and would make a node look at it.
+        "low_pass_filter": [
+            {"id": "reads", "key_exprs": [HELLO, *(key for key in read if key != status)], "size_limit": 0, **asked},
+            {"id": "names", "key_exprs": [status], "size_limit": _NAMES_BYTES, **asked},
+        ],
+        # A sender would wait for an observer that does not read. `**` fits no key of the synchronization.
+        "qos/network": [
+            *priorities,
+            {
+                "messages": ["put"],
+                "key_exprs": [f"{root}/**"],
+                "overwrite": {"congestion_control": "drop"},
+                "flows": ["egress"],
+                **at_networks,
+            },
+        ],
+    }
+
+
+_KEY_BYTES: Final = 1 << 16
+_NAMES_BYTES: Final = 1 << 22
+"""A question for a state may have the names of the variables that its sender has subscribed to."""
 
 _EVERYBODY: Final = "*"
 """A subject without any property; no name of a certificate is this."""

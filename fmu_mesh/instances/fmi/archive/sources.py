@@ -37,7 +37,7 @@ from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed
 
-__all__ = ["describe", "extract", "prepare"]
+__all__ = ["describe", "extract", "needs_compiler", "prepare"]
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +76,7 @@ _linked: set[Path] = set()
 class _Build(msgspec.Struct, frozen=True):
     """What to compile and how."""
 
+    fmi_version: str
     identifier: str
     sources: tuple[str, ...]  # paths relative to the folder `sources` of the FMU
     includes: tuple[str, ...]
@@ -157,6 +158,19 @@ def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Calla
     return model
 
 
+def needs_compiler(path: Path, terms: Terms, kind: Literal["auto"] | Kind) -> bool:
+    """Whether `describe` would compile what nobody has compiled before; nothing is."""
+    with opened(path, terms) as fmu:
+        model = description_of(fmu, kind)
+        if model.library is not None:
+            return False
+        with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as name, reading(path):
+            folder = Path(name)
+            fmu.unpack_into(folder)
+            build = _build_of(fmu, folder, model)
+            return build is not None and not _command(path, folder / "sources", build)[1].is_file()
+
+
 def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | None, folder: Path) -> None:
     """Unpack an FMU into an empty folder, and give it the library that it lacks."""
     fmu.unpack_into(folder)
@@ -176,17 +190,23 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
 
 def _add_library(fmu: OpenFmu, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
     """Copy the compiled library of an FMU to where FMI expects it."""
+    if (build := _build_of(fmu, folder, model)) is None:
+        return  # the error of loading it says what is missing
+    library = _compiled(fmu.path, folder / "sources", build, tell)
+    target = folder / library_name(build.identifier, build.fmi_version)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(library, target)
+
+
+def _build_of(fmu: OpenFmu, folder: Path, model: ModelDescription | None) -> _Build | None:
+    """What to compile of an FMU that is unpacked; None if it has no sources."""
     names = [file.relative_to(folder).as_posix() for file in folder.glob("sources/**/*") if file.is_file()]
     if not source_names(names):
-        return  # the error of loading it says what is missing
+        return None
     path, (contents, root, _) = fmu.path, examine(fmu)
     description = parsed(path, contents)
     kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
-    build = _build(path, description, names, kind, _listed_files(root, kind))
-    library = _compiled(path, folder / "sources", build, tell)
-    target = folder / library_name(build.identifier, description.fmiVersion)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(library, target)
+    return _build(path, description, names, kind, _listed_files(root, kind))
 
 
 def _listed_files(root: ET.Element, kind: str) -> list[str]:
@@ -230,7 +250,7 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
         (language,) = languages
         if re.fullmatch(r"C(\+\+)?\d\d", language):
             options.append(f"-std={language.lower().replace('c', 'gnu', 1)}")
-    return _Build(identifier, tuple(sources), tuple(includes), tuple(options))
+    return _Build(str(description.fmiVersion), identifier, tuple(sources), tuple(includes), tuple(options))
 
 
 def _inside(path: Path, name: str) -> str:
@@ -243,15 +263,7 @@ def _inside(path: Path, name: str) -> str:
 
 def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], None]) -> Path:
     """The library of these sources: that in the cache, or a new one."""
-    plus = any(not name.endswith(".c") for name in build.sources)
-    compiler = _compiler(path, plus=plus)
-    own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
-    target = (
-        files.cache_folder()
-        / "sources"
-        / _key(sources, build, own)
-        / f"{build.identifier}{fmpy.sharedLibraryExtension}"
-    )
+    own, target = _command(path, sources, build)
     if target.is_file():
         return target
     tell(f"'{path}' has no binary for this platform ({fmpy.platform}): compiling its sources into '{target.parent}'")
@@ -274,6 +286,20 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
             hint="Set FMU_MESH_CACHE_DIR to a folder that can be written.",
         ) from error
     return target
+
+
+def _command(path: Path, sources: Path, build: _Build) -> tuple[list[str], Path]:
+    """How sources are compiled, without their names, and where in the cache their library is."""
+    plus = any(not name.endswith(".c") for name in build.sources)
+    compiler = _compiler(path, plus=plus)
+    own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
+    target = (
+        files.cache_folder()
+        / "sources"
+        / _key(sources, build, own)
+        / f"{build.identifier}{fmpy.sharedLibraryExtension}"
+    )
+    return own, target
 
 
 def _other_folders(sources: Path) -> list[str]:
