@@ -67,7 +67,7 @@ class Claimant:
 
     def ask(self, key: str, payload: bytes, **more: Any) -> None:  # noqa: ANN401  arguments of Zenoh
         """Send a query, and wait for its end."""
-        list(self.session.get(key, payload=payload, timeout=DEADLINE_S, **more))
+        list(self.session.get(key, payload=payload, **{"timeout": DEADLINE_S, **more}))
 
     def other_keys(self) -> None:
         for key in OTHER_KEYS:
@@ -119,7 +119,7 @@ class Claimant:
     def audit(self) -> None:
         entry = AuditEntry("set", "carol", "2026-11-30T00:00:00.000+00:00", 0, "", "free.u")
         self.session.put(f"{ROOT}/mesh/audit", msgspec.json.encode(entry))
-        self.ask(f"{ROOT}/mesh/audit", msgspec.json.encode(entry))
+        self.ask(f"{ROOT}/mesh/audit", msgspec.json.encode(entry), timeout=0.2)  # nobody answers
 
     def answers(self) -> None:
         """Play who is set and commanded, to hear what carol sends."""
