@@ -66,10 +66,14 @@ class Stranger:
         keys: the internal keys of the run, which any client of the same user can find out.
         asked: all that it has asked.
         sent: keys and payloads that it has put.
+        patience_s: how long it waits for an answer, in s.
     """
 
-    def __init__(self, session: zenoh.Session, mesh: str, run: str | None = None) -> None:
+    def __init__(
+        self, session: zenoh.Session, mesh: str, run: str | None = None, patience_s: float = DEADLINE_S
+    ) -> None:
         self.session = session
+        self.patience_s = patience_s
         self.public = Keys("fmu_mesh", mesh)
         self.asked: list[_Asked] = []
         self.sent: set[tuple[str, bytes]] = set()
@@ -86,7 +90,7 @@ class Stranger:
 
     def ask(self, key: str, payload: bytes | None = None) -> list[str]:
         """The texts of the refusals that a query gets."""
-        replies = list(self.session.get(key, payload=payload, timeout=DEADLINE_S))
+        replies = list(self.session.get(key, payload=payload, timeout=self.patience_s))
         refusals = [reply.err.payload.to_bytes().decode() for reply in replies if reply.err is not None]
         self.asked.append(_Asked(key, refusals, answered=any(reply.ok is not None for reply in replies)))
         return refusals
@@ -226,7 +230,7 @@ def any_bytes(stranger: Stranger) -> None:
     @given(known | wild | of_any_run, _PAYLOADS, st.none() | st.binary(max_size=40) | _JSON, st.booleans())
     def send(key: str, payload: bytes | None, attachment: bytes | None, asks: bool) -> None:  # noqa: FBT001  hypothesis draws it
         if asks:
-            list(stranger.session.get(key, payload=payload, attachment=attachment, timeout=DEADLINE_S))
+            list(stranger.session.get(key, payload=payload, attachment=attachment, timeout=stranger.patience_s))
         elif payload is None:
             stranger.session.delete(key)
         elif not key.endswith(("in/u", "param/k", "set/k")):  # a value that fits is rightly taken

@@ -9,13 +9,14 @@ import argparse
 import json
 from collections.abc import Callable, Mapping
 from datetime import datetime
+from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from ..errors import ConfigurationError
 from ..text import listed, short_path
 from ..wire.security.identity import CERTIFICATE, ends_soon, time_left
-from ..wire.security.rules import ACTIONS, ROLE_NAMES, access_control
+from ..wire.security.rules import ACTIONS, ROLE_NAMES, for_networks
 from .arguments import Runs
 from .output.json_output import print_json
 
@@ -85,8 +86,11 @@ def _remove(authority: Authority, arguments: argparse.Namespace) -> None:
 
 def _show(authority: Authority, arguments: argparse.Namespace) -> None:
     if arguments.zenohd:
-        rules = access_control(f"{arguments.key_prefix}/*", authority.table.roles, arguments.end)
-        print(json.dumps({"access_control": rules}, indent=2))
+        rules: dict[str, Any] = {}
+        for path, value in for_networks(f"{arguments.key_prefix}/*", authority.table.roles, arguments.end, ()).items():
+            *above, last = path.split("/")
+            reduce(lambda section, name: section.setdefault(name, {}), above, rules)[last] = value
+        print(json.dumps(rules, indent=2))
         return
     if arguments.json:
         for name, member in authority.members.items():

@@ -78,12 +78,12 @@ class Audit:
         self._add(AuditEntry(what, who, now, self._point() if point is None else point, key, text))
 
     def _add(self, new: AuditEntry, *, is_logged: bool = False) -> None:
-        """Values, or refusals, of one sender at one key are one entry, and so is a command that follows itself."""
+        """One entry: values or refusals of one sender at one key, commands in a row, joins from one host."""
         new = replace(new, who=new.who[:_LONGEST], key=new.key[:_LONGEST], text=new.text[:_LONGEST])
         with self._lock:
             if new.what == "commanded" and (new.who, new.text) != self._command[:2]:
                 self._command = new.who, new.text, str(self.changes)
-            own = {"commanded": self._command, "joined": (new.who, new.text)}
+            own = {"commanded": self._command, "joined": (new.who, new.text.rpartition(":")[0])}
             same = new.what, *own.get(new.what, (new.who, new.key))
             known = self._newest.get(same)
             self.changes += 1
@@ -93,8 +93,9 @@ class Audit:
                 return
             self._newest[same] = new
             if len(self._newest) > _MOST:
-                # Whoever is refused again and again must not hide what was done.
-                del self._newest[next((key for key in self._newest if key[0] == "refused"), next(iter(self._newest)))]
+                # Whoever comes or is refused again and again must not hide what was done.
+                harmless = (key for key in self._newest if key[0] in {"refused", "joined"})
+                del self._newest[next(harmless, next(iter(self._newest)))]
                 self._left_out += 1
         if matches(self._publisher):
             self._publisher.put(msgspec.json.encode(new))

@@ -67,7 +67,7 @@ class Claimant:
 
     def ask(self, key: str, payload: bytes, **more: Any) -> None:  # noqa: ANN401  arguments of Zenoh
         """Send a query, and wait for its end."""
-        list(self.session.get(key, payload=payload, timeout=DEADLINE_S, **more))
+        list(self.session.get(key, payload=payload, **{"timeout": DEADLINE_S, **more}))
 
     def other_keys(self) -> None:
         for key in OTHER_KEYS:
@@ -119,7 +119,7 @@ class Claimant:
     def audit(self) -> None:
         entry = AuditEntry("set", "carol", "2026-11-30T00:00:00.000+00:00", 0, "", "free.u")
         self.session.put(f"{ROOT}/mesh/audit", msgspec.json.encode(entry))
-        self.ask(f"{ROOT}/mesh/audit", msgspec.json.encode(entry))
+        self.ask(f"{ROOT}/mesh/audit", msgspec.json.encode(entry), timeout=0.2)  # nobody answers
 
     def answers(self) -> None:
         """Play who is set and commanded, to hear what carol sends."""
@@ -219,3 +219,18 @@ def test_joins_and_acts_of_names_are_in_the_audit_of_the_result(place: Place, wa
     ]
     kept = Result.read(own.config.with_suffix(".csv")).metadata["audit"]["entries"]
     assert msgspec.convert(kept, list[AuditEntry])[: len(told)] == told
+
+
+def test_who_joins_again_and_again_is_one_entry_and_one_line(place: Place) -> None:
+    with scene(place, "direct") as own:
+        for _ in range(20):
+            with dialled(own, "bob", "client") as bob:
+                [seen] = bob.get(f"{ROOT}/mesh/audit", timeout=DEADLINE_S)
+                assert seen.ok is not None
+
+        def of_bob() -> list[int]:
+            return [entry.number for entry in entries(own) if (entry.what, entry.who) == ("joined", "bob")]
+
+        wait_until(lambda: of_bob() == [20], "20 joins in one entry")
+        lines = [payload for key, payload in own.heard if key == f"{ROOT}/mesh/log" and b"bob joined" in payload]
+        assert len(lines) == 1
