@@ -137,7 +137,7 @@ class _Loaded:
         self._reductions = [read_reduction(text) for text in self._task.reductions]
         data = self._task.data
         if isinstance(data, dict):  # variants must not listen at the same ports, nor write into the same files
-            data = {**data, **{name: ALONE[name] for name in ("zenoh", "runtime")}}
+            data = {**data, "zenoh": {**(data.get("zenoh") or {}), **ALONE["zenoh"]}, "runtime": ALONE["runtime"]}
             if isinstance(records := data.get("record"), list):
                 data["record"] = records[:1]
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))
