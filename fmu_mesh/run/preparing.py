@@ -208,7 +208,9 @@ def planned(
 
 def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:
     """Find what this host cannot do for a mesh, and say whom the mesh trusts here."""
-    if (why := why_no_sandbox(config)) is not None:
+    own = {name: section for name, section in config.instances.items() if config.process_of(section).is_sandboxed}
+    elsewhere = {name: bool(section.host or section.interpreter) for name, section in own.items()}
+    if elsewhere and (why := why_no_sandbox(config.zenoh, elsewhere)) is not None:
         obstacles.add("process.sandbox", *why)
     if (group := config.runtime.share_with) is not None:
         trusted = f"the members of the group '{group}' are trusted as you are: they can read, set and end this mesh"

@@ -21,7 +21,7 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -29,8 +29,7 @@ from typing import Final
 import msgspec
 
 from .. import files
-from ..config.access_sections import given_folder
-from ..config.mesh import Config
+from ..config.access_sections import ZenohConfig, given_folder
 from ..system.plan import NodePlan
 from ..wire.host_processes import STATES, Answered, Asked, is_alive, is_stopped
 from ..wire.runtime import box_of, runtime_folder
@@ -56,15 +55,20 @@ _SIGNALLED: Final = 128
 _CREDENTIALS: Final = struct.Struct("3i")
 
 
-def why_no_sandbox(config: Config) -> tuple[str, str] | None:
-    """Why nodes cannot run in a sandbox here, and what to do; None: they can, or none is asked for."""
-    names = [name for name, own in config.instances.items() if config.process_of(own).is_sandboxed]
-    if not names:
-        return None
-    if config.zenoh.mode == "client" or config.zenoh.connect:
-        return f"a sandbox for '{names[0]}', which has no network, with `zenoh.connect`", "a mesh on one host"
-    if others := [name for name in names if config.instances[name].host or config.instances[name].interpreter]:
-        return f"a sandbox for '{others[0]}', which has a `host` or an `interpreter`", "an instance without"
+def why_no_sandbox(zenoh: ZenohConfig, sandboxed: Mapping[str, bool]) -> tuple[str, str] | None:
+    """Why nodes cannot run in a sandbox here, and what to do; None: they can.
+
+    Args:
+        zenoh: how the processes find each other.
+        sandboxed: the instances in a sandbox, and whether each runs on another host or in another Python.
+    """
+    if zenoh.mode == "client" or zenoh.connect:
+        return (
+            f"a sandbox for '{next(iter(sandboxed))}', which has no network, with `zenoh.connect`",
+            "a mesh on one host",
+        )
+    if (other := next((name for name, is_elsewhere in sandboxed.items() if is_elsewhere), None)) is not None:
+        return f"a sandbox for '{other}', which has a `host` or an `interpreter`", "an instance without"
     if (program := shutil.which("bwrap")) is None:
         return "bubblewrap, which is not installed", "`apt-get install bubblewrap`, or `sandbox: none`"
     command = [program, *_APART, *_system(), "true"]
