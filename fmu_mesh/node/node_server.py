@@ -8,6 +8,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -29,7 +30,7 @@ from .activity import Activity
 from .answering import Answers, Job
 from .key_ends import KeyEnds
 from .stepping import Runner
-from .streams import MAX_WAITING_ROWS, Batch, InstanceStreams
+from .streams import InstanceStreams, WaitingRows
 
 __all__ = ["NodeServer"]
 
@@ -91,6 +92,7 @@ class NodeServer:
         self._declared: dict[str, zenoh.KeyExpr] = {}
         self._searches = False
         self._next_search = 0.0
+        self._rows: deque[WaitingRows] = deque()
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self.keys = KeyEnds(plan.node, plan.timeouts, session, inbox.post, self.log_message, tell)
@@ -130,16 +132,17 @@ class NodeServer:
 
     @property
     def is_followed(self) -> bool:
-        """Whether somebody gets rows by samples: some streams have subscribers, or rows go to keys."""
-        return self.keys.publishes or any(streams.is_active for streams in self._streams)
+        """Whether somebody would get the next row at once: some streams have subscribers, or rows go to keys."""
+        return self.keys.publishes or any(own.is_active and self._waiting_rows <= own.backlog for own in self._streams)
 
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers, and to keys."""
         self.keys.publish_now()
         for streams in (*self.keys.lossy, *self._streams):
             if (batch := streams.collect(self._waiting_rows)) is not None:
-                self._waiting_rows += len(batch[1])
-                self._jobs.put(partial(self._publish_rows, batch))
+                self._waiting_rows += len(batch.steps)
+                self._rows.append(batch)
+                self._jobs.put(self._publish_rows)
 
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
@@ -184,6 +187,8 @@ class NodeServer:
         while True:
             with suppress(queue.Empty):
                 if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
+                    while self._rows and not self._closing.is_set():
+                        self._publish_rows()
                     self._answers.tell_refused()
                     return
                 with self._inbox.refusals.guard("a query or a value"):
@@ -278,14 +283,22 @@ class NodeServer:
         self.stepped()  # the earlier rows belong to the old set of variables
         streams.update()
 
-    def _publish_rows(self, batch: Batch) -> None:
-        streams, steps, columns = batch
-        started = time.monotonic()
-        streams.publish(steps, columns)
-        self._waiting_rows -= len(steps)
-        if self._waiting_rows > MAX_WAITING_ROWS // 2:
+    def _publish_rows(self) -> None:
+        """Publish a part of the first rows that wait; the others are jobs after those that wait already."""
+        if not self._rows:
+            return
+        batch, started = self._rows[0], time.monotonic()
+        streams, (part, rest) = batch.streams, batch.parts()
+        streams.publish(part.steps, part.blocks)
+        self._waiting_rows -= len(part.steps)
+        if len(rest.steps):
+            self._rows[0] = rest
+            self._jobs.put(self._publish_rows)
+        else:
+            self._rows.popleft()
+        if self._waiting_rows > streams.backlog:
             # Subscribers are slower than this run: publishing gets a share of the node's time, and samples are dropped.
-            self._closing.wait(_STREAM_SHARE * (time.monotonic() - started))
+            self._hurries.wait(_STREAM_SHARE * (time.monotonic() - started))
 
     def _publish_log(self, line: LogLine) -> None:
         publisher = self._log_publishers.get(line.instance)

@@ -24,7 +24,7 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import attachment, encode_value, json_encoding
 from .stepping import Runner
 
-__all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "RowsFor", "VariableKeys", "kind_of"]
+__all__ = ["PRIORITY", "InstanceStreams", "RowsFor", "VariableKeys", "WaitingRows", "kind_of"]
 
 # Threads: the main thread calls `update`, `collect` and reads `_active`; the thread of the server calls `look`,
 # `look_at` and `publish`, and owns `_wanted` and `_search`; a thread of Zenoh calls `changed`, which only puts a job.
@@ -38,7 +38,11 @@ __all__ = ["MAX_WAITING_ROWS", "PRIORITY", "Batch", "InstanceStreams", "RowsFor"
 # 60,000), a listener without them (declaring takes time that grows with the square), and the list of subscribers in
 # the admin space (a session that answers it while another one subscribes can stand for ever, zenoh 1.10).
 
-MAX_WAITING_ROWS = 1 << 14
+_MAX_WAITING_ROWS = 1 << 14
+_AT_ONCE: Final = 512
+_BACKLOG: Final = 1 << 16
+"""So many values are published in one job; and where so many wait, publishing gets a share of the time."""
+
 _MAX_WAITING_VALUES = 1 << 20
 """Somebody may subscribe to all 60,000 variables of an FMU: their rows would need gigabytes."""
 
@@ -76,8 +80,19 @@ class Picked(NamedTuple):
     keys: list[tuple[Any, int, tuple[int, ...]]]
 
 
-Batch = tuple["RowsFor", NDArray[np.intp], list[tuple[Picked, NDArray[Any]]]]
-"""Who publishes them, own steps, and their rows."""
+class WaitingRows(NamedTuple):
+    """Who publishes them, own steps, and their rows."""
+
+    streams: RowsFor
+    steps: NDArray[np.intp]
+    blocks: list[tuple[Picked, NDArray[Any]]]
+
+    def parts(self) -> tuple[WaitingRows, WaitingRows]:
+        """As many rows as are published without a look at what else is to do, and the others."""
+        count = max(1, _AT_ONCE // max(1, sum(block.shape[1] for _, block in self.blocks)))
+        part = [(picked, block[:count]) for picked, block in self.blocks]
+        rest = [(picked, block[count:]) for picked, block in self.blocks]
+        return WaitingRows(self.streams, self.steps[:count], part), WaitingRows(self.streams, self.steps[count:], rest)
 
 
 def kind_of(variable: Variable) -> VariableKind | None:
@@ -115,10 +130,17 @@ class VariableKeys:
 
 
 class RowsFor:
-    """Hands the rows of one instance to whoever publishes the values of some of its variables."""
+    """Hands the rows of one instance to whoever publishes the values of some of its variables.
+
+    Attributes:
+        backlog: where more rows wait, publishing gets a share of the time; set by the main thread, and read by that of
+            the server, too.
+        most_waiting: where more rows wait, they are dropped.
+    """
 
     def __init__(self, runner: Runner) -> None:
         self.runner = runner
+        self.backlog = self.most_waiting = 0
         self._dropped = self._next = 0
         self._active: Mapping[str, Any] = {}
         self._picked: list[Picked] = []
@@ -128,6 +150,9 @@ class RowsFor:
         if not self._active:
             self._next = self.runner.step
         self._active = wanted
+        most = max(1, len(wanted))
+        self.backlog = min(_MAX_WAITING_ROWS // 2, _BACKLOG // most)
+        self.most_waiting = min(_MAX_WAITING_ROWS, _MAX_WAITING_VALUES // most)
         rings = [ring for ring in (self.runner.outputs, self.runner.watched) if ring is not None]
         self._picked = [picked for ring in rings for picked in _picked(ring, wanted)]
 
@@ -136,7 +161,7 @@ class RowsFor:
         """On the main thread: whether `collect` has something to do."""
         return bool(self._active)
 
-    def collect(self, waiting_rows: int) -> Batch | None:
+    def collect(self, waiting_rows: int) -> WaitingRows | None:
         """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
         end, watched = self.runner.step + 1, self.runner.watched
         first = max(self._next, end - (watched.rows if watched is not None else end))
@@ -148,12 +173,12 @@ class RowsFor:
         kept = min(self.runner.outputs.rows, watched.rows if watched is not None else end)
         self._dropped += max(0, end - kept - first)
         first = max(first, end - kept)  # older rows are overwritten
-        if waiting_rows > min(MAX_WAITING_ROWS, _MAX_WAITING_VALUES // len(self._active)):
+        if waiting_rows > self.most_waiting:
             self._dropped += end - first
             return None
         steps = np.arange(first, end)
         rows = [(own, own.ring.parts[own.part][np.ix_(steps & own.ring.mask, own.elements)]) for own in self._picked]
-        return self, steps, rows
+        return WaitingRows(self, steps, rows)
 
     def publish(self, steps: NDArray[np.intp], blocks: list[tuple[Picked, NDArray[Any]]]) -> None:
         """Publish what `collect` returned."""
@@ -189,6 +214,7 @@ class InstanceStreams(RowsFor):
         self._declared = declared
         self._grid = grid
         self._wanted: dict[str, zenoh.KeyExpr] = {}
+        self._rests = False
         self._search: tuple[list[str], Iterator[str | None]] | None = None
         self._publisher = session.declare_publisher(
             self._keys.every, priority=PRIORITY, allowed_destination=zenoh.Locality.REMOTE
@@ -264,13 +290,25 @@ class InstanceStreams(RowsFor):
 
     def update(self) -> None:
         """On the main thread, between steps: from now on, read the variables that have subscribers."""
-        active = self._wanted
-        if active.keys() == self._active.keys():
-            return
-        watched = tuple(name for name in active if name not in self.runner.outputs.layout)
+        if (wanted := self._wanted).keys() != self._active.keys():
+            self._read(wanted)
+
+    def _read(self, wanted: Mapping[str, Any]) -> None:
+        watched = tuple(name for name in wanted if name not in self.runner.outputs.layout)
         if {*watched} != {*(self.runner.watched.layout.names if self.runner.watched is not None else ())}:
             self.runner.watch(watched)
-        self._pick(active)
+        self._rests = False
+        self._pick(wanted)
+
+    def collect(self, waiting_rows: int) -> WaitingRows | None:
+        """As `RowsFor.collect`; what would be dropped is not read either: an FMU may take long to give many values."""
+        batch = super().collect(waiting_rows if not self._rests else self.most_waiting + 1)
+        if self._rests and waiting_rows <= self.backlog:
+            self._read(self._active)
+        elif waiting_rows > self.most_waiting and self.runner.watched is not None:
+            self.runner.watch(())
+            self._rests = True
+        return batch
 
     def publish(self, steps: NDArray[np.intp], blocks: list[tuple[Picked, NDArray[Any]]]) -> None:
         """On the server's thread: publish what `collect` returned."""

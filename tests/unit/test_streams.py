@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, Self, cast
@@ -206,6 +206,47 @@ def test_rows_that_were_overwritten_before_they_were_read_are_dropped() -> None:
     batch = streams.collect(0)
 
     assert batch is not None
-    assert batch[1].tolist() == [6, 7, 8, 9]
-    assert [values.ravel().tolist() for _, values in batch[2]] == [[6.0, 7.0, 8.0, 9.0]]
+    assert batch.steps.tolist() == [6, 7, 8, 9]
+    assert [values.ravel().tolist() for _, values in batch.blocks] == [[6.0, 7.0, 8.0, 9.0]]
     assert streams.take_dropped() == 6
+
+
+def test_what_would_be_dropped_is_not_read() -> None:
+    own, other = variable("y", "output"), variable("z", "output")
+    outputs = Ring(Layout.of([own]), 4)
+    description = SimpleNamespace(variables=[own, other], variable={"y": own, "z": other}.get)
+    runner = SimpleNamespace(
+        name="unit", outputs=outputs, watched=None, step=0, instance=SimpleNamespace(description=description)
+    )
+
+    def watch(names: Sequence[str]) -> None:
+        runner.watched = Ring(Layout.of([other]), 4) if names else None
+        if runner.watched is not None:
+            runner.watched.put(runner.step, "z", 100.0 + runner.step)
+
+    runner.watch = watch
+    session = Session([f"{ROOT}/out/y", f"{ROOT}/out/z"])
+    streams = InstanceStreams(
+        cast("Any", runner), cast("Any", session), Keys("fmu_mesh", "lab"), TimeGrid(0.0, 0.1, 100), lambda: None, {}
+    )
+    streams.look()
+    streams.update()
+    assert runner.watched is not None
+
+    full = streams.most_waiting + 1
+    for runner.step in (1, 2):  # nobody has read the rows before
+        outputs.put(runner.step, "y", float(runner.step))
+        assert streams.collect(full) is None
+        assert runner.watched is None
+    runner.step = 3
+    assert streams.collect(streams.backlog) is None  # from the next row on
+    assert runner.watched is not None
+    runner.step = 4
+    outputs.put(4, "y", 4.0)
+    runner.watched.put(4, "z", 104.0)
+    batch = streams.collect(0)
+
+    assert batch is not None
+    assert batch.steps.tolist() == [4]
+    assert [values.ravel().tolist() for _, values in batch.blocks] == [[4.0], [104.0]]
+    assert streams.take_dropped() == 4
