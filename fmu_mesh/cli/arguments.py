@@ -13,11 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
-from ..config.access_sections import why_open
 from ..config.base import ENDPOINT_PATTERN
 from ..errors import ConfigurationError
 from ..text import listed, meant, nearest
-from .output.terminal import say_warning
 
 __all__ = [
     "ACCESS",
@@ -167,6 +165,9 @@ def reaching(timeout_s: float = _TIMEOUT_S) -> tuple[ArgumentPart, ...]:
 def reach(arguments: argparse.Namespace) -> dict[str, Any]:
     """The flags of `reaching`, as the library takes them; warns of a network without TLS."""
     if arguments.insecure:
+        from ..config.access_sections import why_open  # noqa: PLC0415  the list of commands needs neither
+        from .output.terminal import say_warning  # noqa: PLC0415  as above
+
         for _, text in why_open({"--connect": arguments.connect}, secured=False):
             say_warning(text)
     return {name: getattr(arguments, name) for name in ("connect", "timeout", "security", "insecure")}
