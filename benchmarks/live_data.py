@@ -29,9 +29,9 @@ import zenoh
 
 from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 from fmu_mesh.results.keys_file import keys_beside
-from tests.helpers import Launched, Place, row_count, wait_until, write_config
+from tests.helpers import Launched, Place, free_port, row_count, wait_until, write_config
 from tests.mqtt.mqtt_bridge import Bridge, bridge_or_skip, running_bridge
-from tests.ros.peers import Peer, free_port
+from tests.ros.peers import Peer
 
 __all__ = ["PARTS", "Watched", "ahead", "flooded", "main", "misplaced"]
 

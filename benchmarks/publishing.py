@@ -49,6 +49,7 @@ BLOCKS = {
     "ros topics": "benchmarks.ros_topics",
     "live data": "benchmarks.live_data",
     "floods": "benchmarks.floods",
+    "tls": "benchmarks.tls",
     "recording": "benchmarks.recording",
     "formats": "benchmarks.formats",
     "scale": "benchmarks.scale",

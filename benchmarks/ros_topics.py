@@ -20,8 +20,8 @@ import pytest
 
 from benchmarks.publishing import Figures, add_write_docs, markdown_table, publish
 from benchmarks.ros_topics_peer import TWIST
-from tests.helpers import Place, wait_until, write_config
-from tests.ros.peers import Peer, bridge, bridge_binary, domain, free_port, need, ros_settings
+from tests.helpers import Place, free_port, wait_until, write_config
+from tests.ros.peers import Peer, bridge, bridge_binary, domain, need, ros_settings
 
 __all__ = ["PROFILES", "Ways", "main"]
 

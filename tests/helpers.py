@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -40,6 +41,7 @@ __all__ = [
     "Place",
     "assert_readable",
     "braked",
+    "free_port",
     "on_a_busy_machine",
     "row_count",
     "rows_of",
@@ -85,6 +87,13 @@ sys.addaudithook(hold)
 """A process of a run asks for the name of its host before it opens a session."""
 
 Value = TypeVar("Value")
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A free port of the loopback device."""
+    with socket.socket(type=kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def wait_until(condition: Callable[[], Value | None], what: str, deadline_s: float = DEADLINE_S) -> Value:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import signal
-import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +13,7 @@ import pytest
 import yaml
 
 import fmu_mesh
-from tests.helpers import BY_STREAMS, BY_ZENOH, Launched, Place, row_count, wait_until
+from tests.helpers import BY_STREAMS, BY_ZENOH, Launched, Place, free_port, row_count, wait_until
 from tests.key_meshes import key_lines, stepped_router, written
 
 VECTOR = """
@@ -118,11 +117,6 @@ def parts(
         instances = {name: section for name, (own, section) in split.instances.items() if own == mesh}
         files[mesh] = written(place, mesh, instances, connections, **sections)
     return files
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as own:
-        return int(own.getsockname()[1])
 
 
 def columns_of(config: Path) -> dict[str, list[str]]:

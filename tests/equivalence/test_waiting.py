@@ -6,23 +6,15 @@ import json
 import os
 import re
 import signal
-import socket
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from tests.helpers import DEADLINE_S, FMUS, Launched, Place, braked, rows_of, wait_until, write_config
+from tests.helpers import DEADLINE_S, FMUS, Launched, Place, braked, free_port, rows_of, wait_until, write_config
 
 FAR_S = 1e6
 PACED = {"real_time_factor": 1.0, "step_size": 0.01}
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def point_in(text: str) -> int:

@@ -21,7 +21,7 @@ import pytest
 
 from tests.helpers import DEADLINE_S, wait_until
 
-__all__ = ["Peer", "bridge", "bridge_binary", "domain", "free_port", "need", "ros_settings"]
+__all__ = ["Peer", "bridge", "bridge_binary", "domain", "need", "ros_settings"]
 
 FOLDER = Path(__file__).parent
 BRIDGE = "fmu-mesh-ros2dds"
@@ -46,14 +46,6 @@ def bridge_binary() -> Path:
     if not built.is_file():
         pytest.skip("the bridge is not built: bridges/ros2dds/build (needs cargo, cmake and libclang; 10 minutes)")
     return built
-
-
-def free_port() -> int:
-    """A free TCP port of the loopback device."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 @cache

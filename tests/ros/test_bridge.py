@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from tests.helpers import Place, rows_of, wait_until, write_config
-from tests.ros.peers import Peer, bridge, bridge_binary, free_port, need
+from tests.helpers import Place, free_port, rows_of, wait_until, write_config
+from tests.ros.peers import Peer, bridge, bridge_binary, need
 
 COUNT = 1000
 FLOAT = "std_msgs/msg/Float64"

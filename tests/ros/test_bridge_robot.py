@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.helpers import Launched, Place, wait_until, write_config
-from tests.ros.peers import bridge, bridge_binary, free_port, need
+from tests.helpers import Launched, Place, free_port, wait_until, write_config
+from tests.ros.peers import bridge, bridge_binary, need
 from tests.ros.ros_peer import Ros, ros_or_skip
 from tests.ros.test_images import camera
 from tests.ros.test_qos_node import latched

@@ -19,8 +19,7 @@ import zenoh
 from fmu_mesh.ros_wire.cdr import Codec
 from fmu_mesh.ros_wire.definitions import MessageTypes, Nested
 from fmu_mesh.ros_wire.ros_names import dds_type
-from tests.helpers import DEADLINE_S, Launched, Place, row_count, rows_of, wait_until, write_config
-from tests.ros.peers import free_port
+from tests.helpers import DEADLINE_S, Launched, Place, free_port, row_count, rows_of, wait_until, write_config
 
 COMMANDS = 5000
 JOINTS = "sensor_msgs/msg/JointState"

@@ -17,9 +17,9 @@ from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.ros_wire.assembling import Assembler, Disassembler
 from fmu_mesh.ros_wire.cdr import MAX_MESSAGE_SIZE, CdrError
 from fmu_mesh.ros_wire.definitions import MessageTypes
-from tests.helpers import Launched, Place, wait_until, write_config
+from tests.helpers import Launched, Place, free_port, wait_until, write_config
 from tests.planning import prepare
-from tests.ros.peers import Peer, free_port, need
+from tests.ros.peers import Peer, need
 from tests.ros.ros_peer import Ros, ros_or_skip
 from tests.ros.test_bag import messages_of
 from tests.ros.test_gateway_messages import port, topic

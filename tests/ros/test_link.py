@@ -14,8 +14,8 @@ import pytest
 from fmu_mesh.config.mesh import RosConfig
 from fmu_mesh.ros.gateway.link import open_ros
 from fmu_mesh.wire.session import Wiring, close_session, open_session
-from tests.helpers import Launched, Place, rows_of, wait_until, write_config
-from tests.ros.peers import Peer, bridge, bridge_binary, free_port, need
+from tests.helpers import Launched, Place, free_port, rows_of, wait_until, write_config
+from tests.ros.peers import Peer, bridge, bridge_binary, need
 
 DOMAIN = 7
 CLOCK = {"publish": {"/clock": "rosgraph_msgs/msg/Clock"}, "count": 1}

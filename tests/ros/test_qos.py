@@ -14,8 +14,7 @@ import zenoh.ext
 from fmu_mesh.ros_wire.cdr import Codec
 from fmu_mesh.ros_wire.definitions import MessageTypes
 from fmu_mesh.ros_wire.ros_names import dds_type
-from tests.helpers import Place, wait_until, write_config
-from tests.ros.peers import free_port
+from tests.helpers import Place, free_port, wait_until, write_config
 
 pytest.importorskip("rosbags", reason="the package rosbags is not installed; pip install '.[test]'")
 

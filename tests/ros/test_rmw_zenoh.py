@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from tests.fmus.helpers import find_fmu
-from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
-from tests.ros.peers import Peer, free_port, need
+from tests.helpers import Launched, Place, free_port, row_count, rows_of, wait_until, write_config
+from tests.ros.peers import Peer, need
 
 DOMAIN = 7
 COUNT = 100

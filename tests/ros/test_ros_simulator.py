@@ -21,12 +21,13 @@ from tests.helpers import (
     Launched,
     Place,
     assert_readable,
+    free_port,
     row_count,
     rows_of,
     wait_until,
     write_config,
 )
-from tests.ros.peers import Peer, free_port, need
+from tests.ros.peers import Peer, need
 from tests.ros.ros_peer import built_types_or_skip, environment, ros_or_skip
 
 DOMAIN = 7

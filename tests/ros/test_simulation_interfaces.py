@@ -20,8 +20,8 @@ from fmu_mesh.ros_wire.simulation_types import (
     SimulatorFeature,
     define_simulation_types,
 )
-from tests.helpers import Launched, Place, row_count, rows_of, wait_until, write_config
-from tests.ros.peers import Peer, free_port, need
+from tests.helpers import Launched, Place, free_port, row_count, rows_of, wait_until, write_config
+from tests.ros.peers import Peer, need
 from tests.ros.ros_peer import Ros, built_types_or_skip, ros_or_skip
 
 ros_or_skip()

@@ -23,7 +23,7 @@ from fmu_mesh.config.access_sections import host_of, port_of
 from fmu_mesh.errors import ConfigurationError, FmuMeshError, MeshLost
 from fmu_mesh.wire.refused_links import RefusedLinks
 from fmu_mesh.wire.security.identity import CA, CERTIFICATE, KEY, Identity
-from tests.helpers import wait_until
+from tests.helpers import free_port, wait_until
 
 pytest.importorskip("cryptography")
 from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
@@ -90,12 +90,6 @@ def comes_as(folder: Path) -> Identity:
     """Who has a folder, even if our own check would refuse it: another program has none."""
     certificate = load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
     return Identity(folder, folder.name, "operator", certificate.not_valid_after_utc, "the lab")
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 def settings(endpoint: str, folder: Path) -> dict[str, Any]:

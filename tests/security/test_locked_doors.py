@@ -15,8 +15,7 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError, MeshLost
-from tests.equivalence.test_coupled_meshes import free_port
-from tests.helpers import Launched, Place, on_a_busy_machine, wait_until, write_config
+from tests.helpers import Launched, Place, free_port, on_a_busy_machine, wait_until, write_config
 from tests.network_hosts import NEEDS_HOSTS, two_hosts
 
 pytest.importorskip("cryptography")

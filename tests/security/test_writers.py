@@ -15,9 +15,9 @@ import pytest
 import fmu_mesh
 from fmu_mesh.dashboard.mesh_follower import MeshFollower
 from tests.foxglove_client import FoxgloveClient
-from tests.helpers import FMUS, Place, wait_until, write_config
+from tests.helpers import FMUS, Place, free_port, wait_until, write_config
 from tests.house import PACKAGE
-from tests.ros.peers import Peer, free_port, need
+from tests.ros.peers import Peer, need
 
 pytest.importorskip("cryptography")
 from fmu_mesh.wire.security.authority import Authority
