@@ -195,7 +195,7 @@ def test_the_gateway_node_needs_the_role_of_a_node(
             publisher.publish(Float64(data=0.125))  # the other end may not know this one yet
             return asked_value(place) == 0.125
 
-        assert wait_until(is_set, "the value from ROS")
+        ros.until(is_set, "the value from ROS")
         assert "ROS" in place.run("status").output
 
 
