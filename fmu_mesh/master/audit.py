@@ -88,8 +88,7 @@ class Audit:
             known = self._newest.get(same)
             self.changes += 1
             if known is not None:
-                number, at = known.number + new.number, (new.last_time or new.time, new.last_point or new.point)
-                self._newest[same] = replace(known, number=number, last_time=at[0], last_point=at[1])
+                self._newest[same] = known.and_again(new)
                 return
             self._newest[same] = new
             if len(self._newest) > _MOST:

@@ -270,10 +270,11 @@ class Answers:
         who = sender_in(key)
         with suppress(MessageRefused):
             who = who or who_sent(sent.attachment)
+        new = AuditEntry("refused", who, now, at, key, reason)
         if (known := self._refused.get((who, key))) is not None:
-            self._refused[who, key] = replace(known, number=known.number + 1, last_time=now, last_point=at)
+            self._refused[who, key] = known.and_again(new)
         elif len(self._refused) < _MOST_WARNED:
-            self._refused[who, key] = AuditEntry("refused", who, now, at, key, reason)
+            self._refused[who, key] = new
             self._log(LogLine(runner.name, "warning", "set", reason, at))
         if pending is not None:  # at last: nothing can be read of a query that was answered
             pending.refuse(reason)

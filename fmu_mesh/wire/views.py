@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.key_sections import KeyView
 from ..config.ros_section import MeshTopic
@@ -236,6 +237,11 @@ class AuditEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     number: int = 1
     last_time: str = ""
     last_point: int = 0
+
+    def and_again(self, new: AuditEntry) -> AuditEntry:
+        """This entry after the same has happened again, as ``new`` says."""
+        last_time, last_point = new.last_time or new.time, new.last_point or new.point
+        return replace(self, number=self.number + new.number, last_time=last_time, last_point=last_point)
 
     def __str__(self) -> str:
         more = f" ({self.number} times, the last at point {self.last_point})" if self.last_time else ""
