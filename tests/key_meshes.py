@@ -87,9 +87,9 @@ def put_values(
 
 
 def key_lines(result: Path) -> list[KeyLine]:
-    """What has come by keys, as it is beside a result file."""
-    lines = result.with_name(f"{result.name}.keys.jsonl").read_bytes().splitlines()
-    return [msgspec.json.decode(line, type=tuple[str, int, float | None, Any]) for line in lines]
+    """What has come by keys, as it is beside a result file; without a line that is being written."""
+    lines, _, _ = result.with_name(f"{result.name}.keys.jsonl").read_bytes().rpartition(b"\n")
+    return [msgspec.json.decode(line, type=tuple[str, int, float | None, Any]) for line in lines.splitlines()]
 
 
 def status_of(session: zenoh.Session, mesh: str, instance: str) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def check_link(endpoint: str, own: Identity | None) -> None:
             except ssl.SSLCertVerificationError as error:
                 why = _why_not_theirs(error.verify_code, host, own, _certificate_at(host, port, end))
                 raise ConfigurationError(f"{endpoint}: {why or error.verify_message}") from error
-            except ssl.SSLError as error:
+            except (ssl.SSLError, ConnectionResetError, BrokenPipeError) as error:
                 raise _refused(endpoint, error, own) from error
             except TimeoutError as error:
                 text = f"who listens at {endpoint} does not answer with {'QUIC' if quic else 'TLS'}"
@@ -210,8 +210,9 @@ def _why_not_theirs(code: int, host: str, own: Identity | None, theirs: Certific
     return f"{whose} is signed by '{called(theirs.issuer)}'{ours}"
 
 
-def _refused(endpoint: str, error: ssl.SSLError, own: Identity | None) -> ConfigurationError | MeshLost:
-    reason = error.reason or ""
+def _refused(endpoint: str, error: OSError, own: Identity | None) -> ConfigurationError | MeshLost:
+    # Who hangs up resets the connection if our first words have come too late to be read.
+    reason = (error.reason or "") if isinstance(error, ssl.SSLError) else "UNEXPECTED_EOF"
     alert = next((text for word, text in _BY_ALERT.items() if word in reason), None)
     if alert is not None:
         if own is None:
