@@ -15,6 +15,7 @@ this host, or of a third one, is in the folder of the run there (`-R`), and one 
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import re
@@ -37,7 +38,7 @@ from .. import __version__
 from ..config.deploy_section import HostConfig
 from ..errors import ConfigurationError, FmuMeshError, MeshLost
 from ..run.process import launch_of
-from ..run.run_plan import RunPlan, encoded
+from ..run.run_plan import RunPlan, encoded, nodes_only
 from ..system.plan import MASTER, NodePlan
 from ..text import counted
 from ..wire.runtime import rows_socket, socket_endpoint
@@ -51,6 +52,8 @@ T = TypeVar("T")
 _CONNECT_S: Final = 10
 _LEAVE_S: Final = 6.0
 """How long a helper may take to end, with ssh."""
+_END_S: Final = 1.0
+"""The same, after its last word."""
 _FORWARD_S: Final = 30.0
 _PIECE_BYTES: Final = 1 << 18
 _CONTROL_BYTES: Final = 90
@@ -67,6 +70,8 @@ _OPTIONS: Final = (
     *("ForkAfterAuthentication=no", "StdinNull=no", "SessionType=default"),
 )
 _OF_CHANNEL: Final = re.compile(r"channel \d+: open failed: ")
+_OF_SOCKET: Final = re.compile(r"connect_?\w* to \S+ port -2 failed")
+"""A process has dialled before the other one was there."""
 _FORBIDDEN: Final = "administratively prohibited"
 
 _BY_HAND: Final = "Connect once by hand: `ssh {ssh}`."
@@ -247,7 +252,7 @@ class _Host:
     def start(self, node: str) -> RemoteProcess:
         """Start a node."""
         self._processes[node] = made = RemoteProcess(lambda number: self._say(frames.Signal(node, number)))
-        self._say(frames.Start(node))
+        self._say(frames.Start(node, self._nodes[node].interpreter))
         if self.lost is not None:
             made.end(_LOST)
         return made
@@ -292,11 +297,12 @@ class _Host:
             self._said.append(str(error))
         except FmuMeshError as error:
             self.failure = error
-        if not self._leaving:
-            self._lose()
-        for process in self._processes.values():
-            process.end(_LOST)
-        self._post(lambda: None)
+        finally:
+            if not self._leaving:
+                self._lose()
+            for process in self._processes.values():
+                process.end(_LOST)
+            self._post(lambda: None)
 
     def _take(self, message: frames.FromHelper) -> None:
         match message:
@@ -311,8 +317,9 @@ class _Host:
 
     def _lose(self) -> None:
         """The connection has ended, or has to end: say why."""
-        if self._is_silent or self.failure is not None:
-            self._kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._relay.wait(0.0 if self._is_silent or self.failure is not None else _END_S)
+        self._kill()
         code = self._relay.wait()
         self._threads[1].join(1.0)
         last = self._said[-1] if self._said else ""
@@ -382,7 +389,9 @@ class _Host:
                 zenoh = replace(zenoh, rows_address=self._config.address)
             own = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh)
             plans[name] = self._content.moved(encoded(own), hello.cache)
-        self._say(frames.Prepare(plans))
+        terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
+        checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
+        self._say(frames.Prepare(nodes_only(plans), hashlib.sha256(checked).hexdigest()))
         self._mirror(Path(missing.folder))
         ready = self._heard(frames.Ready, self._link_s)
         for instance, found, expected in ready.problems[:1]:
@@ -448,7 +457,7 @@ class _Host:
                 if _FORBIDDEN in text and self.failure is None:
                     self.failure = self._forbidden(text)
                     self._post(self._kill)
-            elif text:
+            elif text and not _OF_SOCKET.match(text):
                 self._said.append(text)
                 if self.is_ready and not self._leaving:
                     self._tell(text)

@@ -34,11 +34,12 @@ __all__ = [
     "PlannedModel",
     "RunPlan",
     "encoded",
+    "nodes_only",
     "numbered",
     "opening_in",
     "read_node",
+    "read_nodes",
     "read_run",
-    "write_nodes",
 ]
 
 MANUAL = "hand"
@@ -231,7 +232,13 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
         """
         nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
-        return _written(_Parts(nodes, encoded(self)), folder)
+        file = folder / _FILE_NAME
+        try:
+            file.write_bytes(encoded(_Parts(nodes, encoded(self))))
+        except OSError as error:
+            text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
+            raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
+        return file
 
 
 class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -270,19 +277,9 @@ def opening_in(
     )
 
 
-def write_nodes(nodes: Mapping[str, bytes], folder: Path) -> Path:
-    """Write a plan of these nodes only, `encoded`, as `RunPlan.write` does."""
-    return _written(_Parts({name: msgspec.Raw(data) for name, data in nodes.items()}, msgspec.Raw(b"\xc0")), folder)
-
-
-def _written(parts: _Parts, folder: Path) -> Path:
-    file = folder / _FILE_NAME
-    try:
-        file.write_bytes(encoded(parts))
-    except OSError as error:
-        text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
-        raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
-    return file
+def nodes_only(nodes: Mapping[str, bytes]) -> bytes:
+    """The content of a file, for `read_node`, with these nodes: each as `encoded` has made it."""
+    return bytes(encoded(_Parts({name: msgspec.Raw(data) for name, data in nodes.items()}, encoded(None))))
 
 
 def read_node(file: Path, name: str) -> NodeRun:
@@ -295,6 +292,11 @@ def read_node(file: Path, name: str) -> NodeRun:
     if name not in parts.nodes:
         raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
     return _decoded(file, parts.nodes[name], NodeRun)
+
+
+def read_nodes(file: Path) -> list[NodeRun]:
+    """As `read_node`, for all nodes."""
+    return [_decoded(file, part, NodeRun) for part in _read(file).nodes.values()]
 
 
 def read_run(file: Path) -> RunPlan:
