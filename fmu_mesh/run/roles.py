@@ -44,7 +44,7 @@ from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_li
 from .limits import limit_process, strain
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
-from .process import RunProcess
+from .process import RunProcess, die_with_parent
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
 from .wiring import certified, patient, table_of, wiring
 
@@ -78,6 +78,8 @@ def job_of(role: str, plan: str, node: str = "", *others: str, forks: bool = Fal
 
         def be_node() -> None:
             setproctitle(f"fmu-mesh node {node}")
+            if run.run == MANUAL:  # one command has started all nodes of a host
+                die_with_parent()
             run_node(run)
 
         return be_node
