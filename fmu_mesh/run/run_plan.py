@@ -28,7 +28,18 @@ from ..variables.model_description import ModelDescription, Variable
 from ..wire.runtime import MeshNote
 from .limits import ring_problem
 
-__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "numbered", "opening_in", "read_node", "read_run"]
+__all__ = [
+    "MANUAL",
+    "NodeRun",
+    "PlannedModel",
+    "RunPlan",
+    "encoded",
+    "numbered",
+    "opening_in",
+    "read_node",
+    "read_run",
+    "write_nodes",
+]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
@@ -62,6 +73,8 @@ class NodeRun(msgspec.Struct, frozen=True):
         plan: the plan of the node.
         models: the models of its instances, by instance name.
         security: the certificate of this host.
+        launch: identifies the launch, on another host than that of the launcher; None: this is known.
+        helper: the process id of the helper of the launcher there.
     """
 
     config_file: Path
@@ -71,6 +84,8 @@ class NodeRun(msgspec.Struct, frozen=True):
     plan: NodePlan
     models: Mapping[str, PlannedModel]
     security: SecurityConfig | None = None
+    launch: str | None = None
+    helper: int | None = None
 
 
 class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -215,14 +230,8 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
         """
-        nodes = {name: _encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
-        file = folder / _FILE_NAME
-        try:
-            file.write_bytes(_encoded(_Parts(nodes, _encoded(self))))
-        except OSError as error:
-            text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
-            raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
-        return file
+        nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
+        return _written(_Parts(nodes, encoded(self)), folder)
 
 
 class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -261,6 +270,21 @@ def opening_in(
     )
 
 
+def write_nodes(nodes: Mapping[str, bytes], folder: Path) -> Path:
+    """Write a plan of these nodes only, `encoded`, as `RunPlan.write` does."""
+    return _written(_Parts({name: msgspec.Raw(data) for name, data in nodes.items()}, msgspec.Raw(b"\xc0")), folder)
+
+
+def _written(parts: _Parts, folder: Path) -> Path:
+    file = folder / _FILE_NAME
+    try:
+        file.write_bytes(encoded(parts))
+    except OSError as error:
+        text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
+        raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
+    return file
+
+
 def read_node(file: Path, name: str) -> NodeRun:
     """Read what one node needs from the file of a run plan.
 
@@ -293,7 +317,8 @@ def _read(file: Path) -> _Parts:
     return _decoded(file, data, _Parts)
 
 
-def _encoded(value: object) -> msgspec.Raw:
+def encoded(value: object) -> msgspec.Raw:
+    """What a process of a run needs, as it is in the file."""
     return msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=os.fspath))
 
 

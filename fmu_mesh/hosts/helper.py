@@ -1,0 +1,216 @@
+"""What runs on another host behind ssh for a launcher: `python -Pu -m fmu_mesh.hosts.helper MESH LINK_S`.
+
+It has a folder of the run and a fork server of its own, starts nodes, passes on what they write, and ends them where
+the launcher is gone: at the end of its standard input, where nobody reads what it writes, with another parent, or after
+a silence of LINK_S seconds.
+"""
+
+# Threads: the main one starts the nodes, which end with it, and alone has their state. `frames` reads what the launcher
+# sends, and answers at once that this process lives, whatever the main one does. Those of `Child` and a signal handler
+# put functions into the same queue. All write frames, one at a time.
+#
+# What may go wrong: this process is killed: the fork server, and with it the nodes, get a signal of the kernel. It is
+# stopped: it is no answer any more, so the launcher ends the connection; the nodes lose their link to the master, wake
+# this process, and ask it to end (`fmu_mesh.run.roles`). ssh passes on neither, but sshd closes standard input.
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from .. import __version__
+from ..awake import AwakeClock
+from ..config.findings import Findings
+from ..errors import FmuMeshError, LoadFailed
+from ..files import remove_tree
+from ..instances.registry import check_engines, describe
+from ..run.child import Child, Process
+from ..run.fork_server import ForkServer, executed
+from ..run.one_process import is_other_python
+from ..run.process import die_with_parent
+from ..run.run_plan import NodeRun, read_node, write_nodes
+from ..wire.runtime import remove_stale_folders, run_folder, run_name
+from . import frames
+from .content import Cache
+
+__all__ = ["main"]
+
+_LOOK_S: Final = 0.25
+_LOOK_AT_END_S: Final = 0.02
+_GRACES_S: Final = ((signal.SIGTERM, 1.5), (signal.SIGKILL, 1.0))
+"""How long nodes may take to end after each signal, if the launcher is gone."""
+
+
+class _Helper:
+    """The helper, on its main thread."""
+
+    def __init__(self, mesh: str, link_s: float, output: int) -> None:
+        self._mesh, self._link_s, self._output = mesh, link_s, output
+        self._writing = threading.Lock()
+        self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._is_over = self._heard = False
+        self._parent = os.getppid()
+        self._children: dict[str, Child] = {}
+        self._nodes: dict[str, NodeRun] = {}
+        self._trees: dict[str, dict[str, str]] = {}
+        self._cache = Cache()
+        self._run = run_name()
+        self._server = ForkServer()
+        self._watch("", self._server.process)
+
+    def run(self) -> None:
+        """Serve the launcher until it is gone."""
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda *_: self._happened.put(self._leave))
+        libc, cache = " ".join(platform.libc_ver()), str(self._cache.folder)
+        me = frames.Hello(
+            __version__, platform.python_version(), libc, platform.machine(), self._run, os.getpid(), cache
+        )
+        os.write(self._output, frames.MAGIC)
+        self._say(me)
+        threading.Thread(target=self._read, name="frames", daemon=True).start()
+        folder: Path | None = None
+        try:
+            remove_stale_folders()
+            folder = self._folder = run_folder(self._mesh, self._run)
+            self._serve()
+        except FmuMeshError as error:
+            self._say(frames.Failed(error.message, error.hint or ""))
+        except OSError as error:
+            where = f"'{error.filename}' " if error.filename else ""
+            self._say(frames.Failed(f"{where}cannot be used: {error.strerror or error}", "Is there room left?"))
+        finally:
+            self._end()
+            if folder is not None:
+                remove_tree(folder)
+
+    def _serve(self) -> None:
+        clock = AwakeClock()
+        heard_at = clock()
+        while not self._is_over:
+            with suppress(queue.Empty):
+                self._happened.get(timeout=_LOOK_S)()
+            now = clock()
+            if self._heard:
+                self._heard, heard_at = False, now
+            if now - heard_at > self._link_s or os.getppid() != self._parent:
+                self._leave()
+
+    def _leave(self) -> None:
+        self._is_over = True
+
+    def _say(self, message: frames.FromHelper) -> None:
+        """From any thread."""
+        data = memoryview(frames.framed(message))
+        try:
+            with self._writing:
+                while data:
+                    data = data[os.write(self._output, data) :]
+        except OSError:  # the launcher is gone
+            self._happened.put(self._leave)
+
+    def _read(self) -> None:
+        reader = frames.FrameReader(0)
+        while (content := reader.next()) is not None:
+            self._heard = True
+            self._say(frames.Alive())
+            if content:
+                message = msgspec.msgpack.decode(content, type=frames.ToHelper)
+                self._happened.put(partial(self._take, message))
+        self._happened.put(self._leave)
+
+    def _take(self, message: frames.ToHelper) -> None:
+        match message:
+            case frames.Offer(trees):
+                self._trees = trees
+                missing = tuple(dict.fromkeys(self._cache.missing(trees)))
+                self._say(frames.Missing(missing, str(self._folder)))
+            case frames.Piece(content, data, last):
+                self._cache.take(content, data, last=last)
+            case frames.Prepare(plans):
+                self._cache.make(self._trees)
+                self._file = write_nodes(plans, self._folder)
+                self._nodes = {name: read_node(self._file, name) for name in plans}
+                self._say(frames.Ready(tuple(self._problems())))
+            case frames.Start(node):
+                self._start(node)
+            case frames.Signal(node, number):
+                self._children[node].signal(signal.Signals(number))
+
+    def _problems(self) -> Iterator[tuple[str, str, str]]:
+        """What instances miss here: each model is described as when the run was planned, once in this cache."""
+        for run in self._nodes.values():
+            for item in run.plan.instances:
+                path, trees = Path(item.fmu), self._cache.folder / "trees"
+                terms = msgspec.json.encode((item.fmu, item.section, run.plan.limits, __version__, sys.version))
+                mark = f".checked-{hashlib.sha256(terms).hexdigest()[:16]}"
+                place = trees / path.relative_to(trees).parts[0] / mark if path.is_relative_to(trees) else None
+                if place is not None and place.exists():
+                    continue
+                findings = Findings(self._mesh)
+                try:
+                    description = describe(path if item.fmu else Path(), item.section, run.plan.limits)
+                    check_engines(
+                        {item.name: item.section}, {item.name: (path, description)}, run.plan.limits, findings
+                    )
+                except LoadFailed as error:
+                    yield item.name, error.message, error.hint or ""
+                yield from ((item.name, own.found, f"Expected {own.expected}") for own in findings)
+                if place is not None and not len(findings):
+                    place.touch()
+
+    def _start(self, node: str) -> None:
+        python = self._nodes[node].plan.interpreter
+        if python is not None and is_other_python(python):
+            self._watch(node, executed("node", str(self._file), node, interpreter=python))
+        else:
+            self._watch(node, self._server.fork(self._mesh, "node", str(self._file), node))
+
+    def _watch(self, node: str, process: Process) -> None:
+        self._children[node] = child = Child(node, process, self._happened.put)
+        child.watch(
+            lambda line: self._say(frames.Line(node, line, error=False)),
+            lambda _, line: self._say(frames.Line(node, line, error=True)),
+            lambda _, code: self._say(frames.Ended(node, code)),
+            limited=True,
+        )
+
+    def _end(self) -> None:
+        """End all nodes, and the fork server."""
+        clock = AwakeClock()
+        self._server.finish()
+        for number, grace_s in _GRACES_S:
+            end = clock() + grace_s
+            for child in self._children.values():
+                child.signal(number)
+            while any(child.running for child in self._children.values()) and clock() < end:
+                with suppress(queue.Empty):
+                    self._happened.get(timeout=_LOOK_AT_END_S)()
+        for child in self._children.values():
+            child.close()
+        self._server.close()
+
+
+def main() -> int:
+    """Be a helper, with the arguments of the module."""
+    output = os.dup(1)
+    os.dup2(2, 1)  # what is printed must not be among the frames
+    die_with_parent()
+    _Helper(sys.argv[1], float(sys.argv[2]), output).run()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
