@@ -40,7 +40,7 @@ def two_trips(plan: Plan) -> list[str]:
         source, target = (plan.nodes[plan.node_of(end)].host for end in (c.source_instance, c.target_instance))
         if c.initial_only or source == target or source not in hosts or target not in hosts:
             continue
-        if "sockets" in (hosts[source].rows, hosts[target].rows):
+        if hosts[source].rows == hosts[target].rows == "sockets":
             text = f"{c}: from '{source}' to '{target}' through the host of `launch`, which is two trips"
             sentences[c.source_instance, target] = sentences.get((c.source_instance, target), text)
     return [*sentences.values()]
