@@ -88,6 +88,7 @@ class Prepare(msgspec.Struct, frozen=True, tag=True):
     """All files are there: make the trees, write the run plan, and check the models, once for the same ``terms``."""
 
     plan: bytes
+    nodes: tuple[str, ...]
     terms: str
 
 

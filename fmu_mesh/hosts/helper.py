@@ -21,7 +21,7 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -133,12 +133,12 @@ class _Helper:
                 self._say(frames.Missing(self._cache.missing(trees), str(self._folder)))
             case frames.Piece(content, data, last):
                 self._cache.take(content, data, last=last)
-            case frames.Prepare(plan, terms):
+            case frames.Prepare(plan, nodes, terms):
                 self._cache.make(self._trees)
                 self._file = self._folder / "run.plan"
                 self._file.write_bytes(plan)
                 mark = self._cache.mark(f"{terms} {__version__} {sys.version} {sys.prefix}")
-                problems = tuple(self._problems()) if not mark.exists() else ()
+                problems = tuple(self._problems(nodes)) if not mark.exists() else ()
                 if not problems:
                     mark.touch()
                 self._say(frames.Ready(problems))
@@ -147,13 +147,13 @@ class _Helper:
             case frames.Signal(node, number):
                 self._children[node].signal(signal.Signals(number))
 
-    def _problems(self) -> Iterator[tuple[str, str, str]]:
+    def _problems(self, nodes: Sequence[str]) -> Iterator[tuple[str, str, str]]:
         """What instances miss here: each model is described as when the run was planned."""
         from ..config.findings import Findings  # noqa: PLC0415  all of these are slow, and often not needed
         from ..instances.registry import check_engines, describe  # noqa: PLC0415  as above
-        from ..run.run_plan import read_nodes  # noqa: PLC0415  as above
+        from ..run.run_plan import read_node  # noqa: PLC0415  as above
 
-        for run in read_nodes(self._file):
+        for run in (read_node(self._file, node) for node in nodes):
             for item in run.plan.instances:
                 path, limits, findings = Path(item.fmu), run.plan.limits, Findings(self._mesh)
                 try:

@@ -38,7 +38,7 @@ from .. import __version__
 from ..config.deploy_section import HostConfig
 from ..errors import ConfigurationError, FmuMeshError, MeshLost
 from ..run.process import launch_of
-from ..run.run_plan import RunPlan, encoded, nodes_only
+from ..run.run_plan import RunPlan, encoded, in_parts
 from ..system.plan import MASTER, NodePlan
 from ..text import counted
 from ..wire.runtime import rows_socket, socket_endpoint
@@ -391,7 +391,7 @@ class _Host:
             plans[name] = self._content.moved(encoded(own), hello.cache)
         terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
         checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
-        self._say(frames.Prepare(nodes_only(plans), hashlib.sha256(checked).hexdigest()))
+        self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))
         self._mirror(Path(missing.folder))
         ready = self._heard(frames.Ready, self._link_s)
         for instance, found, expected in ready.problems[:1]:

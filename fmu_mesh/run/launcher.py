@@ -34,9 +34,10 @@ from msgspec.structs import replace
 
 from ..awake import AwakeClock
 from ..config.deadlines import Deadlines
-from ..errors import Interrupted, MeshLost
+from ..errors import ConfigurationError, Interrupted, MeshLost
 from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
+from ..system.placement import manual_hosts, placed
 from ..system.plan import MASTER, RECORDER, NodePlan
 from ..wire.refused_links import RefusedLinks
 from ..wire.runtime import box_of, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
@@ -112,9 +113,14 @@ class Launcher:
         self._clock = AwakeClock()
         self._refused_links = RefusedLinks()
         config, plan = run.loaded.config, run.plan
+        manual = {name for nodes in manual_hosts(plan).values() for name in nodes}
         self._states = LaunchStates(
             LaunchTerms(
-                {n: [item.name for item in node.instances] for n, node in plan.nodes.items() if n != RECORDER},
+                {
+                    n: [item.name for item in node.instances]
+                    for n, node in plan.nodes.items()
+                    if n not in (RECORDER, *manual)
+                },
                 Deadlines.of(config.timeouts),
                 has_gateway=config.ros is not None and config.ros.profile != "rclpy",
                 start_time=plan.grid.start_time,
@@ -128,6 +134,7 @@ class Launcher:
             FmuMeshError: the run ended early, and why.
         """
         self._run.check_memory()
+        self._check_reachable()
         remove_stale_folders()
         self._folder = run_folder(self._run.mesh, self._run.run)
         try:
@@ -149,6 +156,17 @@ class Launcher:
                 self._files = rows_left([record.file for record in self._run.plan.system.records], self._folder)
             remove_tree(self._folder)
         return self._result(self._files)
+
+    def _check_reachable(self) -> None:
+        """Check that nodes that are started manually on other hosts can reach the master.
+
+        Raises:
+            ConfigurationError: it has no endpoint for them.
+        """
+        zenoh, hosts = self._run.loaded.config.zenoh, manual_hosts(self._run.plan)
+        if hosts and not (zenoh.listen or zenoh.connect):
+            text = f"the nodes of host '{next(iter(hosts))}', which has no `ssh`, cannot reach this mesh"
+            raise ConfigurationError(text, hint="Give it `listen=...` or `connect=...`, or `ssh` to the host.")
 
     def interrupt(self) -> None:
         """From any thread or signal handler: end the run; a second call ends it without waiting."""
@@ -295,6 +313,7 @@ class Launcher:
             assert outcome is not None
             self.outcome = replace(outcome, warnings=tuple(map(self._states.with_how, outcome.warnings)))
             return self.outcome
+        placed(plan, error)
         last = last_recorded(plan, files)
         if type(error) in (Interrupted, MeshLost) and last > (error.point or 0):
             error.at(last, plan.grid.time(last))

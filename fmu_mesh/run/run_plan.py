@@ -6,6 +6,7 @@ Owns the file through which they get it. Each process decodes only the parts of 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,11 +35,10 @@ __all__ = [
     "PlannedModel",
     "RunPlan",
     "encoded",
-    "nodes_only",
+    "in_parts",
     "numbered",
     "opening_in",
     "read_node",
-    "read_nodes",
     "read_run",
 ]
 
@@ -46,7 +46,9 @@ MANUAL = "hand"
 """Name of a run whose processes are started manually."""
 
 _FILE_NAME = "run.plan"
-_MOST_BYTES = 1 << 30
+_LENGTH = struct.Struct("<Q")
+_RUN = ""
+"""The name of the part with all of the run; no node has it."""
 
 T = TypeVar("T")
 
@@ -234,18 +236,11 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
         file = folder / _FILE_NAME
         try:
-            file.write_bytes(encoded(_Parts(nodes, encoded(self))))
+            file.write_bytes(in_parts({**nodes, _RUN: encoded(self)}))
         except OSError as error:
             text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
         return file
-
-
-class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file. Each process decodes one part of it; what several of them need stands in each."""
-
-    nodes: dict[str, msgspec.Raw]
-    run: msgspec.Raw
 
 
 def numbered(file: Path, resets: int) -> Path:
@@ -277,9 +272,17 @@ def opening_in(
     )
 
 
-def nodes_only(nodes: Mapping[str, bytes]) -> bytes:
-    """The content of a file, for `read_node`, with these nodes: each as `encoded` has made it."""
-    return bytes(encoded(_Parts({name: msgspec.Raw(data) for name, data in nodes.items()}, encoded(None))))
+def in_parts(parts: Mapping[str, bytes]) -> bytes:
+    """The content of a file with these parts, each `encoded`, by the names of nodes.
+
+    It has the length of an index, the index, and the parts. So who needs one part reads no other one.
+    """
+    places, end = dict[str, tuple[int, int]](), 0
+    for name, part in parts.items():
+        places[name] = end, len(part)
+        end += len(part)
+    index = msgspec.msgpack.encode(places)
+    return b"".join([_LENGTH.pack(len(index)), index, *parts.values()])
 
 
 def read_node(file: Path, name: str) -> NodeRun:
@@ -288,15 +291,7 @@ def read_node(file: Path, name: str) -> NodeRun:
     Raises:
         ConfigurationError: it cannot be read, or is no run plan.
     """
-    parts = _read(file)
-    if name not in parts.nodes:
-        raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
-    return _decoded(file, parts.nodes[name], NodeRun)
-
-
-def read_nodes(file: Path) -> list[NodeRun]:
-    """As `read_node`, for all nodes."""
-    return [_decoded(file, part, NodeRun) for part in _read(file).nodes.values()]
+    return _read(file, name, NodeRun)
 
 
 def read_run(file: Path) -> RunPlan:
@@ -305,26 +300,35 @@ def read_run(file: Path) -> RunPlan:
     Raises:
         ConfigurationError: it cannot be read, or is no run plan.
     """
-    return _decoded(file, _read(file).run, RunPlan)
+    return _read(file, _RUN, RunPlan)
 
 
-def _read(file: Path) -> _Parts:
+def _read(file: Path, name: str, type_: type[T]) -> T:
+    """One part of a file, of which nothing else is read but the index."""
     try:
         with file.open("rb") as source:
-            data = source.read(_MOST_BYTES + 1)
+            head = source.read(_LENGTH.size)
+            most = os.fstat(source.fileno()).st_size
+            length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else most
+            if length > most - len(head):
+                raise ConfigurationError(f"'{file}' is no run plan of this version of fmu_mesh: its index is cut.")
+            places = _decoded(file, source.read(length), dict[str, tuple[int, int]])
+            if name not in places:
+                raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
+            begin, size = places[name]
+            source.seek(len(head) + length + begin)
+            data = source.read(min(size, most))
     except OSError as error:
         raise ConfigurationError(f"the run plan '{file}' cannot be read: {error.strerror}.") from error
-    if len(data) > _MOST_BYTES:
-        raise ConfigurationError(f"the run plan '{file}' has more than {_MOST_BYTES} bytes.")
-    return _decoded(file, data, _Parts)
+    return _decoded(file, data, type_)
 
 
-def encoded(value: object) -> msgspec.Raw:
+def encoded(value: object) -> bytes:
     """What a process of a run needs, as it is in the file."""
-    return msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=os.fspath))
+    return msgspec.msgpack.encode(value, enc_hook=os.fspath)
 
 
-def _decoded(file: Path, data: bytes | msgspec.Raw, type_: type[T]) -> T:
+def _decoded(file: Path, data: bytes, type_: type[T]) -> T:
     def decoded_value(of_type: type[Any], value: object) -> object:
         return Path(value) if of_type is Path and isinstance(value, str) else decode_section(of_type, value)
 
