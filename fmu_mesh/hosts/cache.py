@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from ..files import cache_folder, remove_tree
+from ..files import cache_folder, remove_tree, sha256_of
 
 __all__ = ["Cache"]
 
@@ -47,9 +47,17 @@ class Cache:
         """
         for own in (self._contents, self.trees):
             own.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self.forget_drafts()
-        contents = dict.fromkeys(sha for name, own in trees.items() if not self._hold(name) for sha in own.values())
-        return tuple(sha for sha in contents if not (self._contents / sha).is_file())
+        self._forget_drafts()  # of an older process of this number
+        contents = dict.fromkeys(sha for own in trees.values() for sha in own.values())
+        for sha in contents:
+            with suppress(FileNotFoundError):
+                if sha256_of(file := self._contents / sha) != sha:  # it is damaged
+                    file.unlink()
+        missing = tuple(sha for sha in contents if not (self._contents / sha).is_file())
+        for name, tree in trees.items():
+            if not {*missing}.isdisjoint(tree.values()):
+                remove_tree(self.trees / name)
+        return missing
 
     def take(self, content: str, data: bytes, *, last: bool) -> None:
         """Take a part of a content.
@@ -87,8 +95,13 @@ class Cache:
         """A file that is there for an hour after somebody has made it, to know what was checked."""
         return self._contents / f"checked-{hashlib.sha256(terms.encode()).hexdigest()}"
 
-    def forget_drafts(self) -> None:
-        """Remove what this process has not finished."""
+    def close(self) -> None:
+        """Hold no tree any more, and remove what is not finished."""
+        while self._held:
+            os.close(self._held.pop())
+        self._forget_drafts()
+
+    def _forget_drafts(self) -> None:
         for folder in (self._contents, self.trees):
             for draft in folder.glob(f"*.{os.getpid()}"):
                 draft.unlink() if draft.is_file() else remove_tree(draft)

@@ -82,11 +82,11 @@ class _Helper:
         except FmuMeshError as error:
             self._say(frames.Failed(error.message, error.hint or ""))
         except OSError as error:
-            where = f"'{error.filename}' " if error.filename else ""
-            self._say(frames.Failed(f"{where}cannot be used: {error.strerror or error}", "Is there room left?"))
+            text = f"'{error.filename or self._cache.folder}' cannot be used: {error.strerror or error}"
+            self._say(frames.Failed(text, "Make room there."))
         finally:
             self._end()
-            self._cache.forget_drafts()
+            self._cache.close()
             if folder is not None:
                 remove_tree(folder)
 
@@ -177,7 +177,7 @@ class _Helper:
         child.watch(
             lambda line: self._say(frames.Line(node, line, error=False)),
             lambda _, line: self._say(frames.Line(node, line, error=True)),
-            lambda _, code: self._say(frames.Ended(node, code)),
+            lambda _, code: self._say(frames.Ended(node, code)) if not self._is_over else None,
             limited=True,
         )
 
