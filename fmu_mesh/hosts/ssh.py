@@ -308,9 +308,9 @@ class _Host:
             with suppress(subprocess.TimeoutExpired):
                 self._relay.wait(_LEAVE_S)
         self._kill()
-        code = self._relay.wait()
+        code = self._relay.wait()  # that of ssh, and 128 more than the number of a signal
         self._threads[1].join(1.0)
-        how = f"exit code {code}" if code >= 0 else how_it_ended(code)
+        how = f"ssh {how_it_ended(code if not 128 < code < 255 else 128 - code)}"
         if self._is_silent:
             how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
         elif self.failure is not None:
