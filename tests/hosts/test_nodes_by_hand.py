@@ -15,6 +15,7 @@ import psutil
 import pytest
 
 from tests.helpers import Launched, Place, free_port, on_a_busy_machine, wait_until, write_config
+from tests.terminal import Terminal
 
 PAIR = {"pendulum": {"fmu": "DampedPendulum"}, "delay": {"fmu": "TransportDelay"}}
 FREE = {"stop_time": None, "real_time_factor": 1.0}
@@ -118,6 +119,19 @@ def test_nodes_of_a_host_end_with_the_command(number: signal.Signals, here: Plac
     assert launch.wait() == 4, here.story()
     psutil.wait_procs(there.processes(), on_a_busy_machine(2.0))
     assert there.processes() == []
+
+
+def test_a_terminal_shows_who_is_missing_until_the_end(here: Place) -> None:
+    file = written(here.folder, "pendulum", "delay", simulation=FREE)
+    with Terminal(here, "launch", file, "--listen", f"tcp/127.0.0.1:{free_port()}", columns=200) as terminal:
+        terminal.wait_for("b  waits for pendulum, delay")
+        terminal.signal(signal.SIGINT)
+
+        assert terminal.wait() == 130
+        shown = "\n".join(terminal.shown)
+        assert "start on b (pendulum, delay): fmu-mesh node " in shown
+        assert "are there" not in shown
+        assert "waits for" not in shown
 
 
 def test_a_host_that_nobody_can_reach_is_refused_at_once(here: Place) -> None:
