@@ -85,9 +85,11 @@ class Piece(msgspec.Struct, frozen=True, tag=True):
 
 
 class Prepare(msgspec.Struct, frozen=True, tag=True):
-    """All files are there: make the trees, check the models, and write the plans of these nodes."""
+    """All files are there: make the trees, write the run plan, and check the models, once for the same ``terms``."""
 
-    plans: dict[str, bytes]
+    plan: bytes
+    nodes: tuple[str, ...]
+    terms: str
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):
@@ -97,9 +99,10 @@ class Ready(msgspec.Struct, frozen=True, tag=True):
 
 
 class Start(msgspec.Struct, frozen=True, tag=True):
-    """Start a node."""
+    """Start a node, with this Python; None: that of the helper."""
 
     node: str
+    interpreter: str | None
 
 
 class Signal(msgspec.Struct, frozen=True, tag=True):

@@ -15,14 +15,13 @@ a silence of LINK_S seconds.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
 import queue
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -32,18 +31,13 @@ import msgspec
 
 from .. import __version__
 from ..awake import AwakeClock
-from ..config.findings import Findings
 from ..errors import FmuMeshError, LoadFailed
 from ..files import remove_tree
-from ..instances.registry import check_engines, describe
 from ..run.child import Child, Process
 from ..run.fork_server import ForkServer, executed
-from ..run.one_process import is_other_python
-from ..run.process import die_with_parent
-from ..run.run_plan import NodeRun, read_node, write_nodes
 from ..wire.runtime import remove_stale_folders, run_folder, run_name
 from . import frames
-from .content import Cache
+from .cache import Cache
 
 __all__ = ["main"]
 
@@ -63,7 +57,6 @@ class _Helper:
         self._is_over = self._heard = False
         self._parent = os.getppid()
         self._children: dict[str, Child] = {}
-        self._nodes: dict[str, NodeRun] = {}
         self._trees: dict[str, dict[str, str]] = {}
         self._cache = Cache()
         self._run = run_name()
@@ -74,25 +67,26 @@ class _Helper:
         """Serve the launcher until it is gone."""
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, lambda *_: self._happened.put(self._leave))
-        libc, cache = " ".join(platform.libc_ver()), str(self._cache.folder)
-        me = frames.Hello(
-            __version__, platform.python_version(), libc, platform.machine(), self._run, os.getpid(), cache
-        )
+        there = platform.python_version(), " ".join(platform.libc_ver()), platform.machine()
         os.write(self._output, frames.MAGIC)
-        self._say(me)
+        self._say(frames.Hello(__version__, *there, self._run, os.getpid(), str(self._cache.trees)))
         threading.Thread(target=self._read, name="frames", daemon=True).start()
         folder: Path | None = None
         try:
+            from ..run.process import die_with_parent  # noqa: PLC0415  imported while the launcher is busy
+
+            die_with_parent()
             remove_stale_folders()
             folder = self._folder = run_folder(self._mesh, self._run)
             self._serve()
         except FmuMeshError as error:
             self._say(frames.Failed(error.message, error.hint or ""))
         except OSError as error:
-            where = f"'{error.filename}' " if error.filename else ""
-            self._say(frames.Failed(f"{where}cannot be used: {error.strerror or error}", "Is there room left?"))
+            text = f"'{error.filename or self._cache.folder}' cannot be used: {error.strerror or error}"
+            self._say(frames.Failed(text, "Make room there."))
         finally:
             self._end()
+            self._cache.close()
             if folder is not None:
                 remove_tree(folder)
 
@@ -123,67 +117,67 @@ class _Helper:
 
     def _read(self) -> None:
         reader = frames.FrameReader(0)
-        while (content := reader.next()) is not None:
-            self._heard = True
-            self._say(frames.Alive())
-            if content:
-                message = msgspec.msgpack.decode(content, type=frames.ToHelper)
-                self._happened.put(partial(self._take, message))
-        self._happened.put(self._leave)
+        try:
+            while (content := reader.next()) is not None:
+                self._heard = True
+                self._say(frames.Alive())
+                if content:
+                    self._happened.put(partial(self._take, msgspec.msgpack.decode(content, type=frames.ToHelper)))
+        finally:
+            self._happened.put(self._leave)
 
     def _take(self, message: frames.ToHelper) -> None:
         match message:
             case frames.Offer(trees):
                 self._trees = trees
-                missing = tuple(dict.fromkeys(self._cache.missing(trees)))
-                self._say(frames.Missing(missing, str(self._folder)))
+                self._say(frames.Missing(self._cache.missing(trees), str(self._folder)))
             case frames.Piece(content, data, last):
                 self._cache.take(content, data, last=last)
-            case frames.Prepare(plans):
+            case frames.Prepare(plan, nodes, terms):
                 self._cache.make(self._trees)
-                self._file = write_nodes(plans, self._folder)
-                self._nodes = {name: read_node(self._file, name) for name in plans}
-                self._say(frames.Ready(tuple(self._problems())))
-            case frames.Start(node):
-                self._start(node)
+                self._file = self._folder / "run.plan"
+                self._file.write_bytes(plan)
+                mark = self._cache.mark(f"{terms} {__version__} {sys.version} {sys.prefix}")
+                problems = tuple(self._problems(nodes)) if not mark.exists() else ()
+                if not problems:
+                    mark.touch()
+                self._say(frames.Ready(problems))
+            case frames.Start(node, interpreter):
+                self._start(node, interpreter)
             case frames.Signal(node, number):
                 self._children[node].signal(signal.Signals(number))
 
-    def _problems(self) -> Iterator[tuple[str, str, str]]:
-        """What instances miss here: each model is described as when the run was planned, once in this cache."""
-        for run in self._nodes.values():
+    def _problems(self, nodes: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+        """What instances miss here: each model is described as when the run was planned."""
+        from ..config.findings import Findings  # noqa: PLC0415  all of these are slow, and often not needed
+        from ..instances.registry import check_engines, describe  # noqa: PLC0415  as above
+        from ..run.run_plan import read_node  # noqa: PLC0415  as above
+
+        for run in (read_node(self._file, node) for node in nodes):
             for item in run.plan.instances:
-                path, trees = Path(item.fmu), self._cache.folder / "trees"
-                terms = msgspec.json.encode((item.fmu, item.section, run.plan.limits, __version__, sys.version))
-                mark = f".checked-{hashlib.sha256(terms).hexdigest()[:16]}"
-                place = trees / path.relative_to(trees).parts[0] / mark if path.is_relative_to(trees) else None
-                if place is not None and place.exists():
-                    continue
-                findings = Findings(self._mesh)
+                path, limits, findings = Path(item.fmu), run.plan.limits, Findings(self._mesh)
                 try:
-                    description = describe(path if item.fmu else Path(), item.section, run.plan.limits)
-                    check_engines(
-                        {item.name: item.section}, {item.name: (path, description)}, run.plan.limits, findings
-                    )
+                    model = path, describe(path, item.section, limits)
+                    check_engines({item.name: item.section}, {item.name: model}, limits, findings)
                 except LoadFailed as error:
                     yield item.name, error.message, error.hint or ""
                 yield from ((item.name, own.found, f"Expected {own.expected}") for own in findings)
-                if place is not None and not len(findings):
-                    place.touch()
 
-    def _start(self, node: str) -> None:
-        python = self._nodes[node].plan.interpreter
-        if python is not None and is_other_python(python):
-            self._watch(node, executed("node", str(self._file), node, interpreter=python))
-        else:
-            self._watch(node, self._server.fork(self._mesh, "node", str(self._file), node))
+    def _start(self, node: str, interpreter: str | None) -> None:
+        if interpreter is not None:
+            from ..run.one_process import is_other_python  # noqa: PLC0415  as above
+
+            if is_other_python(interpreter):
+                self._watch(node, executed("node", str(self._file), node, interpreter=interpreter))
+                return
+        self._watch(node, self._server.fork(self._mesh, "node", str(self._file), node))
 
     def _watch(self, node: str, process: Process) -> None:
         self._children[node] = child = Child(node, process, self._happened.put)
         child.watch(
             lambda line: self._say(frames.Line(node, line, error=False)),
             lambda _, line: self._say(frames.Line(node, line, error=True)),
-            lambda _, code: self._say(frames.Ended(node, code)),
+            lambda _, code: self._say(frames.Ended(node, code)) if not self._is_over else None,
             limited=True,
         )
 
@@ -207,7 +201,6 @@ def main() -> int:
     """Be a helper, with the arguments of the module."""
     output = os.dup(1)
     os.dup2(2, 1)  # what is printed must not be among the frames
-    die_with_parent()
     _Helper(sys.argv[1], float(sys.argv[2]), output).run()
     return 0
 

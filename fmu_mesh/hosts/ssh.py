@@ -15,6 +15,8 @@ this host, or of a third one, is in the folder of the run there (`-R`), and one 
 
 from __future__ import annotations
 
+import hashlib
+import math
 import os
 import platform
 import re
@@ -35,9 +37,12 @@ from msgspec.structs import replace
 
 from .. import __version__
 from ..config.deploy_section import HostConfig
+from ..config.instance_sections import PhysicsSection
 from ..errors import ConfigurationError, FmuMeshError, MeshLost
+from ..files import beside
+from ..run.child import how_it_ended
 from ..run.process import launch_of
-from ..run.run_plan import RunPlan, encoded
+from ..run.run_plan import RunPlan, encoded, in_parts
 from ..system.plan import MASTER, NodePlan
 from ..text import counted
 from ..wire.runtime import rows_socket, socket_endpoint
@@ -51,6 +56,8 @@ T = TypeVar("T")
 _CONNECT_S: Final = 10
 _LEAVE_S: Final = 6.0
 """How long a helper may take to end, with ssh."""
+_END_S: Final = 1.0
+"""The same, after its last word."""
 _FORWARD_S: Final = 30.0
 _PIECE_BYTES: Final = 1 << 18
 _CONTROL_BYTES: Final = 90
@@ -58,15 +65,18 @@ _CONTROL_BYTES: Final = 90
 _LINES: Final = 20
 _LOST: Final = -signal.SIGHUP
 """The exit code of nodes whose host is lost."""
-_OF_SSH: Final = 255
-_NO_COMMAND: Final = 127
+_NO_COMMAND: Final = (126, 127)
+"""The exit codes of a shell that cannot start a command."""
 
 _OPTIONS: Final = (
+    "IgnoreUnknown=ForkAfterAuthentication,StdinNull,SessionType",  # of versions before 8.7
     *("BatchMode=yes", f"ConnectTimeout={_CONNECT_S}", "Compression=no", "ControlPersist=no", "LogLevel=INFO"),
     *("RequestTTY=no", "RemoteCommand=none", "PermitLocalCommand=no", "ForwardAgent=no", "ForwardX11=no"),
     *("ForkAfterAuthentication=no", "StdinNull=no", "SessionType=default"),
 )
 _OF_CHANNEL: Final = re.compile(r"channel \d+: open failed: ")
+_OF_SOCKET: Final = re.compile(r"connect_?\w* to \S+ port -2 failed")
+"""A process has dialled before the other one was there."""
 _FORBIDDEN: Final = "administratively prohibited"
 
 _BY_HAND: Final = "Connect once by hand: `ssh {ssh}`."
@@ -79,7 +89,7 @@ _HINTS: Final = {
     "Could not resolve hostname": "Is `ssh: {ssh}` right? It is [user@]host, or a name of ~/.ssh/config.",
     "kex_exchange_identification": "Its sshd may refuse so many connections at once: see `MaxStartups` there.",
     "Connection refused": "Does an sshd run there?",
-    "No module named": "Install fmu-mesh {version} for `{python}` there.",
+    "No module named": "There is no fmu_mesh {version} for `{python}` there, or a part of it is missing: install it.",
 }
 
 
@@ -103,6 +113,11 @@ class SshHosts:
         if which("ssh") is None:
             hint = "Install it, on Debian with `apt install openssh-client`."
             raise ConfigurationError("there is no `ssh` on this host, and the mesh has nodes on others", hint=hint)
+        shown = [own for own, section in run.loaded.config.instances.items() if isinstance(section, PhysicsSection)]
+        away = [own for own in shown if run.plan.nodes[run.plan.node_of(own)].host in run.plan.hosts]
+        if run.showing and away:
+            text = f"the world of '{away[0]}' can be shown on the host of `launch` only, and it is on another one"
+            raise ConfigurationError(text)
         self._hosts: dict[str, _Host] = {}
         for name, config in run.plan.hosts.items():
             if config.ssh is not None:
@@ -153,6 +168,7 @@ class RemoteProcess:
         self._send = send
         self._code: int | None = None
         self._ended = threading.Event()
+        self._ending = threading.Lock()
         (output, self._output), (errors, self._errors) = os.pipe(), os.pipe()
         self.stdout, self.stderr = os.fdopen(output, "rb"), os.fdopen(errors, "rb")
 
@@ -176,12 +192,13 @@ class RemoteProcess:
             os.write(self._errors if error else self._output, data)
 
     def end(self, code: int) -> None:
-        """On the thread of its host: it has ended."""
-        if self._code is None:
-            self._code = code
-            os.close(self._output)
-            os.close(self._errors)
-            self._ended.set()
+        """From any thread: it has ended, unless that is known."""
+        with self._ending:
+            if self._code is None:
+                self._code = code
+                os.close(self._output)
+                os.close(self._errors)
+                self._ended.set()
 
 
 class _Host:
@@ -211,7 +228,10 @@ class _Host:
         self._link_s = run.loaded.config.timeouts.link
         self._nodes = {key: node for key, node in run.plan.nodes.items() if node.host == name}
         records = [Path(record.file) for record in run.plan.system.records]
-        self._content = Content(name, [*self._nodes.values()], records)
+        own, zenoh = run.config_file, run.loaded.config.zenoh.config
+        self._zenoh = str(beside(own, zenoh)) if zenoh is not None else None
+        tables = [Path(self._zenoh)] if self._zenoh is not None else []
+        self._content = Content(name, [*self._nodes.values()], tables, records)
         self._processes: dict[str, RemoteProcess] = {}
         self._writing = threading.Lock()
         self._said: deque[str] = deque(maxlen=_LINES)
@@ -222,7 +242,7 @@ class _Host:
 
     def begin(self) -> None:
         """Connect; `is_ready` or `failure` follows."""
-        alive_s = max(1, round(self._link_s / 4))
+        alive_s = math.ceil(self._link_s / 3)
         more = "ClearAllForwardings=yes", f"ServerAliveInterval={alive_s}", "ServerAliveCountMax=3", "ControlMaster=yes"
         options = [word for option in (*_OPTIONS, *more) for word in ("-o", option)]
         helper = f"exec {self._config.python} -Pu -m {__package__}.helper {self._run.mesh} {self._link_s:g}"
@@ -247,8 +267,8 @@ class _Host:
     def start(self, node: str) -> RemoteProcess:
         """Start a node."""
         self._processes[node] = made = RemoteProcess(lambda number: self._say(frames.Signal(node, number)))
-        self._say(frames.Start(node))
-        if self.lost is not None:
+        self._say(frames.Start(node, self._nodes[node].interpreter))
+        if self.lost is not None:  # its thread may have ended all others before
             made.end(_LOST)
         return made
 
@@ -262,7 +282,7 @@ class _Host:
     def close(self) -> None:
         """Wait for the end, and close what is open."""
         with suppress(subprocess.TimeoutExpired):
-            self._relay.wait(_LEAVE_S if self.lost is None else 0.0)
+            self._relay.wait(_LEAVE_S if self.is_ready and self.lost is None else 0.0)
         self._kill()
         for thread in self._threads:
             thread.join(1.0)
@@ -292,11 +312,12 @@ class _Host:
             self._said.append(str(error))
         except FmuMeshError as error:
             self.failure = error
-        if not self._leaving:
-            self._lose()
-        for process in self._processes.values():
-            process.end(_LOST)
-        self._post(lambda: None)
+        finally:
+            if not self._leaving:
+                self._lose()
+            for process in [*self._processes.values()]:
+                process.end(_LOST)
+            self._post(lambda: None)
 
     def _take(self, message: frames.FromHelper) -> None:
         match message:
@@ -311,26 +332,27 @@ class _Host:
 
     def _lose(self) -> None:
         """The connection has ended, or has to end: say why."""
-        if self._is_silent or self.failure is not None:
-            self._kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._relay.wait(0.0 if self._is_silent or self.failure is not None else _END_S)
+        self._kill()
         code = self._relay.wait()
         self._threads[1].join(1.0)
-        last = self._said[-1] if self._said else ""
+        last = self.failure.message if self.failure is not None else self._said[-1] if self._said else ""
         if self._is_silent:
             how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
         else:
-            how = f"exit code {code}: {last}" if last else f"exit code {code}"
-        what = "the ssh connection to" if code == _OF_SSH or self._is_silent else "the helper of fmu_mesh on"
-        self.lost = f"ran on host '{self._name}', and {what} it was lost ({how})"
+            how = f"exit code {code}" if code >= 0 else how_it_ended(code)
+            how += f": {last}" if last else ""
+        self.lost = f"is gone: the ssh connection to {self._name} was lost ({how})"
         if self.failure is None and not self.is_ready:
             self.failure = self._in_words(code, how)
 
     def _in_words(self, code: int, how: str) -> FmuMeshError:
         """Why nothing could be started there."""
-        text = f"no node can be started on host '{self._name}' (`ssh {self._ssh}`): {how}"
+        text = f"no node can be started on {self._name} with `ssh {self._ssh}`: {how}"
         said, hint = "\n".join(self._said), None
-        if code == _NO_COMMAND:
-            hint = f"Is `python: {self._config.python}` the path of a Python on host '{self._name}'?"
+        if code in _NO_COMMAND:
+            hint = f"Is `{self._config.python}` the path of a Python on {self._name}?"
         for words, what in _HINTS.items():
             if words in said:
                 hint = what.format(ssh=self._ssh, python=self._config.python, version=__version__)
@@ -346,7 +368,7 @@ class _Host:
         while True:
             match self._next(limit_s):
                 case frames.Failed(text, hint):
-                    raise ConfigurationError(f"host '{self._name}': {text}", hint=hint or None)
+                    raise ConfigurationError(f"{self._name} cannot take part: {text}", hint=hint or None)
                 case None:
                     raise EOFError
                 case message if isinstance(message, kind):
@@ -377,17 +399,18 @@ class _Host:
         launch = launch_of(self._run.run)
         for name in self._nodes:
             own = self._run.node(name)
-            zenoh = own.zenoh
-            if self._config.rows == "tcp":
-                zenoh = replace(zenoh, rows_address=self._config.address)
+            rows = self._config.address if self._config.rows == "tcp" else own.zenoh.rows_address
+            zenoh = replace(own.zenoh, config=self._zenoh, rows_address=rows)
             own = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh)
             plans[name] = self._content.moved(encoded(own), hello.cache)
-        self._say(frames.Prepare(plans))
+        terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
+        checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
+        self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))
         self._mirror(Path(missing.folder))
         ready = self._heard(frames.Ready, self._link_s)
         for instance, found, expected in ready.problems[:1]:
             more = f" (and {counted(len(ready.problems) - 1, 'problem')} more)" if len(ready.problems) > 1 else ""
-            text = f"host '{self._name}' cannot run '{instance}': {found.rstrip('.')}{more}"
+            text = f"{self._name} cannot run '{instance}': {found.rstrip('.')}{more}"
             raise ConfigurationError(text, hint=expected or None)
 
     def _compare(self, hello: frames.Hello) -> None:
@@ -397,7 +420,7 @@ class _Host:
             ConfigurationError: it has another version of fmu_mesh.
         """
         if hello.version != __version__:
-            text = f"host '{self._name}' has fmu_mesh {hello.version}, and here is {__version__}"
+            text = f"{self._name} has fmu_mesh {hello.version}, here {__version__}"
             raise ConfigurationError(text, hint=f"Install the same version there, for `{self._config.python}`.")
         libc = " ".join(platform.libc_ver())
         own = {"Python": platform.python_version(), "the libc": libc, "the processor": platform.machine()}
@@ -423,19 +446,19 @@ class _Host:
                 for path in (own, rows_socket(here, name)) if by_ssh else (own,):
                     ends = (there / path.name, path) if option == "-R" else (here / path.name, there / path.name)
                     options += [option, f"{ends[0]}:{ends[1]}"]
-        more = [word for option in _OPTIONS for word in ("-o", option)]
-        command = ["ssh", "-S", str(self._control), *more, "-o", "ClearAllForwardings=no", "-O", "forward", *options]
+        # The file of the user might forward more.
+        command = ["ssh", "-F", os.devnull, "-S", str(self._control), "-O", "forward", *options]
         try:
             done = subprocess.run(
                 [*command, self._ssh], stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=_FORWARD_S
             )
         except subprocess.TimeoutExpired as error:
-            raise MeshLost(f"host '{self._name}' has not made the sockets within {_FORWARD_S:g} s") from error
+            raise MeshLost(f"{self._name} has not made the sockets within {_FORWARD_S:g} s") from error
         if done.returncode != 0:
             raise self._forbidden(" ".join(done.stderr.decode(errors="replace").split()))
 
     def _forbidden(self, said: str) -> ConfigurationError:
-        text = f"the sshd of host '{self._name}' forwards no Unix sockets: {said}"
+        text = f"the sshd of {self._name} forwards no Unix sockets: {said}"
         return ConfigurationError(text, hint="`AllowStreamLocalForwarding yes` in its sshd_config allows it.")
 
     # --- the thread that reads what ssh writes
@@ -448,7 +471,7 @@ class _Host:
                 if _FORBIDDEN in text and self.failure is None:
                     self.failure = self._forbidden(text)
                     self._post(self._kill)
-            elif text:
+            elif text and not _OF_SOCKET.match(text):
                 self._said.append(text)
                 if self.is_ready and not self._leaving:
                     self._tell(text)

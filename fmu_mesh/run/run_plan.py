@@ -35,11 +35,11 @@ __all__ = [
     "PlannedModel",
     "RunPlan",
     "encoded",
+    "in_parts",
     "numbered",
     "opening_in",
     "read_node",
     "read_run",
-    "write_nodes",
 ]
 
 MANUAL = "hand"
@@ -234,7 +234,13 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
         """
         nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
-        return _written({**nodes, _RUN: encoded(self)}, folder)
+        file = folder / _FILE_NAME
+        try:
+            file.write_bytes(in_parts({**nodes, _RUN: encoded(self)}))
+        except OSError as error:
+            text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
+            raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
+        return file
 
 
 def numbered(file: Path, resets: int) -> Path:
@@ -266,25 +272,17 @@ def opening_in(
     )
 
 
-def write_nodes(nodes: Mapping[str, bytes], folder: Path) -> Path:
-    """Write a plan of these nodes only, `encoded`, as `RunPlan.write` does."""
-    return _written(nodes, folder)
+def in_parts(parts: Mapping[str, bytes]) -> bytes:
+    """The content of a file with these parts, each `encoded`, by the names of nodes.
 
-
-def _written(parts: Mapping[str, bytes], folder: Path) -> Path:
-    """Write a file: the length of an index, the index, and the parts. So who needs one part reads no other one."""
+    It has the length of an index, the index, and the parts. So who needs one part reads no other one.
+    """
     places, end = dict[str, tuple[int, int]](), 0
     for name, part in parts.items():
         places[name] = end, len(part)
         end += len(part)
     index = msgspec.msgpack.encode(places)
-    file = folder / _FILE_NAME
-    try:
-        file.write_bytes(b"".join([_LENGTH.pack(len(index)), index, *parts.values()]))
-    except OSError as error:
-        text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
-        raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
-    return file
+    return b"".join([_LENGTH.pack(len(index)), index, *parts.values()])
 
 
 def read_node(file: Path, name: str) -> NodeRun:
