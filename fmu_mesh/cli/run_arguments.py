@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ..config.call_options import option_fields
 from ..run.options import SimulateOptions
@@ -69,6 +71,33 @@ def _with_key(flag: str, text: str) -> ArgumentPart:
     return argument(flag, "VARIABLE=KEY", f"{text}; repeatable", type=_end, action="append", default=[])
 
 
+class _Instead(argparse.Action):
+    """An option that stands for an argument, which is not needed with it.
+
+    With `nargs="?"` for the argument, argparse would not find it behind an option.
+    """
+
+    def __init__(self, argument_: argparse.Action, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
+        super().__init__(**details)
+        self._argument = argument_
+
+    def __call__(
+        self,
+        _parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        _option: str | None = None,
+    ) -> None:
+        self._argument.required = False
+        setattr(namespace, self.dest, values)
+
+
+def _add_nodes(parser: argparse._ActionsContainer) -> None:
+    node = parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
+    text = "start all nodes of this host of `deploy.hosts` instead, each in a process"
+    parser.add_argument("--host", metavar="NAME", help=text, action=partial(_Instead, node))
+
+
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
@@ -80,8 +109,7 @@ PARSERS: Parsers = {
     "node": (
         *CONFIGURED,
         options("view", "video"),
-        argument("--host", "NAME", "start all nodes of this host of `deploy.hosts`, each in a process"),
-        argument("node", "INSTANCE", "name of the instance, or of its group", nargs="?"),
+        _add_nodes,
     ),
     "master": (*CONFIGURED, options("paused", "profile"), _PLOT, *_OUTPUT),
     "gateway": (*CONFIGURED, QUIET),
