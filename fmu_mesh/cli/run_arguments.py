@@ -71,15 +71,15 @@ def _with_key(flag: str, text: str) -> ArgumentPart:
     return argument(flag, "VARIABLE=KEY", f"{text}; repeatable", type=_end, action="append", default=[])
 
 
-class _Instead(argparse.Action):
-    """An option that stands for an argument, which is not needed with it.
+class _Stored(argparse.Action):
+    """An argument, or an option with which another argument is not needed.
 
-    With `nargs="?"` for the argument, argparse would not find it behind an option.
+    With `nargs="?"` for that argument, argparse would not find it behind an option.
     """
 
-    def __init__(self, argument_: argparse.Action, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
+    def __init__(self, instead: _Stored | None = None, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
         super().__init__(**details)
-        self._argument = argument_
+        self._instead = instead
 
     def __call__(
         self,
@@ -88,14 +88,19 @@ class _Instead(argparse.Action):
         values: object,
         _option: str | None = None,
     ) -> None:
-        self._argument.required = False
-        setattr(namespace, self.dest, values)
+        vars(namespace)[self.dest] = values
+        if self._instead is not None:
+            self._instead.spare()
+
+    def spare(self) -> None:
+        """It is not needed."""
+        self.required = False
 
 
 def _add_nodes(parser: argparse._ActionsContainer) -> None:
-    node = parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group")
+    node = parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group", action=_Stored)
     text = "start all nodes of this host of `deploy.hosts` instead, each in a process"
-    parser.add_argument("--host", metavar="NAME", help=text, action=partial(_Instead, node))
+    parser.add_argument("--host", metavar="NAME", help=text, action=partial(_Stored, node))
 
 
 PARSERS: Parsers = {

@@ -168,7 +168,7 @@ def test_a_host_without_nodes_is_refused(here: Place) -> None:
     )
 
 
-def test_a_node_that_is_lost_before_the_master_knows_it_ends_the_others(there: Place) -> None:
+def test_a_node_that_is_lost_early_ends_the_others(there: Place) -> None:
     file = written(there.folder, "pendulum", "delay")
     by_hand = there.start("node", file, "--host", "b", "--connect", f"tcp/127.0.0.1:{free_port()}")
     nodes = wait_until(lambda: found if len(found := there.processes("node")) == 2 else None, "two nodes")
