@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +76,7 @@ class _Stored(argparse.Action):
     With `nargs="?"` for that argument, argparse would not find it behind an option.
     """
 
-    def __init__(self, instead: _Stored | None = None, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
+    def __init__(self, instead: argparse.Action | None = None, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
         super().__init__(**details)
         self._instead = instead
 
@@ -89,7 +88,7 @@ class _Stored(argparse.Action):
         _option: str | None = None,
     ) -> None:
         vars(namespace)[self.dest] = values
-        if self._instead is not None:
+        if isinstance(self._instead, _Stored):
             self._instead.spare()
 
     def spare(self) -> None:
@@ -100,7 +99,7 @@ class _Stored(argparse.Action):
 def _add_nodes(parser: argparse._ActionsContainer) -> None:
     node = parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group", action=_Stored)
     text = "start all nodes of this host of `deploy.hosts` instead, each in a process"
-    parser.add_argument("--host", metavar="NAME", help=text, action=partial(_Stored, node))
+    parser.add_argument("--host", metavar="NAME", help=text, action=_Stored, instead=node)
 
 
 PARSERS: Parsers = {

@@ -29,8 +29,9 @@ SSH = {"ssh": "user@b", "python": "~/mesh/bin/python"}
 def placed(folder: Path, hosts: dict[str, Any] | None, **of: str) -> Path:
     """A pendulum and a delay on these hosts, with these entries of `deploy.hosts`; None: without the section."""
     instances = {name: {**own, **({"host": of[name]} if name in of else {})} for name, own in PAIR.items()}
-    sections = {"deploy": {"hosts": hosts}} if hosts is not None else {}
-    return write_config(folder, instances=instances, **sections)
+    if hosts is None:
+        return write_config(folder, instances=instances)
+    return write_config(folder, instances=instances, deploy={"hosts": hosts})
 
 
 def findings_of(file: Path) -> list[str]:
