@@ -64,8 +64,9 @@ class NetworkHost:
             shutil.copytree(_ROOT / part, folder / "own-clone" / part)
         lines = [f"{address} {other}\n" for other, address in addresses.items()]
         (folder / "etc_hosts").write_text("".join(lines), encoding="utf-8")
-        users = Path("/etc/passwd").read_text(encoding="utf-8")
-        (folder / "etc_passwd").write_text(_ROOT_S_HOME.sub(rf"\g<1>{HOME}", users), encoding="utf-8")
+        users = _ROOT_S_HOME.sub(rf"\g<1>{HOME}", Path("/etc/passwd").read_text(encoding="utf-8"))
+        users += f"user:x:0:0::{HOME}:/bin/bash\n"  # as the pages call the one who works there
+        (folder / "etc_passwd").write_text(users, encoding="utf-8")
         steps = (
             f"hostname {name}",
             "ip link set lo up",

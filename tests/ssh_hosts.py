@@ -21,7 +21,7 @@ import pytest
 from tests.helpers import DEADLINE_S, Launched
 from tests.network_hosts import HOME, NEEDS_HOSTS, NetworkHost, started_hosts
 
-__all__ = ["NEEDS_SSH", "PYTHON", "SshHosts", "ssh_hosts"]
+__all__ = ["NEEDS_SSH", "PYTHON", "SshHosts", "ssh_hosts", "why_not"]
 
 PYTHON: Final = sys.executable
 """The Python of all hosts."""
@@ -30,10 +30,15 @@ _SSHD: Final = shutil.which("sshd", path="/usr/sbin:/usr/local/sbin")
 _SEPARATION: Final = Path("/run/sshd")
 """An empty folder that sshd of Debian wants; a service would make it."""
 
-NEEDS_SSH = [
-    NEEDS_HOSTS,
-    pytest.mark.skipif(_SSHD is None, reason="needs sshd: apt install openssh-server"),
-]
+
+def why_not() -> str:
+    """Why there can be no such hosts here; empty if they can."""
+    if _SSHD is None:
+        return "needs sshd: apt install openssh-server"
+    return str(NEEDS_HOSTS.kwargs["reason"]) if NEEDS_HOSTS.args[0] else ""
+
+
+NEEDS_SSH = pytest.mark.skipif(bool(why_not()), reason=why_not() or "can run")
 
 
 class SshHosts:

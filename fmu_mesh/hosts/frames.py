@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import platform
 import select
 import struct
 from typing import Final
@@ -18,6 +19,7 @@ from ..awake import AwakeClock
 
 __all__ = [
     "MAGIC",
+    "PROBE",
     "Alive",
     "Ended",
     "Failed",
@@ -34,9 +36,13 @@ __all__ = [
     "Start",
     "ToHelper",
     "framed",
+    "this_system",
 ]
 
 MAGIC: Final = b"\x00fmu_mesh helper\x00"
+
+PROBE: Final = "probe"
+"""A socket in the folder of the run at the helper, which sends a byte to the first one who comes."""
 
 _LENGTH: Final = struct.Struct("<I")
 _READ_BYTES: Final = 1 << 18
@@ -146,6 +152,11 @@ def framed(message: ToHelper | FromHelper) -> bytes:
     """A message as a frame."""
     data = msgspec.msgpack.encode(message)
     return _LENGTH.pack(len(data)) + data
+
+
+def this_system() -> tuple[str, str, str]:
+    """The version of Python, the C library, and the processor of this host."""
+    return platform.python_version(), " ".join(platform.libc_ver()), platform.machine()
 
 
 class FrameReader:

@@ -16,9 +16,9 @@ a silence of LINK_S seconds.
 from __future__ import annotations
 
 import os
-import platform
 import queue
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -67,9 +67,8 @@ class _Helper:
         """Serve the launcher until it is gone."""
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, lambda *_: self._happened.put(self._leave))
-        there = platform.python_version(), " ".join(platform.libc_ver()), platform.machine()
         os.write(self._output, frames.MAGIC)
-        self._say(frames.Hello(__version__, *there, self._run, os.getpid(), str(self._cache.trees)))
+        self._say(frames.Hello(__version__, *frames.this_system(), self._run, os.getpid(), str(self._cache.trees)))
         threading.Thread(target=self._read, name="frames", daemon=True).start()
         folder: Path | None = None
         try:
@@ -130,6 +129,9 @@ class _Helper:
         match message:
             case frames.Offer(trees):
                 self._trees = trees
+                (door := socket.socket(socket.AF_UNIX)).bind(str(self._folder / frames.PROBE))
+                door.listen()
+                threading.Thread(target=self._answer_probe, args=(door,), name="probe", daemon=True).start()
                 self._say(frames.Missing(self._cache.missing(trees), str(self._folder)))
             case frames.Piece(content, data, last):
                 self._cache.take(content, data, last=last)
@@ -146,6 +148,11 @@ class _Helper:
                 self._start(node, interpreter)
             case frames.Signal(node, number):
                 self._children[node].signal(signal.Signals(number))
+
+    @staticmethod
+    def _answer_probe(door: socket.socket) -> None:
+        with door, suppress(OSError), door.accept()[0] as tried:
+            tried.send(b"1")
 
     def _problems(self, nodes: Sequence[str]) -> Iterator[tuple[str, str, str]]:
         """What instances miss here: each model is described as when the run was planned."""

@@ -18,9 +18,9 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import platform
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -36,7 +36,6 @@ import msgspec
 from msgspec.structs import replace
 
 from .. import __version__
-from ..config.deploy_section import HostConfig
 from ..config.instance_sections import PhysicsSection
 from ..errors import ConfigurationError, FmuMeshError, MeshLost
 from ..files import beside
@@ -44,7 +43,6 @@ from ..run.child import how_it_ended
 from ..run.process import launch_of
 from ..run.run_plan import RunPlan, encoded, in_parts
 from ..system.plan import MASTER, NodePlan
-from ..text import counted
 from ..wire.runtime import rows_socket, socket_endpoint
 from . import frames, relay
 from .content import Content
@@ -52,21 +50,18 @@ from .content import Content
 __all__ = ["SshHosts"]
 
 T = TypeVar("T")
+Post = Callable[[Callable[[], None]], None]
+"""Calls a function on the launcher's thread."""
 
 _CONNECT_S: Final = 10
 _LEAVE_S: Final = 6.0
 """How long a helper may take to end, with ssh."""
-_END_S: Final = 1.0
-"""The same, after its last word."""
 _FORWARD_S: Final = 30.0
 _PIECE_BYTES: Final = 1 << 18
 _CONTROL_BYTES: Final = 90
 """The longest path of a control socket: ssh adds 17 bytes to it."""
-_LINES: Final = 20
 _LOST: Final = -signal.SIGHUP
 """The exit code of nodes whose host is lost."""
-_NO_COMMAND: Final = (126, 127)
-"""The exit codes of a shell that cannot start a command."""
 
 _OPTIONS: Final = (
     "IgnoreUnknown=ForkAfterAuthentication,StdinNull,SessionType",  # of versions before 8.7
@@ -74,10 +69,8 @@ _OPTIONS: Final = (
     *("RequestTTY=no", "RemoteCommand=none", "PermitLocalCommand=no", "ForwardAgent=no", "ForwardX11=no"),
     *("ForkAfterAuthentication=no", "StdinNull=no", "SessionType=default"),
 )
-_OF_CHANNEL: Final = re.compile(r"channel \d+: open failed: ")
-_OF_SOCKET: Final = re.compile(r"connect_?\w* to \S+ port -2 failed")
-"""A process has dialled before the other one was there."""
-_FORBIDDEN: Final = "administratively prohibited"
+_TOO_EARLY: Final = re.compile(r"channel \d+: open failed: |connect_?\w* to \S+ port -2 failed")
+"""A process has dialled before the other one was there; it does so again."""
 
 _BY_HAND: Final = "Connect once by hand: `ssh {ssh}`."
 _HINTS: Final = {
@@ -89,7 +82,7 @@ _HINTS: Final = {
     "Could not resolve hostname": "Is `ssh: {ssh}` right? It is [user@]host, or a name of ~/.ssh/config.",
     "kex_exchange_identification": "Its sshd may refuse so many connections at once: see `MaxStartups` there.",
     "Connection refused": "Does an sshd run there?",
-    "No module named": "There is no fmu_mesh {version} for `{python}` there, or a part of it is missing: install it.",
+    "No module named": "There is no fmu_mesh for `{python}` there, or a part is missing. Install fmu-mesh {version}.",
 }
 
 
@@ -103,26 +96,16 @@ class SshHosts:
         tell: takes the name of a host, and what there is to say about it; from any thread.
     """
 
-    def __init__(
-        self,
-        run: RunPlan,
-        folder: Path,
-        post: Callable[[Callable[[], None]], None],
-        tell: Callable[[str, str], None],
-    ) -> None:
+    def __init__(self, run: RunPlan, folder: Path, post: Post, tell: Callable[[str, str], None]) -> None:
         if which("ssh") is None:
             hint = "Install it, on Debian with `apt install openssh-client`."
             raise ConfigurationError("there is no `ssh` on this host, and the mesh has nodes on others", hint=hint)
-        shown = [own for own, section in run.loaded.config.instances.items() if isinstance(section, PhysicsSection)]
-        away = [own for own in shown if run.plan.nodes[run.plan.node_of(own)].host in run.plan.hosts]
-        if run.showing and away:
-            text = f"the world of '{away[0]}' can be shown on the host of `launch` only, and it is on another one"
-            raise ConfigurationError(text)
+        items = [item for node in run.plan.nodes.values() if node.host in run.plan.hosts for item in node.instances]
+        if run.showing and (away := [item.name for item in items if isinstance(item.section, PhysicsSection)]):
+            raise ConfigurationError(f"the world of '{away[0]}' cannot be shown: it is not on the host of `launch`")
         self._hosts: dict[str, _Host] = {}
-        for name, config in run.plan.hosts.items():
-            if config.ssh is not None:
-                control = folder / f"ssh{len(self._hosts)}"
-                self._hosts[name] = _Host(name, config, run, control, post, partial(tell, name))
+        for name in (name for name, config in run.plan.hosts.items() if config.ssh is not None):
+            self._hosts[name] = _Host(name, run, folder / f"ssh{len(self._hosts)}", post, partial(tell, name))
         for host in self._hosts.values():
             host.begin()
 
@@ -210,31 +193,23 @@ class _Host:
         lost: how the connection has ended, once nodes were started.
     """
 
-    def __init__(  # noqa: PLR0913, PLR0917  a host and its surroundings
-        self,
-        name: str,
-        config: HostConfig,
-        run: RunPlan,
-        control: Path,
-        post: Callable[[Callable[[], None]], None],
-        tell: Callable[[str], None],
-    ) -> None:
+    def __init__(self, name: str, run: RunPlan, control: Path, post: Post, tell: Callable[[str], None]) -> None:
         self.is_ready = False
         self.failure: FmuMeshError | None = None
         self.lost: str | None = None
-        self._name, self._config, self._run, self._control = name, config, run, control
-        self._ssh = config.ssh or ""
+        self._name, self._config, self._run, self._control = name, run.plan.hosts[name], run, control
+        self._ssh = self._config.ssh or ""
         self._post, self._tell = post, tell
         self._link_s = run.loaded.config.timeouts.link
         self._nodes = {key: node for key, node in run.plan.nodes.items() if node.host == name}
-        records = [Path(record.file) for record in run.plan.system.records]
-        own, zenoh = run.config_file, run.loaded.config.zenoh.config
-        self._zenoh = str(beside(own, zenoh)) if zenoh is not None else None
-        tables = [Path(self._zenoh)] if self._zenoh is not None else []
-        self._content = Content(name, [*self._nodes.values()], tables, records)
+        results = [Path(record.file) for record in run.plan.system.records]
+        zenoh = run.loaded.config.zenoh.config
+        more = [beside(run.config_file, zenoh)] if zenoh is not None else []
+        self._zenoh = str(more[0]) if more else None
+        self._content = Content(name, [*self._nodes.values()], more, results)
         self._processes: dict[str, RemoteProcess] = {}
         self._writing = threading.Lock()
-        self._said: deque[str] = deque(maxlen=_LINES)
+        self._said: deque[str] = deque(maxlen=20)
         self._leaving = self._is_silent = False
         if len(os.fsencode(control)) > _CONTROL_BYTES:
             text = f"'{control}' is too long for a control socket of ssh ({_CONTROL_BYTES} bytes)"
@@ -257,10 +232,8 @@ class _Host:
         )
         assert self._relay.stdout is not None
         self._frames = frames.FrameReader(self._relay.stdout.fileno(), frames.MAGIC)
-        self._threads = [
-            threading.Thread(target=self._follow, name=f"host {self._name}", daemon=True),
-            threading.Thread(target=self._listen, name=f"ssh to {self._name}", daemon=True),
-        ]
+        jobs = (self._follow, f"host {self._name}"), (self._listen, f"ssh to {self._name}")
+        self._threads = [threading.Thread(target=job, name=name, daemon=True) for job, name in jobs]
         for thread in self._threads:
             thread.start()
 
@@ -283,12 +256,10 @@ class _Host:
         """Wait for the end, and close what is open."""
         with suppress(subprocess.TimeoutExpired):
             self._relay.wait(_LEAVE_S if self.is_ready and self.lost is None else 0.0)
-        self._kill()
-        for thread in self._threads:
-            thread.join(1.0)
-        for pipe in (self._relay.stdout, self._relay.stderr):
-            if pipe is not None:
-                pipe.close()
+        with self._relay:  # closes its pipes
+            self._kill()
+            for thread in self._threads:
+                thread.join(1.0)
 
     def _kill(self) -> None:
         with suppress(ProcessLookupError):
@@ -332,17 +303,20 @@ class _Host:
 
     def _lose(self) -> None:
         """The connection has ended, or has to end: say why."""
-        with suppress(subprocess.TimeoutExpired):
-            self._relay.wait(0.0 if self._is_silent or self.failure is not None else _END_S)
+        if not self._is_silent:
+            self.leave()
+            with suppress(subprocess.TimeoutExpired):
+                self._relay.wait(_LEAVE_S)
         self._kill()
         code = self._relay.wait()
         self._threads[1].join(1.0)
-        last = self.failure.message if self.failure is not None else self._said[-1] if self._said else ""
+        how = f"exit code {code}" if code >= 0 else how_it_ended(code)
         if self._is_silent:
             how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
-        else:
-            how = f"exit code {code}" if code >= 0 else how_it_ended(code)
-            how += f": {last}" if last else ""
+        elif self.failure is not None:
+            how = self.failure.message
+        elif self._said:
+            how += f": {self._said[-1]}"
         self.lost = f"is gone: the ssh connection to {self._name} was lost ({how})"
         if self.failure is None and not self.is_ready:
             self.failure = self._in_words(code, how)
@@ -351,7 +325,7 @@ class _Host:
         """Why nothing could be started there."""
         text = f"no node can be started on {self._name} with `ssh {self._ssh}`: {how}"
         said, hint = "\n".join(self._said), None
-        if code in _NO_COMMAND:
+        if code in (126, 127):  # of a shell that cannot start a command
             hint = f"Is `{self._config.python}` the path of a Python on {self._name}?"
         for words, what in _HINTS.items():
             if words in said:
@@ -395,8 +369,7 @@ class _Host:
                     self._say(frames.Piece(content, data, last := len(data) < _PIECE_BYTES))
                     if last:
                         break
-        plans = {}
-        launch = launch_of(self._run.run)
+        plans, launch = {}, launch_of(self._run.run)
         for name in self._nodes:
             own = self._run.node(name)
             rows = self._config.address if self._config.rows == "tcp" else own.zenoh.rows_address
@@ -408,10 +381,8 @@ class _Host:
         self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))
         self._mirror(Path(missing.folder))
         ready = self._heard(frames.Ready, self._link_s)
-        for instance, found, expected in ready.problems[:1]:
-            more = f" (and {counted(len(ready.problems) - 1, 'problem')} more)" if len(ready.problems) > 1 else ""
-            text = f"{self._name} cannot run '{instance}': {found.rstrip('.')}{more}"
-            raise ConfigurationError(text, hint=expected or None)
+        for instance, found, expected in ready.problems:  # the first one
+            raise ConfigurationError(f"{self._name} cannot run '{instance}': {found}", hint=expected or None)
 
     def _compare(self, hello: frames.Hello) -> None:
         """Say how that host differs from this one.
@@ -422,13 +393,15 @@ class _Host:
         if hello.version != __version__:
             text = f"{self._name} has fmu_mesh {hello.version}, here {__version__}"
             raise ConfigurationError(text, hint=f"Install the same version there, for `{self._config.python}`.")
-        libc = " ".join(platform.libc_ver())
-        own = {"Python": platform.python_version(), "the libc": libc, "the processor": platform.machine()}
-        theirs = {"Python": hello.python, "the libc": hello.libc, "the processor": hello.machine}
-        if found := [
-            f"{what} is {theirs[what]} there, and {own[what]} here" for what in own if own[what] != theirs[what]
-        ]:
-            self._tell("; ".join(found))
+        there, here = (hello.python, hello.libc, hello.machine), frames.this_system()
+        what = ("Python", "the C library", "the processor")
+        others = [
+            f"{name} is {its} there, and {own} here"
+            for name, its, own in zip(what, there, here, strict=True)
+            if its != own
+        ]
+        if others:
+            self._tell("; ".join(others))
 
     def _mirror(self, there: Path) -> None:
         """Let ssh make the sockets that this host and the other one need of each other.
@@ -439,13 +412,14 @@ class _Host:
         here, inside = self._control.parent, self._nodes
         peers = {peer for node in inside.values() for peer in node.peers()} - inside.keys()
         by_ssh = self._config.rows == "sockets" and self._run.loaded.config.row_streams
-        options = []
+        probe = here / f"{self._control.name}.probe"
+        options = ["-L", f"{probe}:{there / frames.PROBE}"]
         for option, names in (("-R", [MASTER, *sorted(peers)]), ("-L", [*inside])):
             for name in names:
-                own = Path(socket_endpoint(here, name).partition("/")[2])
-                for path in (own, rows_socket(here, name)) if by_ssh else (own,):
-                    ends = (there / path.name, path) if option == "-R" else (here / path.name, there / path.name)
-                    options += [option, f"{ends[0]}:{ends[1]}"]
+                zenoh = Path(socket_endpoint(here, name).partition("/")[2])
+                for own in (zenoh, rows_socket(here, name)) if by_ssh else (zenoh,):
+                    other = there / own.name
+                    options += [option, f"{other}:{own}" if option == "-R" else f"{own}:{other}"]
         # The file of the user might forward more.
         command = ["ssh", "-F", os.devnull, "-S", str(self._control), "-O", "forward", *options]
         try:
@@ -454,12 +428,15 @@ class _Host:
             )
         except subprocess.TimeoutExpired as error:
             raise MeshLost(f"{self._name} has not made the sockets within {_FORWARD_S:g} s") from error
-        if done.returncode != 0:
-            raise self._forbidden(" ".join(done.stderr.decode(errors="replace").split()))
-
-    def _forbidden(self, said: str) -> ConfigurationError:
-        text = f"the sshd of {self._name} forwards no Unix sockets: {said}"
-        return ConfigurationError(text, hint="`AllowStreamLocalForwarding yes` in its sshd_config allows it.")
+        said = " ".join(done.stderr.decode(errors="replace").split())
+        if done.returncode == 0:
+            with socket.socket(socket.AF_UNIX) as tried:
+                tried.settimeout(_FORWARD_S)
+                tried.connect(str(probe))
+                if tried.recv(1):
+                    return
+        hint = "`AllowStreamLocalForwarding yes` in its sshd_config allows it."
+        raise ConfigurationError(f"the sshd of {self._name} forwards no Unix sockets: {said}", hint=hint)
 
     # --- the thread that reads what ssh writes
 
@@ -467,11 +444,7 @@ class _Host:
         assert self._relay.stderr is not None
         for line in self._relay.stderr:
             text = line.decode(errors="replace").rstrip()
-            if _OF_CHANNEL.match(text):
-                if _FORBIDDEN in text and self.failure is None:
-                    self.failure = self._forbidden(text)
-                    self._post(self._kill)
-            elif text and not _OF_SOCKET.match(text):
+            if text and not _TOO_EARLY.match(text):
                 self._said.append(text)
                 if self.is_ready and not self._leaving:
                     self._tell(text)

@@ -258,8 +258,11 @@ class Launcher:
         node = self._run.plan.nodes.get(name)
         if node is None:
             return None
-        lost = self._elsewhere.why(node) if self._elsewhere is not None else None
-        return lost or why_ended(code, node.process, self._shares.get(name))
+        return self._lost_host(node) or why_ended(code, node.process, self._shares.get(name))
+
+    def _lost_host(self, node: NodePlan) -> str | None:
+        """How the process of a node has ended, if that is because its host was lost."""
+        return self._elsewhere.why(node) if self._elsewhere is not None else None
 
     def _take_event(self, line: bytes) -> None:
         try:
@@ -314,6 +317,10 @@ class Launcher:
             self.outcome = replace(outcome, warnings=tuple(map(self._states.with_how, outcome.warnings)))
             return self.outcome
         placed(plan, error)
+        if isinstance(error, MeshLost) and error.instance in plan.system.instances:
+            node = plan.nodes[plan.node_of(error.instance)]
+            if (lost := self._lost_host(node)) is not None:  # that is why, whatever the node had time to say
+                error.saying(f"node '{node.node}' was lost: its process {lost}")
         last = last_recorded(plan, files)
         if type(error) in (Interrupted, MeshLost) and last > (error.point or 0):
             error.at(last, plan.grid.time(last))
