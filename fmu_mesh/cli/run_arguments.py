@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from ..config.call_options import option_fields
 from ..run.options import SimulateOptions
@@ -69,6 +70,38 @@ def _with_key(flag: str, text: str) -> ArgumentPart:
     return argument(flag, "VARIABLE=KEY", f"{text}; repeatable", type=_end, action="append", default=[])
 
 
+class _Stored(argparse.Action):
+    """An argument, or an option with which another argument is not needed.
+
+    With `nargs="?"` for that argument, argparse would not find it behind an option.
+    """
+
+    def __init__(self, instead: argparse.Action | None = None, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
+        super().__init__(**details)
+        self._instead = instead
+
+    def __call__(
+        self,
+        _parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        _option: str | None = None,
+    ) -> None:
+        vars(namespace)[self.dest] = values
+        if isinstance(self._instead, _Stored):
+            self._instead.spare()
+
+    def spare(self) -> None:
+        """It is not needed."""
+        self.required = False
+
+
+def _add_nodes(parser: argparse._ActionsContainer) -> None:
+    node = parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group", action=_Stored)
+    text = "start all nodes of this host of `deploy.hosts` instead, each in a process"
+    parser.add_argument("--host", metavar="NAME", help=text, action=_Stored, instead=node)
+
+
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
@@ -80,8 +113,7 @@ PARSERS: Parsers = {
     "node": (
         *CONFIGURED,
         options("view", "video"),
-        argument("--host", "NAME", "start all nodes of this host of `deploy.hosts`, each in a process"),
-        argument("node", "INSTANCE", "name of the instance, or of its group", nargs="?"),
+        _add_nodes,
     ),
     "master": (*CONFIGURED, options("paused", "profile"), _PLOT, *_OUTPUT),
     "gateway": (*CONFIGURED, QUIET),

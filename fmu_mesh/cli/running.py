@@ -168,10 +168,8 @@ def _node(arguments: argparse.Namespace) -> int:
     from ..run.host_nodes import nodes_on, run_nodes  # noqa: PLC0415  only this command needs it
     from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
 
-    if (arguments.node is None) is (arguments.host is None):
-        raise ConfigurationError(
-            "`fmu-mesh node` starts INSTANCE, or with --host all nodes of a host: give one of both."
-        )
+    if arguments.node is not None and arguments.host is not None:
+        raise ConfigurationError("--host starts all nodes of a host, and INSTANCE one", hint="Leave one of them out.")
     plan = mesh_of(arguments).plan(**given_options(arguments))
     names = [arguments.node] if arguments.node is not None else nodes_on(plan, arguments.host)
     _warn(plan, every=False)

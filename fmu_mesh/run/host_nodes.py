@@ -4,9 +4,9 @@ Each node is a process as if it were started manually on its own. This module st
 and ends when they have ended. Which other hosts there are, and who starts those, it does not know.
 """
 
-# Who meets here: the main thread, which waits for the queue, and the threads of each `Child`, which only put functions
-# into it. So does the handler of SIGINT and SIGTERM. The nodes have sessions of their own, so Ctrl-C reaches only this
-# process; the kernel ends them with its main thread, which has started them (`die_with_parent`).
+# Who meets here (ADR 71): the main thread, which waits for the queue, and the threads of each `Child`, which only put
+# functions into it. So does the handler of SIGINT and SIGTERM. The nodes have sessions of their own, so Ctrl-C reaches
+# only this process; the kernel ends them with its main thread, which has started them (`die_with_parent`).
 #
 # What may go wrong: a node fails before the master knows it, so nobody tells the others. They get some time to end by
 # themselves, because what the master says of a failure is more than what can be known here.

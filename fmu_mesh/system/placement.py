@@ -35,7 +35,7 @@ def placed(plan: Plan, error: E, nodes: Sequence[str] = ()) -> E:
 def two_trips(plan: Plan) -> list[str]:
     """The connections whose values go through the host of `launch` because no ssh joins their two hosts, in words."""
     hosts = {name: own for name, own in plan.hosts.items() if own.ssh is not None}
-    sentences = {}
+    sentences = dict[tuple[str, str | None], str]()
     for c in plan.connections:
         source, target = (plan.nodes[plan.node_of(end)].host for end in (c.source_instance, c.target_instance))
         if c.initial_only or source == target or source not in hosts or target not in hosts:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.rerunning import on_this_host
 from fmu_mesh.errors import ConfigurationError, DeadlineExceeded, MeshLost, StepFailed, from_report
 from fmu_mesh.master.master_states import MasterStates
 from fmu_mesh.pictures.plan_page import plan_page
@@ -27,8 +29,9 @@ SSH = {"ssh": "user@b", "python": "~/mesh/bin/python"}
 def placed(folder: Path, hosts: dict[str, Any] | None, **of: str) -> Path:
     """A pendulum and a delay on these hosts, with these entries of `deploy.hosts`; None: without the section."""
     instances = {name: {**own, **({"host": of[name]} if name in of else {})} for name, own in PAIR.items()}
-    sections = {"deploy": {"hosts": hosts}} if hosts is not None else {}
-    return write_config(folder, instances=instances, **sections)
+    if hosts is None:
+        return write_config(folder, instances=instances)
+    return write_config(folder, instances=instances, deploy={"hosts": hosts})
 
 
 def findings_of(file: Path) -> list[str]:
@@ -105,6 +108,38 @@ def test_a_sandbox_on_another_host_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(ConfigurationError, match=r"a sandbox for 'delay', which has a `host` or an `interpreter`"):
         prepare(file, PlanOptions(config_values={"instances.delay.process": {"sandbox": "bubblewrap"}}))
+
+
+def test_another_user_cannot_name_a_host_to_log_in_to(tmp_path: Path) -> None:
+    file = placed(tmp_path, {"b": SSH, "c": {}}, delay="b")
+    told: list[str] = []
+    os.chown(file, 65_533, -1)
+
+    [finding] = findings_of(file)
+    allowed = fmu_mesh.load(file).plan(allow_code=True, on_notice=told.append).plan
+
+    assert finding.startswith("deploy.hosts.b.ssh: a host that you would log in to, in a file of the user 65533; ")
+    assert allowed.nodes["delay"].host == "b"
+    [text] = told
+    assert text == (
+        "nodes run on host 'b', by `ssh user@b` and its `~/mesh/bin/python`, because of `allow_code=True` "
+        "(as a file of the user 65533 says)"
+    )
+
+
+def test_a_rerun_and_a_sweep_stay_on_one_host() -> None:
+    data = {"instances": {"a": {"fmu": "a.fmu", "host": "b"}, "c": None}, "deploy": {"hosts": {"b": SSH}}}
+
+    assert {**data, **on_this_host(data)} == {"instances": {"a": {"fmu": "a.fmu"}, "c": None}, "deploy": {}}
+
+
+def test_a_result_of_several_hosts_is_made_again_on_one(tmp_path: Path) -> None:
+    file = placed(tmp_path, {"b": SSH}, delay="b")
+    first = fmu_mesh.load(file).run(processes=False)
+
+    again = fmu_mesh.rerun(str(first.file), processes=False)
+
+    assert again["delay.y"].tolist() == first["delay.y"].tolist()
 
 
 # --- what is shown

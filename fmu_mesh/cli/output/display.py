@@ -197,7 +197,7 @@ class Display:
     def _status(self, status: MeshStatus) -> None:
         self._progress.update(status.point, status)
         waiting = {host: [n for n in nodes if n in status.missing] for host, nodes in self._hosts.items()}
-        for host, missing in self._waiting.items() if not self._quiet else ():
+        for host, missing in self._waiting.items() if not self._quiet and status.state != "failed" else ():
             if missing and not waiting[host]:
                 self._print(f"all nodes of {host} are there", "dim")
         self._waiting = waiting
