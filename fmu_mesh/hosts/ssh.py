@@ -380,7 +380,11 @@ class _Host:
         terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
         checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
         self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))
-        self._mirror(Path(missing.folder))
+        try:
+            self._mirror(Path(missing.folder))
+        except ConfigurationError:
+            self._heard(frames.Ready, self._link_s)  # a helper that has failed says why, and that is why
+            raise
         ready = self._heard(frames.Ready, self._link_s)
         for instance, found, expected in ready.problems:  # the first one
             raise ConfigurationError(f"{self._name} cannot run '{instance}': {found}", hint=expected or None)
@@ -437,7 +441,8 @@ class _Host:
                 if tried.recv(1):
                     return
         hint = "`AllowStreamLocalForwarding yes` in its sshd_config allows it."
-        raise ConfigurationError(f"the sshd of {self._name} forwards no Unix sockets: {said}", hint=hint)
+        text = f"the sshd of {self._name} forwards no Unix sockets"
+        raise ConfigurationError(f"{text}: {said}" if said else text, hint=hint)
 
     # --- the thread that reads what ssh writes
 
