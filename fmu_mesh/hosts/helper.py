@@ -10,8 +10,8 @@ a silence of LINK_S seconds.
 # put functions into the same queue. All write frames, one at a time.
 #
 # What may go wrong: this process is killed: the fork server, and with it the nodes, get a signal of the kernel. It is
-# stopped: it is no answer any more, so the launcher ends the connection; the nodes lose their link to the master, wake
-# this process, and ask it to end (`fmu_mesh.run.roles`). ssh passes on neither, but sshd closes standard input.
+# stopped: it does not answer, so the launcher ends the connection; the nodes lose their link to the master, wake this
+# process, and ask it to end (`fmu_mesh.run.process`). ssh passes no signal on, but sshd closes standard input. ADR 85.
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from ..files import remove_tree
 from ..run.child import Child, Process
 from ..run.fork_server import ForkServer, executed
 from ..wire.runtime import remove_stale_folders, run_folder, run_name
-from . import frames
+from . import helper_frames as frames
 from .cache import Cache
 
 __all__ = ["main"]
@@ -68,7 +68,9 @@ class _Helper:
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, lambda *_: self._happened.put(self._leave))
         os.write(self._output, frames.MAGIC)
-        self._say(frames.Hello(__version__, *frames.this_system(), self._run, os.getpid(), str(self._cache.trees)))
+        self._say(
+            frames.HelperHello(__version__, *frames.this_system(), self._run, os.getpid(), str(self._cache.trees))
+        )
         threading.Thread(target=self._read, name="frames", daemon=True).start()
         folder: Path | None = None
         try:
@@ -79,10 +81,10 @@ class _Helper:
             folder = self._folder = run_folder(self._mesh, self._run)
             self._serve()
         except FmuMeshError as error:
-            self._say(frames.Failed(error.message, error.hint or ""))
+            self._say(frames.CannotGoOn(error.message, error.hint or ""))
         except OSError as error:
             text = f"'{error.filename or self._cache.folder}' cannot be used: {error.strerror or error}"
-            self._say(frames.Failed(text, "Make room there."))
+            self._say(frames.CannotGoOn(text, "Make room there."))
         finally:
             self._end()
             self._cache.close()
@@ -127,13 +129,13 @@ class _Helper:
 
     def _take(self, message: frames.ToHelper) -> None:
         match message:
-            case frames.Offer(trees):
+            case frames.OfferTrees(trees):
                 self._trees = trees
                 (door := socket.socket(socket.AF_UNIX)).bind(str(self._folder / frames.PROBE))
                 door.listen()
                 threading.Thread(target=self._answer_probe, args=(door,), name="probe", daemon=True).start()
                 self._say(frames.Missing(self._cache.missing(trees), str(self._folder)))
-            case frames.Piece(content, data, last):
+            case frames.FilePiece(content, data, last):
                 self._cache.take(content, data, last=last)
             case frames.Prepare(plan, nodes, terms):
                 self._cache.make(self._trees)
@@ -144,9 +146,9 @@ class _Helper:
                 if not problems:
                     mark.touch()
                 self._say(frames.Ready(problems))
-            case frames.Start(node, interpreter):
+            case frames.StartNode(node, interpreter):
                 self._start(node, interpreter)
-            case frames.Signal(node, number):
+            case frames.SignalNode(node, number):
                 self._children[node].signal(signal.Signals(number))
 
     @staticmethod

@@ -7,7 +7,7 @@ this host, or of a third one, is in the folder of the run there (`-R`), and one 
 
 # Threads: for each host one, `host NAME`, which begins, and then takes what the helper sends, and one that reads what
 # ssh writes to standard error. They post to the launcher's thread, which starts nodes, signals them, and ends all. A
-# lock is held while a frame is written; the program between (`relay`) takes it at once, unless models are sent.
+# lock is held while a frame is written; the program between (`ssh_relay`) takes it at once, unless models are sent.
 #
 # What may go wrong: ssh or the helper ends: standard output ends, and the exit code and the last line say why. It is
 # stopped, or the network is cut: no answer to the signs of life for `timeouts.link`. Then both programs are killed,
@@ -44,7 +44,8 @@ from ..run.process import launch_of
 from ..run.run_plan import RunPlan, encoded, in_parts
 from ..system.plan import MASTER, NodePlan
 from ..wire.runtime import rows_socket, socket_endpoint
-from . import frames, relay
+from . import helper_frames as frames
+from . import ssh_relay
 from .content import Content
 
 __all__ = ["SshHosts"]
@@ -223,7 +224,7 @@ class _Host:
         helper = f"exec {self._config.python} -Pu -m {__package__}.helper {self._run.mesh} {self._link_s:g}"
         ssh = ["ssh", "-T", "-S", str(self._control), *options, self._ssh, helper]
         self._relay = subprocess.Popen(
-            [sys.executable, "-ISP", relay.__file__, *ssh],
+            [sys.executable, "-ISP", ssh_relay.__file__, *ssh],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -239,8 +240,8 @@ class _Host:
 
     def start(self, node: str) -> RemoteProcess:
         """Start a node."""
-        self._processes[node] = made = RemoteProcess(lambda number: self._say(frames.Signal(node, number)))
-        self._say(frames.Start(node, self._nodes[node].interpreter))
+        self._processes[node] = made = RemoteProcess(lambda number: self._say(frames.SignalNode(node, number)))
+        self._say(frames.StartNode(node, self._nodes[node].interpreter))
         if self.lost is not None:  # its thread may have ended all others before
             made.end(_LOST)
         return made
@@ -298,7 +299,7 @@ class _Host:
                 self._processes[node].take(data, error=error)
             case frames.Ended(node, code) if node:
                 self._processes[node].end(code)
-            case frames.Failed(text):
+            case frames.CannotGoOn(text):
                 self._said.append(text)
 
     def _lose(self) -> None:
@@ -308,9 +309,9 @@ class _Host:
             with suppress(subprocess.TimeoutExpired):
                 self._relay.wait(_LEAVE_S)
         self._kill()
-        code = self._relay.wait()
+        code = self._relay.wait()  # that of ssh, and 128 more than the number of a signal
         self._threads[1].join(1.0)
-        how = f"exit code {code}" if code >= 0 else how_it_ended(code)
+        how = f"ssh {how_it_ended(code if not 128 < code < 255 else 128 - code)}"
         if self._is_silent:
             how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
         elif self.failure is not None:
@@ -341,7 +342,7 @@ class _Host:
         """The next frame of a kind."""
         while True:
             match self._next(limit_s):
-                case frames.Failed(text, hint):
+                case frames.CannotGoOn(text, hint):
                     raise ConfigurationError(f"{self._name} cannot take part: {text}", hint=hint or None)
                 case None:
                     raise EOFError
@@ -358,15 +359,15 @@ class _Host:
 
     def _shake_hands(self) -> None:
         """Send what the nodes need, and mirror the sockets."""
-        hello = self._heard(frames.Hello, self._run.loaded.config.timeouts.start)
+        hello = self._heard(frames.HelperHello, self._run.loaded.config.timeouts.start)
         self._compare(hello)
-        self._say(frames.Offer(self._content.trees))
+        self._say(frames.OfferTrees(self._content.trees))
         missing = self._heard(frames.Missing, self._link_s)
         for content in missing.contents:
             with self._content.files[content].open("rb") as file:
                 while True:
                     data = file.read(_PIECE_BYTES)
-                    self._say(frames.Piece(content, data, last := len(data) < _PIECE_BYTES))
+                    self._say(frames.FilePiece(content, data, last := len(data) < _PIECE_BYTES))
                     if last:
                         break
         plans, launch = {}, launch_of(self._run.run)
@@ -379,12 +380,16 @@ class _Host:
         terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
         checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
         self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))
-        self._mirror(Path(missing.folder))
+        try:
+            self._mirror(Path(missing.folder))
+        except ConfigurationError:
+            self._heard(frames.Ready, self._link_s)  # a helper that has failed says why, and that is why
+            raise
         ready = self._heard(frames.Ready, self._link_s)
         for instance, found, expected in ready.problems:  # the first one
             raise ConfigurationError(f"{self._name} cannot run '{instance}': {found}", hint=expected or None)
 
-    def _compare(self, hello: frames.Hello) -> None:
+    def _compare(self, hello: frames.HelperHello) -> None:
         """Say how that host differs from this one.
 
         Raises:
@@ -436,13 +441,13 @@ class _Host:
                 if tried.recv(1):
                     return
         hint = "`AllowStreamLocalForwarding yes` in its sshd_config allows it."
-        raise ConfigurationError(f"the sshd of {self._name} forwards no Unix sockets: {said}", hint=hint)
+        text = f"the sshd of {self._name} forwards no Unix sockets"
+        raise ConfigurationError(f"{text}: {said}" if said else text, hint=hint)
 
     # --- the thread that reads what ssh writes
 
     def _listen(self) -> None:
-        assert self._relay.stderr is not None
-        for line in self._relay.stderr:
+        for line in self._relay.stderr or ():
             text = line.decode(errors="replace").rstrip()
             if text and not _TOO_EARLY.match(text):
                 self._said.append(text)

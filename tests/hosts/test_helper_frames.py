@@ -12,7 +12,8 @@ from contextlib import closing
 import msgspec
 import pytest
 
-from fmu_mesh.hosts import frames, relay
+from fmu_mesh.hosts import helper_frames as frames
+from fmu_mesh.hosts import ssh_relay
 from tests.helpers import DEADLINE_S
 
 BEAT = bytes(4)
@@ -41,7 +42,7 @@ def test_what_a_profile_prints_before_the_magic_word_is_skipped(pipe: tuple[int,
 
 def test_a_frame_that_comes_in_pieces_is_read_whole(pipe: tuple[int, int]) -> None:
     reading, writing = pipe
-    piece = frames.Piece("name", bytes(range(256)) * 10, last=True)
+    piece = frames.FilePiece("name", bytes(range(256)) * 10, last=True)
     data = frames.framed(piece)
     reader = frames.FrameReader(reading)
     for place in range(0, len(data), 100):
@@ -65,7 +66,7 @@ def test_silence_ends_at_its_limit(pipe: tuple[int, int]) -> None:
 
 def relayed(*command: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-ISP", relay.__file__, *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-ISP", ssh_relay.__file__, *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
 
 
@@ -74,7 +75,7 @@ def test_the_relay_passes_whole_frames_and_signs_of_life() -> None:
         assert process.stdin is not None
         assert process.stdout is not None
         reader = frames.FrameReader(process.stdout.fileno())
-        sent = [frames.framed(frames.Piece(str(size), bytes(size), last=False)) for size in (0, 70_000, 3_000_000)]
+        sent = [frames.framed(frames.FilePiece(str(size), bytes(size), last=False)) for size in (0, 70_000, 3_000_000)]
         half = frames.framed(frames.Alive())
 
         assert reader.next(DEADLINE_S) == b""  # before anything was sent

@@ -1,4 +1,4 @@
-"""The program between a launcher and its ssh: `python -ISP relay.py ssh ...`. It needs only the standard library.
+"""The program between a launcher and its ssh: `python -ISP ssh_relay.py ssh ...`. It needs only the standard library.
 
 It passes on the frames of the launcher whole, and a sign of life each second, also while the launcher is stopped by
 Ctrl-Z; ssh answers to the launcher directly. It has a session of its own, and ends with the launcher, and so does ssh.

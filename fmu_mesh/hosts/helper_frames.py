@@ -1,7 +1,7 @@
 """What a launcher and its helper on another host send each other: frames, each a length and MessagePack.
 
 What comes before the first frame of the helper, such as the output of a login script, ends with a magic word. A frame
-without content is a sign of life; `fmu_mesh.hosts.relay` sends it, which knows nothing else of frames.
+without content is a sign of life; `fmu_mesh.hosts.ssh_relay` sends it, which knows nothing else of frames.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ __all__ = [
     "MAGIC",
     "PROBE",
     "Alive",
+    "CannotGoOn",
     "Ended",
-    "Failed",
+    "FilePiece",
     "FrameReader",
     "FromHelper",
-    "Hello",
+    "HelperHello",
     "Line",
     "Missing",
-    "Offer",
-    "Piece",
+    "OfferTrees",
     "Prepare",
     "Ready",
-    "Signal",
-    "Start",
+    "SignalNode",
+    "StartNode",
     "ToHelper",
     "framed",
     "this_system",
@@ -49,7 +49,7 @@ _READ_BYTES: Final = 1 << 18
 _LOOK_S: Final = 0.25
 
 
-class Hello(msgspec.Struct, frozen=True, tag=True):
+class HelperHello(msgspec.Struct, frozen=True, tag=True):
     """The first frame of a helper: what is there. Of another version it may have more.
 
     Attributes:
@@ -69,7 +69,7 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     cache: str
 
 
-class Offer(msgspec.Struct, frozen=True, tag=True):
+class OfferTrees(msgspec.Struct, frozen=True, tag=True):
     """The trees that the nodes need, by name: the SHA-256 of each file by its path in the tree."""
 
     trees: dict[str, dict[str, str]]
@@ -82,7 +82,7 @@ class Missing(msgspec.Struct, frozen=True, tag=True):
     folder: str
 
 
-class Piece(msgspec.Struct, frozen=True, tag=True):
+class FilePiece(msgspec.Struct, frozen=True, tag=True):
     """A part of a file, or the ``last`` one."""
 
     content: str
@@ -104,14 +104,14 @@ class Ready(msgspec.Struct, frozen=True, tag=True):
     problems: tuple[tuple[str, str, str], ...] = ()
 
 
-class Start(msgspec.Struct, frozen=True, tag=True):
+class StartNode(msgspec.Struct, frozen=True, tag=True):
     """Start a node, with this Python; None: that of the helper."""
 
     node: str
     interpreter: str | None
 
 
-class Signal(msgspec.Struct, frozen=True, tag=True):
+class SignalNode(msgspec.Struct, frozen=True, tag=True):
     """Send a signal to a node, if it still runs."""
 
     node: str
@@ -137,15 +137,15 @@ class Alive(msgspec.Struct, frozen=True, tag=True):
     """The answer to each frame, at once."""
 
 
-class Failed(msgspec.Struct, frozen=True, tag=True):
+class CannotGoOn(msgspec.Struct, frozen=True, tag=True):
     """The helper cannot go on, and ends."""
 
     text: str
     hint: str
 
 
-ToHelper = Offer | Piece | Prepare | Start | Signal
-FromHelper = Hello | Missing | Ready | Line | Ended | Alive | Failed
+ToHelper = OfferTrees | FilePiece | Prepare | StartNode | SignalNode
+FromHelper = HelperHello | Missing | Ready | Line | Ended | Alive | CannotGoOn
 
 
 def framed(message: ToHelper | FromHelper) -> bytes:
