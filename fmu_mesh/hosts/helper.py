@@ -10,8 +10,8 @@ a silence of LINK_S seconds.
 # put functions into the same queue. All write frames, one at a time.
 #
 # What may go wrong: this process is killed: the fork server, and with it the nodes, get a signal of the kernel. It is
-# stopped: it is no answer any more, so the launcher ends the connection; the nodes lose their link to the master, wake
-# this process, and ask it to end (`fmu_mesh.run.roles`). ssh passes no signal on, but sshd closes standard input. ADR 85.
+# stopped: it does not answer, so the launcher ends the connection; the nodes lose their link to the master, wake this
+# process, and ask it to end (`fmu_mesh.run.process`). ssh passes no signal on, but sshd closes standard input. ADR 85.
 
 from __future__ import annotations
 

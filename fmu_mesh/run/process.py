@@ -43,7 +43,6 @@ __all__ = [
     "interrupts_later",
     "launch_of",
     "only_wake",
-    "wake_helper",
 ]
 
 GRACE_S = 1.0
@@ -108,6 +107,7 @@ class RunProcess:
         mesh: name of the mesh.
         run: name of the run; `MANUAL` if a person has started this process.
         launch: identifies the launch, if that of ``run`` is on another host.
+        helper: the process id of the helper of the launcher on this host, if there is one.
 
     Attributes:
         is_child: whether a launcher has started this process and watches it.
@@ -117,7 +117,8 @@ class RunProcess:
         interruption: requests to end, from signals or the parent.
     """
 
-    def __init__(self, mesh: str, run: str, launch: str | None = None) -> None:
+    def __init__(self, mesh: str, run: str, launch: str | None = None, helper: int | None = None) -> None:
+        self._helper = helper
         self.is_child = run != MANUAL
         self.launch = launch or launch_of(run)
         self.folder = run_folder(mesh, run)
@@ -136,6 +137,9 @@ class RunProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stack.__exit__(kind, error, trace)
+        if error is not None and self._helper is not None and is_stopped(self._helper):  # it could not end by itself
+            for number in (signal.SIGCONT, signal.SIGTERM):
+                os.kill(self._helper, number)
 
     def take_place(self, name: str, who: str) -> None:
         """Note in the folder of the run that this process is ``name``, and what to remove if it is killed.
@@ -229,13 +233,6 @@ def _wake_server() -> None:
     if (server := os.getppid()) in _servers:
         with suppress(ProcessLookupError):
             os.kill(server, signal.SIGCONT)
-
-
-def wake_helper(helper: int) -> None:
-    """Let the helper of the launcher on this host end, if it is stopped, at the end of a node."""
-    if is_stopped(helper):
-        for number in (signal.SIGCONT, signal.SIGTERM):
-            os.kill(helper, number)
 
 
 def _exit(reason: str, *, reported: bool) -> None:
