@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+import psutil
 import pytest
 
 from tests.helpers import DEADLINE_S, Launched
@@ -72,9 +73,8 @@ class SshHosts:
     def serve(self, host: NetworkHost, settings: Mapping[str, str] = {}) -> None:
         """Start the sshd of a host with these settings of `sshd_config`; one that runs ends, and its sessions stay."""
         if running := self.daemons.pop(host.name, None):
-            for process in host.processes():
-                if process.name() == "sshd" and process.ppid() == running.pid:
-                    process.terminate()
+            for process in psutil.Process(running.pid).children():
+                process.terminate()
             running.wait()
         (folder := host.folder / "sshd").mkdir(exist_ok=True)
         # The first value of a setting counts.
@@ -86,11 +86,6 @@ class SshHosts:
         daemon = host.start(_SSHD, "-D", "-e", "-f", "/tmp/sshd/sshd_config")  # noqa: S108  its own
         daemon.wait_for_error_line("Server listening on")
         self.daemons[host.name] = daemon
-
-    def sessions(self, host: NetworkHost) -> list[int]:
-        """The processes of sshd that serve a connection to this host: their ids on this machine."""
-        daemon = self.daemons[host.name].pid
-        return [one.pid for one in host.processes() if one.name() == "sshd" and one.ppid() != daemon]
 
     def _make_key(self, name: str) -> None:
         command = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", name, "-f", str(self._keys / name)]

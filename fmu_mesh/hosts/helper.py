@@ -128,6 +128,8 @@ class _Helper:
             self._happened.put(self._leave)
 
     def _take(self, message: frames.ToHelper) -> None:
+        if self._is_over:
+            return
         match message:
             case frames.OfferTrees(trees):
                 self._trees = trees
@@ -193,6 +195,7 @@ class _Helper:
     def _end(self) -> None:
         """End all nodes, and the fork server."""
         clock = AwakeClock()
+        self._leave()
         self._server.finish()
         for number, grace_s in _GRACES_S:
             end = clock() + grace_s

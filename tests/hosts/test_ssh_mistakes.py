@@ -190,10 +190,10 @@ def test_a_full_disk_there_is_told_and_leaves_no_part_of_a_file(pair: SshHosts) 
 
             assert launched.wait() in {2, 4}, mesh.story()
             assert "No space left" in launched.message
+            mesh.assert_nothing_left()
             listing = pair["b"].start("find", where, "-type", "f")
             assert listing.wait() == 0
             assert not listing.output
-            mesh.assert_nothing_left()
     finally:
         assert pair["b"].start("umount", where).wait() == 0
 
