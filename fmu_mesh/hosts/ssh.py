@@ -59,10 +59,8 @@ _LEAVE_S: Final = 6.0
 """How long a helper may take to end, with ssh."""
 _FORWARD_S: Final = 30.0
 _PIECE_BYTES: Final = 1 << 18
-_CONTROL_BYTES: Final = 90
-"""The longest path of a control socket: ssh adds 17 bytes to it."""
-_LOST: Final = -signal.SIGHUP
-"""The exit code of nodes whose host is lost."""
+_CONTROL_BYTES: Final = 90  # the longest path of a control socket: ssh adds 17 bytes to it
+_LOST: Final = -signal.SIGHUP  # the exit code of nodes whose host is lost
 
 _OPTIONS: Final = (
     "IgnoreUnknown=ForkAfterAuthentication,StdinNull,SessionType",  # of versions before 8.7
@@ -204,9 +202,8 @@ class _Host:
         self._link_s = run.loaded.config.timeouts.link
         self._nodes = {key: node for key, node in run.plan.nodes.items() if node.host == name}
         results = [Path(record.file) for record in run.plan.system.records]
-        zenoh = run.loaded.config.zenoh.config
-        more = [beside(run.config_file, zenoh)] if zenoh is not None else []
-        self._zenoh = str(more[0]) if more else None
+        more = [beside(run.config_file, own) for own in (run.loaded.config.zenoh.config,) if own is not None]
+        self._zenoh = next(map(str, more), None)
         self._content = Content(name, [*self._nodes.values()], more, results)
         self._processes: dict[str, RemoteProcess] = {}
         self._writing = threading.Lock()
@@ -371,8 +368,9 @@ class _Host:
                     if last:
                         break
         plans, launch = {}, launch_of(self._run.run)
+        rows = self._config.address if self._config.rows == "tcp" else None
         for name in self._nodes:
-            own, rows = self._run.node(name), self._config.address if self._config.rows == "tcp" else None
+            own = self._run.node(name)
             zenoh = replace(own.zenoh, config=self._zenoh, rows_address=rows)
             there = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh)
             plans[name] = self._content.moved(encoded(there), hello.cache)
@@ -398,12 +396,8 @@ class _Host:
             text = f"{self._name} has fmu_mesh {hello.version}, here {__version__}"
             raise ConfigurationError(text, hint=f"Install the same version there, for `{self._config.python}`.")
         there, here = (hello.python, hello.libc, hello.machine), frames.this_system()
-        what = ("Python", "the C library", "the processor")
-        others = [
-            f"{name} is {its} there, and {own} here"
-            for name, its, own in zip(what, there, here, strict=True)
-            if its != own
-        ]
+        compared = zip(("Python", "the C library", "the processor"), there, here, strict=True)
+        others = [f"{name} is {its} there, and {own} here" for name, its, own in compared if its != own]
         if others:
             self._tell("; ".join(others))
 
