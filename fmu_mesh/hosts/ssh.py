@@ -372,11 +372,10 @@ class _Host:
                         break
         plans, launch = {}, launch_of(self._run.run)
         for name in self._nodes:
-            own = self._run.node(name)
-            rows = self._config.address if self._config.rows == "tcp" else own.zenoh.rows_address
+            own, rows = self._run.node(name), self._config.address if self._config.rows == "tcp" else None
             zenoh = replace(own.zenoh, config=self._zenoh, rows_address=rows)
-            own = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh)
-            plans[name] = self._content.moved(encoded(own), hello.cache)
+            there = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh)
+            plans[name] = self._content.moved(encoded(there), hello.cache)
         terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
         checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
         self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))

@@ -61,6 +61,7 @@ from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
 from .sandbox import Sandboxed
+from .wiring import with_doors
 
 __all__ = ["Elsewhere", "Launcher"]
 
@@ -103,7 +104,7 @@ class Launcher:
         self._connect = elsewhere
         self._elsewhere: Elsewhere | None = None
         self.outcome: Outcome | None = None
-        self._run = self._first = replace(run, run=run_name())  # the newest, and the first one
+        self._run = self._first = with_doors(replace(run, run=run_name()))  # the newest, and the first one
         self._on_event = on_event
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._server: ForkServer | None = None

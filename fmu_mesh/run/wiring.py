@@ -29,7 +29,7 @@ from .run_plan import RunPlan
 if TYPE_CHECKING:  # as below
     from ..wire.security.identity import Identity
 
-__all__ = ["certified", "identity_of", "name_of", "patient", "table_of", "warnings_of", "wiring"]
+__all__ = ["certified", "identity_of", "name_of", "patient", "table_of", "warnings_of", "wiring", "with_doors"]
 
 
 _ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=|\bruntime\.share_with")
@@ -68,6 +68,21 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         waits=bool(config.connect),
         insecure=config.insecure,
     )
+
+
+def with_doors(run: RunPlan) -> RunPlan:
+    """The plan of a run whose processes here have a door at the network, for hosts that exchange rows directly."""
+    zenoh, direct = (
+        run.loaded.config.zenoh,
+        [host for host in run.plan.hosts.values() if host.rows == "tcp" and host.ssh],
+    )
+    if zenoh.rows_address is not None or not direct:
+        return run
+    from ..wire.meeting import address_towards  # noqa: PLC0415  most launchers meet nobody
+
+    towards = direct[0].address or (direct[0].ssh or "").rpartition("@")[2]
+    zenoh = replace(zenoh, rows_address=address_towards(towards))
+    return replace(run, loaded=replace(run.loaded, config=replace(run.loaded.config, zenoh=zenoh)))
 
 
 def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tuple[str, ...] = ()) -> Wiring:

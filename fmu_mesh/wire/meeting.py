@@ -25,7 +25,7 @@ from ..rings import native
 from .runtime import rows_socket
 from .session import Wiring
 
-__all__ = ["Door", "Meeting", "Returns", "meeting_of"]
+__all__ = ["Door", "Meeting", "Returns", "address_towards", "meeting_of"]
 
 # Who meets here: two processes, over a socket, and the threads of each. `door` accepts, and gives each connection a
 # thread that has a second to hear who it is; at most `_STRANGERS` of them. A thread of Zenoh notes the doors of others
@@ -350,7 +350,7 @@ def meeting_of(name: str, folder: Path, wiring: Wiring, address: str | None = No
             raise ConfigurationError(text, hint="`zenoh.rows_address` is an address of this host.") from error
         return Meeting(name, [rows_socket(folder, name), address], dict.fromkeys(connected), folder)
     listening = _hosts(wiring.listen)
-    hosts = dict.fromkeys([*listening, *filter(None, map(_own_address, connected))])
+    hosts = dict.fromkeys([*listening, *filter(None, map(address_towards, connected))])
     return Meeting(name, [rows_socket(folder, name), *hosts], dict.fromkeys(connected), folder)
 
 
@@ -363,8 +363,8 @@ def _hosts(endpoints: Sequence[str]) -> list[str]:
     return [host_of(endpoint) for endpoint in endpoints if endpoint.partition("/")[0] in _NETWORKS]
 
 
-def _own_address(host: str) -> str | None:
-    """The address of this host on the way to another one; the system chooses it, and nothing is sent."""
+def address_towards(host: str) -> str | None:
+    """The address of this host on the way to another one; the system chooses it, and nothing is sent. None: no way."""
     with suppress(OSError):
         kind, _, _, _, place = socket.getaddrinfo(host, 1, type=socket.SOCK_DGRAM)[0]
         with socket.socket(kind, socket.SOCK_DGRAM) as own:
