@@ -30,6 +30,8 @@ from tests.ssh_hosts import PYTHON, SshHosts, ssh_hosts, why_not
 __all__ = ["main"]
 
 _WAYS: Final = ("plain TCP", "ssh", "ssh, with `rows: tcp`")
+_ADDRESS: Final = "10.77.0.2"
+"""Of the second host."""
 _FOLDER: Final = Path("own-clone", "configs")
 _RESULT: Final = "over_ssh.csv"
 _SUMMARY: Final = re.compile(r"^(\d+) points in ([0-9.]+) s: (\d+) points/s", re.MULTILINE)
@@ -100,7 +102,7 @@ def _content(job: _Job, way: str, there: str) -> dict[str, Any]:
     content["zenoh"] = {"insecure": way != _WAYS[1]}
     if way != _WAYS[0]:
         rows = "sockets" if way == _WAYS[1] else "tcp"
-        content["deploy"] = {"hosts": {there: {"ssh": there, "python": PYTHON, "rows": rows}}}
+        content["deploy"] = {"hosts": {there: {"ssh": there, "python": PYTHON, "rows": rows, "address": _ADDRESS}}}
         [*content["instances"].values()][1]["host"] = there
     return content
 
