@@ -49,8 +49,7 @@ __all__ = [
 
 _LOG: Final = "slurm-{task}.log"
 _SUBMIT_S, _ASK_S = 60.0, 30.0
-_LOOK_S: Final = 1.0
-_POLL_S: Final = 10.0
+_LOOK_S, _POLL_S = 1.0, 10.0
 """Time in s between two questions: the controller serves all users."""
 _SILENCE_S: Final = 600.0
 """How long Slurm may leave questions without an answer, in s."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import kubernetes_validate
+import psutil
 import pytest
 import yaml
 from hypothesis import given
@@ -78,6 +80,14 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
     return capsys.readouterr().err.splitlines()[-1].removeprefix("fmu-mesh: ")
 
 
+def command_of(process: psutil.Process) -> list[str]:
+    """Its words; none if it has ended meanwhile."""
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:
+        return []
+
+
 def settings_of(script: str) -> list[list[str]]:
     """The options of `sbatch` in a script, for each component of the job."""
     components: list[list[str]] = [[]]
@@ -131,9 +141,7 @@ def test_a_killed_task_ends_the_job_with_code_four(place: Place) -> None:
     job = place.start_command(["sh", "job"])
     wait_until(lambda: row_count(config.with_suffix(".csv")) > 0, "rows")
 
-    [node] = [
-        one for one in place.processes() if one.cmdline()[3:5] == ["node", str(config)] and "delay" in one.cmdline()
-    ]
+    [node] = [one for one in place.processes() if {"node", "delay"} <= {*command_of(one)}]
     node.kill()
 
     assert job.wait() == 4, place.story()
@@ -327,6 +335,34 @@ def test_a_compose_file_shows_each_container_only_its_files(tmp_path: Path, caps
         (str(tmp_path / "lab" / "node"), "/security", True),
     ]
     assert "insecure" not in text
+
+
+@pytest.mark.skipif(not all(map(shutil.which, ("podman", "podman-compose"))), reason="podman-compose is not installed")
+def test_podman_compose_starts_what_the_file_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = main_job(tmp_path, memory="512 MiB")
+    (tmp_path / "compose.yaml").write_text(rendered(capsys, "compose", config, "--insecure"), encoding="utf-8")
+    command = ["podman-compose", "--dry-run", "-f", "compose.yaml", "run", "--rm", "--name", "pair-master", "master"]
+
+    # Debian's has no `config`: this shows the commands of Podman.
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=DEADLINE_S)
+
+    lines = [shlex.split(line) for line in (shown.stdout + shown.stderr).splitlines() if line.startswith("podman run ")]
+    ends = {tuple(words[words.index("fmu-mesh") :]) for words in lines}
+    assert ends == {
+        ("fmu-mesh", "master", "/mesh/pair.yaml", "--listen", "tcp/0.0.0.0:7447", "--no-progress", "--insecure"),
+        *(
+            ("fmu-mesh", "node", "/mesh/pair.yaml", node, "--connect", "tcp/pair-master:7447", "--insecure")
+            for node in ("pendulum", "delay")
+        ),
+    }
+    assert all(f"{tmp_path}:/mesh:ro" in words for words in lines)
+    assert [f"{tmp_path}/results:/mesh/results:rw" in words for words in lines] == [
+        "master" in words for words in lines
+    ]
+    assert ["--name=pair-master" in words for words in lines] == ["master" in words for words in lines]
+    memory = str((512 << 20) + (256 << 20))
+    assert [memory in words for words in lines] == ["pendulum" in words for words in lines]
+    assert all({"--cap-drop", "ALL", "no-new-privileges:true"} <= {*words} for words in lines)
 
 
 def test_files_all_over_the_host_are_not_for_containers(

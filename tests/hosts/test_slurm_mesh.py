@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from fmu_mesh.cli.main import main
@@ -56,6 +57,14 @@ def has_events(job: SlurmJob, *events: Event) -> None:
         write = EventWriter(file.fileno())
         for event in events:
             write(event)
+
+
+def command_of(process: psutil.Process) -> list[str]:
+    """Its words; none if it has ended meanwhile."""
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:
+        return []
 
 
 def end_of(job: SlurmJob) -> str:
@@ -236,7 +245,7 @@ def test_nodes_with_a_host_are_a_component_of_their_own(shared: Place, running: 
 def test_a_task_that_is_killed_is_told_with_host_and_reason(shared: Place) -> None:
     _, submitting = long_job(shared)
 
-    [node] = [one for one in shared.processes() if "node" in one.cmdline() and "delay" in one.cmdline()]
+    [node] = [one for one in shared.processes() if {"node", "delay"} <= {*command_of(one)}]
     node.kill()
 
     assert submitting.wait() == 4, shared.story()
