@@ -94,7 +94,8 @@ PARSERS: Parsers = {
     "node": (
         *CONFIGURED,
         options("view", "video"),
-        argument("node", "INSTANCE", "name of the instance, or of its group"),
+        argument("--host", "NAME", "start all nodes of this host of `deploy.hosts`, each in a process"),
+        argument("node", "INSTANCE", "name of the instance, or of its group", nargs="?"),
     ),
     "master": (
         *CONFIGURED,

@@ -99,7 +99,9 @@ def _shown(
     """The result of a run whose events are shown; ``drive`` is called when it has started."""
     reporter.planned(plan)
     with (
-        Display(plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+        Display(
+            plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, file=str(plan.loaded.file)
+        ) as display,
         interrupted_by_signals() as runs,
     ):
 
@@ -168,11 +170,19 @@ def finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> int:
+    from ..run.host_nodes import nodes_on, run_nodes  # noqa: PLC0415  only this command needs it
     from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
 
+    if (arguments.node is None) is (arguments.host is None):
+        raise ConfigurationError(
+            "`fmu-mesh node` starts INSTANCE, or with --host all nodes of a host: give one of both."
+        )
     plan = mesh_of(arguments).plan(**given_options(arguments))
+    names = [arguments.node] if arguments.node is not None else nodes_on(plan, arguments.host)
     _warn(plan, every=False)
-    run_node(plan.node(arguments.node))
+    if len(names) > 1:
+        return run_nodes(plan, names, say)
+    run_node(plan.node(names[0]))
     return 0
 
 
@@ -183,7 +193,11 @@ def _master(arguments: argparse.Namespace) -> int:
     with (
         plotted_where_it_ends(plan.plan, arguments.plot),
         Display(
-            plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
+            plan.plan,
+            show_progress=not arguments.no_progress,
+            quiet=arguments.quiet,
+            waits_for_nodes=False,
+            file=str(plan.loaded.file),
         ) as display,
         _refusals_told() if identity_of(plan) is not None else nullcontext(),
     ):

@@ -23,6 +23,7 @@ from types import FrameType, TracebackType
 from typing import Self
 
 from ..errors import ConfigurationError, Interrupted
+from ..wire.host_processes import is_stopped
 from ..wire.runtime import (
     enter_run_folder,
     leave_run_folder,
@@ -40,7 +41,9 @@ __all__ = [
     "ended_by_signals",
     "forked_by",
     "interrupts_later",
+    "launch_of",
     "only_wake",
+    "wake_helper",
 ]
 
 GRACE_S = 1.0
@@ -83,6 +86,11 @@ class Interruption:
             end(self.reason)
 
 
+def launch_of(run: str) -> str | None:
+    """What identifies the launch of a run of this host; None if there is no launcher."""
+    return f"{socket.gethostname()}.{run}" if run != MANUAL else None
+
+
 class RunProcess:
     """One process of a run, from its start to its end; use it as a context manager on the main thread.
 
@@ -99,6 +107,7 @@ class RunProcess:
     Args:
         mesh: name of the mesh.
         run: name of the run; `MANUAL` if a person has started this process.
+        launch: identifies the launch, if that of ``run`` is on another host.
 
     Attributes:
         is_child: whether a launcher has started this process and watches it.
@@ -108,9 +117,9 @@ class RunProcess:
         interruption: requests to end, from signals or the parent.
     """
 
-    def __init__(self, mesh: str, run: str) -> None:
+    def __init__(self, mesh: str, run: str, launch: str | None = None) -> None:
         self.is_child = run != MANUAL
-        self.launch = f"{socket.gethostname()}.{run}" if self.is_child else None
+        self.launch = launch or launch_of(run)
         self.folder = run_folder(mesh, run)
         self.stack = ExitStack()
         self.interruption = Interruption()
@@ -220,6 +229,13 @@ def _wake_server() -> None:
     if (server := os.getppid()) in _servers:
         with suppress(ProcessLookupError):
             os.kill(server, signal.SIGCONT)
+
+
+def wake_helper(helper: int) -> None:
+    """Let the helper of the launcher on this host end, if it is stopped, at the end of a node."""
+    if is_stopped(helper):
+        for number in (signal.SIGCONT, signal.SIGTERM):
+            os.kill(helper, number)
 
 
 def _exit(reason: str, *, reported: bool) -> None:

@@ -44,7 +44,7 @@ from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_li
 from .limits import limit_process, strain
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
-from .process import RunProcess
+from .process import RunProcess, wake_helper
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
 from .wiring import certified, patient, table_of, wiring
 
@@ -118,8 +118,13 @@ def run_node(run: NodeRun) -> None:
     if run.run == MANUAL and run.plan.process.is_sandboxed:  # it could ask nobody outside
         text = f"`sandbox` of node '{run.plan.node}' has no effect where the node is started manually"
         raise ConfigurationError(text, hint="`fmu-mesh launch` starts it in a sandbox; `sandbox: none` without.")
-    with RunProcess(run.plan.mesh, run.run) as process:
-        _NodeProcess(run, process).run()
+    with RunProcess(run.plan.mesh, run.run, run.launch) as process:
+        try:
+            _NodeProcess(run, process).run()
+        except FmuMeshError:
+            if run.helper is not None:
+                wake_helper(run.helper)
+            raise
 
 
 class _NodeProcess:
@@ -144,7 +149,8 @@ class _NodeProcess:
             os.chdir(own_folder)
         root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
-        own = replace(patient(ends, plan.timeouts, is_node=True), publishes=f"{root}/**")
+        made = patient(ends, plan.timeouts, is_node=True, is_mirrored=run.launch is not None)
+        own = replace(made, publishes=f"{root}/**")
         own = certified(own, run.security, root)
         session = open_session(own)
         process.stack.callback(close_session, session)

@@ -139,14 +139,15 @@ def table_of(own: Wiring) -> int:
     return own.identity.table.number if own.identity is not None and own.identity.table is not None else 0
 
 
-def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
+def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool, is_mirrored: bool = False) -> Wiring:
     """The wiring of a process that waits for the others as long as the configuration says.
 
     On one host the end of a process closes its sockets, so no link is given up before a step is: its deadlines come
     first. Of two hosts the one that connects decides. Between hosts a queue is full during a cut, and links wait for
-    its end. A master that is on one host with all others does not wait so long for a tool that is stopped.
+    its end. A master that is on one host with all others does not wait so long for a tool that is stopped. Sockets that
+    are ``is_mirrored`` are those of another host.
     """
-    is_local = all(map(is_socket, made.connect))
+    is_local = all(map(is_socket, made.connect)) and not is_mirrored
     lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
     waits = is_node or not all(map(is_socket, (*made.listen, *made.connect)))
     return replace(made, lease_s=lease_s, stuck_s=lease_s if waits else made.stuck_s)

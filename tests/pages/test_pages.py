@@ -352,6 +352,21 @@ NOT_RUN = [
         "sudo bridges/gazebo_classic/setup.sh /opt/gazebo_classic",
         "it takes 15 minutes; .ci/long runs it",
     ),
+    (
+        "docs/hosts.md",
+        "ssh user@lab2 python3 -m venv mesh",
+        "it installs on a host of yours; .ci/run installs the same wheel",
+    ),
+    (
+        "docs/hosts.md",
+        "ssh -o BatchMode=yes user@lab2 true",
+        "lab2 is yours; tests/hosts/test_over_ssh.py runs meshes over hosts with an sshd",
+    ),
+    (
+        "docs/hosts.md",
+        "$ fmu-mesh launch two_hosts.yaml --listen tcp/0.0.0.0:7447 --insecure",
+        "two hosts are needed; tests/hosts/test_nodes_by_hand.py types what launch shows",
+    ),
     ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
     (
         "docs/installation.md",
