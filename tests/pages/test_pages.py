@@ -344,8 +344,7 @@ NOT_RUN = [
     ),
     (
         "docs/engines.md",
-        "fmu-mesh render kubernetes configs/pendulum_delay.yaml --security lab --image "
-        "registry.example.org/fmu-mesh --claim lab-data -o mesh.yaml",
+        "fmu-mesh render kubernetes configs/pendulum_delay.yaml --security lab --claim lab-data -o mesh.yaml",
         "it needs a cluster",
     ),
     (
