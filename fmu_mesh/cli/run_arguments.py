@@ -25,7 +25,7 @@ from .arguments import (
     switch,
     whole,
 )
-from .run_options import CONFIGURED, add_options, options
+from .run_options import CONFIGURED, PLACED, add_options, options
 
 __all__ = ["HERE", "PARSERS", "SIMULATION"]
 
@@ -50,6 +50,20 @@ def _add_simulate(parser: argparse._ActionsContainer) -> None:
 def _add_processes(parser: argparse._ActionsContainer) -> None:
     """Until version 0.5: `sweep` warns, and says what to do."""
     parser.add_argument("--processes", action="store_true", default=None, help=argparse.SUPPRESS)
+
+
+def _add_target(parser: argparse._ActionsContainer) -> None:
+    text = "write it into a file; default: standard output"
+    parser.add_argument("-o", "--to", metavar="FILE", help=text, type=Path, dest="target")
+
+
+_SLURM_OPTION = argument(
+    "--slurm-option",
+    "OPTION",
+    "an option of sbatch, as in --slurm-option=--partition=short; repeatable",
+    action="append",
+    default=[],
+)
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -115,7 +129,13 @@ PARSERS: Parsers = {
         options("view", "video"),
         _add_nodes,
     ),
-    "master": (*CONFIGURED, options("paused", "profile"), _PLOT, *_OUTPUT),
+    "master": (
+        *CONFIGURED,
+        options("paused", "profile"),
+        _PLOT,
+        *_OUTPUT,
+        argument("--events", "FILE.jsonl", "also write the events of the run into a file, as JSON lines", type=Path),
+    ),
     "gateway": (*CONFIGURED, QUIET),
     "router": (
         argument(
@@ -202,13 +222,7 @@ PARSERS: Parsers = {
             "on a Slurm cluster; FOLDER is on a file system that its hosts share",
             switch("--slurm", text="submit an array of jobs, and follow it"),
             argument("--tasks", "N", "tasks of the array, at most (16)", type=count, default=16),
-            argument(
-                "--slurm-option",
-                "OPTION",
-                "an option of sbatch, as in --slurm-option=--partition=short; repeatable",
-                action="append",
-                default=[],
-            ),
+            _SLURM_OPTION,
             switch("--no-wait", text="submit only; the same command follows it later"),
         ),
         group(
@@ -218,6 +232,25 @@ PARSERS: Parsers = {
         options("keys_from", "allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
+    ),
+    "render": (
+        argument("engine", "ENGINE", "slurm, compose or kubernetes", choices=("slurm", "compose", "kubernetes")),
+        *PLACED,
+        _add_target,
+        argument("--image", "IMAGE", "of compose and kubernetes: the image with fmu-mesh; default: fmu-mesh"),
+        argument(
+            "--claim",
+            "NAME",
+            "of kubernetes: the claim of a volume with the folder of the mesh; default: the name of the mesh",
+        ),
+        _SLURM_OPTION,
+        QUIET,
+    ),
+    "submit": (
+        argument("engine", "ENGINE", "slurm", choices=("slurm",)),
+        *PLACED,
+        _SLURM_OPTION,
+        *_OUTPUT,
     ),
     "rerun": (
         argument("result", "RESULT", "the result file of a run", type=Path),

@@ -164,7 +164,7 @@ def open_session(wiring: Wiring) -> zenoh.Session:
     Raises:
         ConfigurationError: an endpoint or the configuration file cannot be used, or an endpoint and this process do
             not take the certificate of each other.
-        MeshLost: a client has a certificate, and nobody listens.
+        MeshLost: a client has found nobody who listens.
     """
     for endpoint in (*wiring.listen, *wiring.connect):
         secured, own_settings = wiring.identity is not None, wiring.config is not None
@@ -188,11 +188,14 @@ def reason_of(error: zenoh.ZError) -> str:
     return _OWN_SOURCE.sub("", str(error))
 
 
-def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
+def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError | MeshLost:
     # Of TLS, the reason has the address and the port, and neither the protocol nor the name of the host.
     ends = {endpoint: f":{endpoint.rpartition(':')[2]}:" for endpoint in wiring.listen}
     endpoint = next((endpoint for endpoint, port in ends.items() if endpoint in reason or port in reason), None)
     if endpoint is None:
+        if wiring.mode == "client" and reason.endswith("Timeout!"):
+            text = f"nobody listens at {', '.join(wiring.connect)}"
+            return MeshLost(text, hint=f"The router, or the master, had {wiring.patience_s:g} s to start.")
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
         return ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {reason}")
     for words, what, hint in _CANNOT_LISTEN:
