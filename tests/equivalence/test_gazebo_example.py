@@ -106,7 +106,7 @@ def endpoint(place: Place) -> Iterator[str]:
     config = place.folder / "actuator.yaml"
     config.write_text(text.replace("../../", f"{EXAMPLE.parents[1]}/"), encoding="utf-8")
     launched = place.start("launch", config, "--output", place.folder / "result.csv")
-    launched.wait_for_error_line(address)
+    launched.wait_for_error_line(f"' at {address}")  # and not that of the warning
     yield address
     launched.close()
 

@@ -119,9 +119,15 @@ def test_the_story_goes_as_the_page_tells_it(place: Place) -> None:
     outputs = "\n".join(text for own in reader.told for text in (own.output, own.errors))
     missing = {*_words("".join(shown for _, shown in STORY))} - {*_words(outputs)}
     assert not missing, f"{missing} is not in\n{outputs}"
-    assert twin.errors.count("warning") == 0, twin.story()
+    assert _warnings(twin.errors) == [], twin.story()
     _assert_forecasts(place.folder / "results" / "pump_twin.csv", topics, events)
     assert _last_row(place.folder / "results" / "worse_fan.csv")[0] == 5.0
+
+
+def _warnings(errors: str) -> list[str]:
+    """All but that of the port of this host, which is meant."""
+    warnings = [line for line in errors.splitlines() if "warning" in line]
+    return [line for line in warnings if "every user of this host can set values" not in line]
 
 
 def _assert_forecasts(result: Path, topics: str, events: str) -> None:
@@ -191,7 +197,7 @@ def test_values_with_times_are_a_line_through_these_times(place: Place, part: tu
     rows = rows_of(place.folder / "part.csv")
     kept = [json.loads(line) for line in (place.folder / "part.csv.keys.jsonl").read_text("utf-8").splitlines()]
     times = [one[2] for one in kept]
-    assert "warning" not in mesh.errors
+    assert _warnings(mesh.errors) == []
     assert [one[3] for one in kept] == [rpm * RPM for _, rpm in sent]
     # Seconds since 1970 have 52 bits, so the last one counts 2.4e-7 s.
     assert np.diff(times) == pytest.approx(0.25, abs=2 * 2**-22)
@@ -255,6 +261,6 @@ def test_a_run_goes_on_while_the_bridge_is_dead(place: Place) -> None:
     place.run("stop", "pump_twin")
 
     assert twin.wait() == 0, twin.story()
-    assert "warning" not in twin.errors
+    assert _warnings(twin.errors) == []
     assert sorted(set(speeds())) == [0.0, 2400 * RPM, 2900 * RPM]
     assert speeds() == sorted(speeds())

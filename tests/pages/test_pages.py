@@ -426,6 +426,16 @@ NOT_RUN = [
         "it takes an hour, and figures of a busy machine mean nothing",
     ),
     (
+        "docs/performance.md",
+        ".venv/bin/python -m benchmarks.tls",
+        "it takes minutes; tests/security/test_locked_doors.py compares the floats",
+    ),
+    (
+        "docs/performance.md",
+        ".venv/bin/python -m benchmarks.floods --floods large stopped --repeat 1",
+        "it takes half an hour, and figures of a busy machine mean nothing",
+    ),
+    (
         "docs/profiling.md",
         "$ pgrep -af '^fmu-mesh'",
         "it lists the processes of all meshes of this host; tests/faults/test_fork_server.py reads the titles",

@@ -189,11 +189,13 @@ def test_the_gateway_node_needs_the_role_of_a_node(
         node.trigger_activate()
         ros.matched(publisher)
 
-        publisher.publish(Float64(data=0.125))
         ros.until(lambda: messages, "a value in ROS")
-        read = wait_until(lambda: asked_value(place) == 0.125, "the value from ROS")
 
-        assert read
+        def is_set() -> bool:
+            publisher.publish(Float64(data=0.125))  # the other end may not know this one yet
+            return asked_value(place) == 0.125
+
+        ros.until(is_set, "the value from ROS")
         assert "ROS" in place.run("status").output
 
 
