@@ -179,7 +179,7 @@ def test_another_version_there_is_refused_before_anything_starts(pair: SshHosts)
         mesh.assert_nothing_left()
 
 
-def test_a_full_disk_there_is_told_and_leaves_no_part_of_a_file(pair: SshHosts) -> None:
+def test_a_full_disk_there_is_told_and_leaves_nothing(pair: SshHosts) -> None:
     folder = pair["b"].home / ".cache" / "fmu_mesh"
     folder.mkdir(parents=True, exist_ok=True)
     where = "/tmp/home/.cache/fmu_mesh"  # noqa: S108  of the host
