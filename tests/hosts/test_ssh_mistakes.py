@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -123,7 +123,7 @@ def forbidden(pair: SshHosts) -> Iterator[None]:
 class Mistake(NamedTuple):
     """What is wrong with the host `b`, and what the message has to say; ``python`` is that of its entry."""
 
-    make: Callable[[SshHosts], object]
+    make: Callable[[SshHosts], AbstractContextManager[object]]
     words: tuple[str, ...]
     python: str = PYTHON
 
