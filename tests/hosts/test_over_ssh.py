@@ -67,12 +67,13 @@ def test_the_commands_of_the_page_run_as_they_are(tmp_path: Path) -> None:
             shutil.rmtree(there.folder / "own-clone" / folder)
         path = f"{sys.prefix}/bin:{os.environ['PATH']}"
 
+        typed: list[Launched] = []
         for command in block.commands(None):
-            typed = here.start("sh", "-c", command.line, PATH=path)
-            assert typed.wait() == 0, typed.story()
+            typed.append(here.start("sh", "-c", command.line, PATH=path))
+            assert typed[-1].wait() == 0, typed[-1].story()
 
-        assert len(block.commands(None)) == 5
-        assert "equal" in typed.output
+        assert len(typed) == 5
+        assert "equal" in typed[-1].output
 
 
 def test_three_hosts_reach_each_other_through_the_one_of_launch(tmp_path: Path) -> None:

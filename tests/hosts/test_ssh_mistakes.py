@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -123,7 +123,7 @@ def forbidden(pair: SshHosts) -> Iterator[None]:
 class Mistake(NamedTuple):
     """What is wrong with the host `b`, and what the message has to say; ``python`` is that of its entry."""
 
-    make: Callable[[SshHosts], object]
+    make: Callable[[SshHosts], AbstractContextManager[object]]
     words: tuple[str, ...]
     python: str = PYTHON
 
@@ -179,7 +179,7 @@ def test_another_version_there_is_refused_before_anything_starts(pair: SshHosts)
         mesh.assert_nothing_left()
 
 
-def test_a_full_disk_there_is_told_and_leaves_no_part_of_a_file(pair: SshHosts) -> None:
+def test_a_full_disk_there_is_told_and_leaves_nothing(pair: SshHosts) -> None:
     folder = pair["b"].home / ".cache" / "fmu_mesh"
     folder.mkdir(parents=True, exist_ok=True)
     where = "/tmp/home/.cache/fmu_mesh"  # noqa: S108  of the host
