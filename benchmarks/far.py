@@ -30,7 +30,7 @@ from benchmarks.report import Report
 from benchmarks.running import Measured
 from benchmarks.task import System
 from tests.helpers import Launched, wait_until
-from tests.network_hosts import NetworkHost, two_hosts
+from tests.network_hosts import NetworkHost, started_hosts
 
 __all__ = ["JOBS", "LINKS", "FarJob", "FarRuns", "main"]
 
@@ -227,7 +227,7 @@ def _all(options: argparse.Namespace) -> Figures:
     changes: dict[str, dict[str, object]] = {"zenoh": {"row_streams": not options.zenoh}}
     if options.window is not None:
         changes["simulation"] = {"window": options.window}
-    with tempfile.TemporaryDirectory(prefix="far-") as folder, two_hosts(Path(folder), wired=False) as hosts:
+    with tempfile.TemporaryDirectory(prefix="far-") as folder, started_hosts(Path(folder), wired=False) as hosts:
         runs = FarRuns(hosts, changes)
         for number, link in itertools.product(range(options.repeat), links):
             with far_link([host.pid for host in hosts], link):

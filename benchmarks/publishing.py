@@ -50,6 +50,7 @@ BLOCKS = {
     "live data": "benchmarks.live_data",
     "floods": "benchmarks.floods",
     "tls": "benchmarks.tls",
+    "ssh": "benchmarks.over_ssh",
     "recording": "benchmarks.recording",
     "formats": "benchmarks.formats",
     "scale": "benchmarks.scale",

@@ -78,6 +78,7 @@ class ErrorReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     point: int | None = None
     time: float | None = None
     hint: str | None = None
+    host: str | None = None
 
 
 class FmuMeshError(Exception):
@@ -92,6 +93,7 @@ class FmuMeshError(Exception):
         hint: what the reader can do next.
 
     Attributes:
+        host: the host of `deploy.hosts` on which the instance runs; None: that of `launch`.
         reported: True if another process has already shown this error.
         result: what was recorded before, if this error ended a run of the library: a `fmu_mesh.Result`.
 
@@ -131,6 +133,7 @@ class FmuMeshError(Exception):
         self.point = point
         self.time = time
         self.hint = hint
+        self.host: str | None = None
         self.reported: bool = False
         self.result: Any = None
 
@@ -139,6 +142,7 @@ class FmuMeshError(Exception):
         if self.instance is not None:
             variable = self.variable if not self._message_has_variable else None
             where.append(f"instance {self.instance}" + (f".{variable}" if variable is not None else ""))
+            where[0] += f" on {self.host}" if self.host is not None else ""
         elif self.variable is not None:
             where.append(f"variable {self.variable}")
         if self.point is not None:
@@ -151,6 +155,11 @@ class FmuMeshError(Exception):
     def at(self, point: int, time: float) -> Self:
         """Set the communication point and its time in s; returns this error."""
         self.point, self.time = point, time
+        return self
+
+    def on(self, host: str | None) -> Self:
+        """Set the host; returns this error."""
+        self.host = host
         return self
 
     def saying(self, message: str) -> Self:
@@ -382,7 +391,7 @@ def from_report(report: ErrorReport) -> FmuMeshError:
     for kind in (ConfigurationError, NotInOneProcess):
         if report.kind == kind.__name__:
             return kind(report.message, hint=report.hint)
-    return _BY_KIND.get(report.kind, FmuMeshError)(
+    error = _BY_KIND.get(report.kind, FmuMeshError)(
         report.message,
         instance=report.instance,
         variable=report.variable,
@@ -390,3 +399,4 @@ def from_report(report: ErrorReport) -> FmuMeshError:
         time=report.time,
         hint=report.hint,
     )
+    return error.on(report.host)

@@ -38,6 +38,7 @@ __all__ = [
     "Kept",
     "OwnFile",
     "archive_on_the_way",
+    "below",
     "beside",
     "cache_folder",
     "cloned",
@@ -247,6 +248,16 @@ def archive_on_the_way(path: Path) -> Path | None:
     None if something is at the path itself, or if no part of it is a file.
     """
     return None if exists(path) else next((parent for parent in path.parents if is_file(parent)), None)
+
+
+def below(folder: Path) -> list[Path]:
+    """All files below a folder, but hidden ones and the byte code of Python."""
+    found: list[Path] = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and name != "__pycache__")
+        own = (Path(place) / name for name in sorted(names) if not name.startswith("."))
+        found += [file for file in own if file.is_file()]
+    return found
 
 
 def sha256_of(path: Path) -> str:

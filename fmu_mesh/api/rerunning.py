@@ -29,7 +29,7 @@ from .mesh_builder import Mesh
 from .result import Result
 from .run_handle import Run
 
-__all__ = ["ALONE", "PlannedRerun", "planned_rerun", "rerun"]
+__all__ = ["ALONE", "PlannedRerun", "on_this_host", "planned_rerun", "rerun"]
 
 log = logging.getLogger("fmu_mesh.run")
 
@@ -41,6 +41,18 @@ ALONE: Mapping[str, Any] = {
     "runtime": {},
 }
 """What a rerun has of its own: nobody else reaches it or sends anything to it."""
+
+
+def on_this_host(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The sections of a configuration by which all of it runs here, whatever hosts it names."""
+    instances = data.get("instances")
+    if not isinstance(instances, dict):
+        return {}
+    here = {
+        name: {key: value for key, value in own.items() if key != "host"} if isinstance(own, dict) else own
+        for name, own in instances.items()
+    }
+    return {"instances": here, "deploy": {}}
 
 
 class PlannedRerun(NamedTuple):
@@ -117,7 +129,7 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     output = Path(options.output) if options.output is not None else path.with_name(f"{path.stem}.rerun{path.suffix}")
     if output.absolute() == path.absolute():
         raise ConfigurationError(f"'{output}' is the result itself", hint="Give another file with `output=...`.")
-    data = {**metadata.configuration, **ALONE}
+    data = {**metadata.configuration, **on_this_host(metadata.configuration), **ALONE}
     sections = data.get("record") or {}
     section = sections[metadata.section] if isinstance(sections, list) else sections
     data["record"] = {**section, "file": str(output.absolute())}

@@ -14,8 +14,10 @@ import atexit
 import logging
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING
@@ -206,11 +208,15 @@ class RunThread:
                 self._take(Restarted(error.report(), plan.restarts, most))
 
     def _run_once(self, plan: RunPlan) -> Outcome:
-        kind: type[Launcher | InProcessRun] = Launcher
+        kind: Callable[..., Launcher | InProcessRun] = Launcher
         if not self._settings.processes:
             from ..run.in_process import InProcessRun  # noqa: PLC0415 it needs all that nodes do
 
             kind = InProcessRun
+        elif any(host.ssh is not None for host in plan.plan.hosts.values()):
+            from ..hosts.ssh import SshHosts  # noqa: PLC0415  most runs are on one host
+
+            kind = partial(Launcher, elsewhere=SshHosts)
         with self._changing:
             if self._failure is not None:
                 raise self._failure

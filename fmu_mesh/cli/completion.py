@@ -237,6 +237,7 @@ _BY_COMMAND: Final[_Offers] = {
     ("inspect", "variables"): lambda prefix, given: _in_parts(
         (one.name for one in variables_of_fmu(given.fmu)), prefix
     ),
+    ("node", "host"): lambda _, given: readable_configuration(given.config, given.ssd).config.deploy.hosts,
     ("plot", "variables"): _columns,
     ("plot", "x"): _columns,
     ("compare", "variables"): _columns,

@@ -65,6 +65,8 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
     "recover": ("file", "plotting", "finish the result file of a run that was killed"),
     "node": ("run", "running", "start one node manually"),
     "master": ("run", "running", "start the master and the recorder manually"),
+    "render": ("run", "engines", "write a mesh for Slurm, Compose or Kubernetes"),
+    "submit": ("run", "engines", "run a mesh as a job of Slurm, and follow it"),
     "gateway": ("run", "running", "start the gateway to ROS manually"),
     "router": ("run", "running", "run a Zenoh router"),
     "security": ("file", "security_command", "certify who may do what, and show it"),

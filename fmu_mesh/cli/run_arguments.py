@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from ..config.call_options import option_fields
 from ..run.options import SimulateOptions
@@ -24,7 +25,7 @@ from .arguments import (
     switch,
     whole,
 )
-from .run_options import CONFIGURED, add_options, options
+from .run_options import CONFIGURED, PLACED, add_options, options
 
 __all__ = ["HERE", "PARSERS", "SIMULATION"]
 
@@ -51,6 +52,20 @@ def _add_processes(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--processes", action="store_true", default=None, help=argparse.SUPPRESS)
 
 
+def _add_target(parser: argparse._ActionsContainer) -> None:
+    text = "write it into a file; default: standard output"
+    parser.add_argument("-o", "--to", metavar="FILE", help=text, type=Path, dest="target")
+
+
+_SLURM_OPTION = argument(
+    "--slurm-option",
+    "OPTION",
+    "an option of sbatch, as in --slurm-option=--partition=short; repeatable",
+    action="append",
+    default=[],
+)
+
+
 def _part(text: str) -> tuple[int, int]:
     number, slash, of = text.partition("/")
     if not (slash and 1 <= whole(number) <= whole(of)):
@@ -69,6 +84,38 @@ def _with_key(flag: str, text: str) -> ArgumentPart:
     return argument(flag, "VARIABLE=KEY", f"{text}; repeatable", type=_end, action="append", default=[])
 
 
+class _Stored(argparse.Action):
+    """An argument, or an option with which another argument is not needed.
+
+    With `nargs="?"` for that argument, argparse would not find it behind an option.
+    """
+
+    def __init__(self, instead: argparse.Action | None = None, **details: Any) -> None:  # noqa: ANN401 the arguments of argparse
+        super().__init__(**details)
+        self._instead = instead
+
+    def __call__(
+        self,
+        _parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        _option: str | None = None,
+    ) -> None:
+        vars(namespace)[self.dest] = values
+        if isinstance(self._instead, _Stored):
+            self._instead.spare()
+
+    def spare(self) -> None:
+        """It is not needed."""
+        self.required = False
+
+
+def _add_nodes(parser: argparse._ActionsContainer) -> None:
+    node = parser.add_argument("node", metavar="INSTANCE", help="name of the instance, or of its group", action=_Stored)
+    text = "start all nodes of this host of `deploy.hosts` instead, each in a process"
+    parser.add_argument("--host", metavar="NAME", help=text, action=_Stored, instead=node)
+
+
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
@@ -80,9 +127,15 @@ PARSERS: Parsers = {
     "node": (
         *CONFIGURED,
         options("view", "video"),
-        argument("node", "INSTANCE", "name of the instance, or of its group"),
+        _add_nodes,
     ),
-    "master": (*CONFIGURED, options("paused", "profile"), _PLOT, *_OUTPUT),
+    "master": (
+        *CONFIGURED,
+        options("paused", "profile"),
+        _PLOT,
+        *_OUTPUT,
+        argument("--events", "FILE.jsonl", "also write the events of the run into a file, as JSON lines", type=Path),
+    ),
     "gateway": (*CONFIGURED, QUIET),
     "router": (
         argument(
@@ -169,13 +222,7 @@ PARSERS: Parsers = {
             "on a Slurm cluster; FOLDER is on a file system that its hosts share",
             switch("--slurm", text="submit an array of jobs, and follow it"),
             argument("--tasks", "N", "tasks of the array, at most (16)", type=count, default=16),
-            argument(
-                "--slurm-option",
-                "OPTION",
-                "an option of sbatch, as in --slurm-option=--partition=short; repeatable",
-                action="append",
-                default=[],
-            ),
+            _SLURM_OPTION,
             switch("--no-wait", text="submit only; the same command follows it later"),
         ),
         group(
@@ -185,6 +232,25 @@ PARSERS: Parsers = {
         options("keys_from", "allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
+    ),
+    "render": (
+        argument("engine", "ENGINE", "slurm, compose or kubernetes", choices=("slurm", "compose", "kubernetes")),
+        *PLACED,
+        _add_target,
+        argument("--image", "IMAGE", "of compose and kubernetes: the image with fmu-mesh; default: fmu-mesh"),
+        argument(
+            "--claim",
+            "NAME",
+            "of kubernetes: the claim of a volume with the folder of the mesh; default: the name of the mesh",
+        ),
+        _SLURM_OPTION,
+        QUIET,
+    ),
+    "submit": (
+        argument("engine", "ENGINE", "slurm", choices=("slurm",)),
+        *PLACED,
+        _SLURM_OPTION,
+        *_OUTPUT,
     ),
     "rerun": (
         argument("result", "RESULT", "the result file of a run", type=Path),

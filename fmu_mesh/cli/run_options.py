@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ..api.mesh_builder import Mesh
     from ..config.yaml_text import Plain
 
-__all__ = ["CONFIGURED", "add_options", "given_options", "mesh_of", "options"]
+__all__ = ["CONFIGURED", "PLACED", "add_options", "forwarded", "given_options", "mesh_of", "options"]
 
 
 def mesh_of(arguments: argparse.Namespace) -> Mesh:
@@ -70,30 +71,31 @@ def options(*names: str, of: type[CallOptions] = RunOptions, **words: Mapping[st
     return lambda parser: add_options(parser, *names, options=of, **words)
 
 
-CONFIGURED = (
+_CONFIG = (
     argument("config", "CONFIG", "a configuration file, a package of SSP, or a world of Gazebo", type=Path),
     *PACKAGE,
-    group(
-        "instead of what CONFIG says",
-        options(
-            "algorithm",
-            "step_size",
-            "stop_time",
-            "window",
-            "real_time_factor",
-            "start_values",
-            "config_values",
-            "scenario",
-            "output",
-            "listen",
-            "connect",
-            "security",
-            "insecure",
-        ),
-    ),
+)
+_INSTEAD = (
+    "algorithm",
+    "step_size",
+    "stop_time",
+    "window",
+    "real_time_factor",
+    "start_values",
+    "config_values",
+    "scenario",
+    "output",
+)
+_ACCESS = ("security", "insecure")
+_TITLE = "instead of what CONFIG says"
+CONFIGURED = (
+    *_CONFIG,
+    group(_TITLE, options(*_INSTEAD, "listen", "connect", *_ACCESS)),
     options("keys_from", "allow_code"),
 )
 """The argument CONFIG, and the flags that replace what CONFIG says."""
+PLACED = (*_CONFIG, group(_TITLE, options(*_INSTEAD, *_ACCESS)), options("keys_from", "allow_code"))
+"""As `CONFIGURED`, where an engine says how processes meet."""
 
 
 def given_options(arguments: argparse.Namespace, options: type[CallOptions] = PlanOptions) -> dict[str, Any]:
@@ -108,6 +110,24 @@ def given_options(arguments: argparse.Namespace, options: type[CallOptions] = Pl
     if "on_notice" in option_fields(options):
         given["on_notice"] = teller(quiet=getattr(arguments, "quiet", False))
     return given
+
+
+def forwarded(arguments: argparse.Namespace) -> list[str | Path]:
+    """The arguments of `PLACED` that are given, but for access, as other processes of the mesh take them."""
+    fields, words = option_fields(PlanOptions), list[str | Path]()
+    for name, value in given_options(arguments).items():
+        if (flag := fields[name].flag) is None or name in _ACCESS:
+            continue
+        if fields[name].named:
+            words += [word for key, own in value for word in (flag, f"{key}={json.dumps(own)}")]
+        elif value is True:
+            words.append(flag)
+        else:
+            words += [flag, value.absolute() if isinstance(value, Path) else str(value)]
+    words += ["--ssd", arguments.ssd] if arguments.ssd else []
+    for file in arguments.ssv:
+        words += ["--ssv", Path(file).absolute() if Path(file).exists() else file]
+    return words
 
 
 def _trace_file(text: str) -> Path:

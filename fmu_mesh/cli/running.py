@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -27,7 +28,7 @@ from ..api.result import Result, result_of
 from ..api.run_handle import Run
 from ..config.access_sections import given_folder, has_tls, why_open
 from ..errors import ConfigurationError, FmuMeshError
-from ..run.events import Event, Reachable
+from ..run.events import Event, EventWriter, Reachable, Status
 from ..run.options import RerunOptions
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
@@ -46,8 +47,11 @@ from .run_options import given_options, mesh_of
 if TYPE_CHECKING:
     from ..sweeps.sweeping import Sweep
 
-__all__ = ["RUNS", "interrupted_by_signals", "run_mesh"]
+__all__ = ["RUNS", "finish", "interrupted_by_signals", "planned_run", "run_mesh"]
 
+_STATUS_S: Final = 1.0
+_STATUS_SHARE: Final = 0.002
+"""Time between two statuses in a file, in s, and as a share of the run: a day has some three thousand of them."""
 _READ_S: Final = 1.0
 """How long the end of a listener waits until its last refusals are said."""
 
@@ -76,13 +80,13 @@ def run_mesh(
     mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace, reporter: RunReporter, how: dict[str, Any]
 ) -> None:
     """Run a mesh, show its events, and at the end what the arguments ask for."""
-    plan = _planned(mesh, options, arguments)
+    plan = planned_run(mesh, options, arguments)
     with (
         plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),
     ):
         result = _shown(plan, arguments, reporter, how)
-    _finish(plan.plan, result, arguments)
+    finish(plan.plan, result, arguments)
 
 
 def _shown(
@@ -95,7 +99,9 @@ def _shown(
     """The result of a run whose events are shown; ``drive`` is called when it has started."""
     reporter.planned(plan)
     with (
-        Display(plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet) as display,
+        Display(
+            plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, file=str(plan.loaded.file)
+        ) as display,
         interrupted_by_signals() as runs,
     ):
 
@@ -109,7 +115,7 @@ def _shown(
         return run.wait()
 
 
-def _planned(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:
+def planned_run(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:
     """Plan the run of a command, and check what it shows at the end."""
     plan = mesh.plan(**options)
     _warn(plan, quiet=arguments.quiet)
@@ -148,7 +154,8 @@ def interrupted_by_signals() -> Iterator[list[Run | Sweep]]:
             signal.signal(number, handler)
 
 
-def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
+def finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
+    """Show what the arguments ask for of a run that has ended, and its summary."""
     outcome = result.outcome
     assert outcome is not None  # it has run
     if outcome.profile is not None:
@@ -163,28 +170,59 @@ def _finish(plan: Plan, result: Result, arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> int:
+    from ..run.host_nodes import nodes_on, run_nodes  # noqa: PLC0415  only this command needs it
     from ..run.roles import run_node  # noqa: PLC0415 `launch` has the fork server for it
 
+    if arguments.node is not None and arguments.host is not None:
+        raise ConfigurationError("--host starts all nodes of a host, and INSTANCE one", hint="Leave one of them out.")
     plan = mesh_of(arguments).plan(**given_options(arguments))
+    names = [arguments.node] if arguments.node is not None else nodes_on(plan, arguments.host)
     _warn(plan, every=False)
-    run_node(plan.node(arguments.node))
+    if len(names) > 1:
+        return run_nodes(plan, names, say)
+    run_node(plan.node(names[0]))
     return 0
 
 
 def _master(arguments: argparse.Namespace) -> int:
     from ..run.roles import run_master  # noqa: PLC0415 as above
 
-    plan = _planned(mesh_of(arguments), given_options(arguments), arguments)
+    plan = planned_run(mesh_of(arguments), given_options(arguments), arguments)
     with (
         plotted_where_it_ends(plan.plan, arguments.plot),
         Display(
-            plan.plan, show_progress=not arguments.no_progress, quiet=arguments.quiet, waits_for_nodes=False
+            plan.plan,
+            show_progress=not arguments.no_progress,
+            quiet=arguments.quiet,
+            waits_for_nodes=False,
+            file=str(plan.loaded.file),
         ) as display,
         _refusals_told() if identity_of(plan) is not None else nullcontext(),
     ):
-        outcome = run_master(plan, display.event)
-    _finish(plan.plan, result_of(plan, outcome), arguments)
+        outcome = run_master(plan, _also_written(display.event, arguments.events))
+    finish(plan.plan, result_of(plan, outcome), arguments)
     return 0
+
+
+def _also_written(show: Callable[[Event], None], file: Path | None) -> Callable[[Event], None]:
+    """What takes events, and also writes them into a file; a status once a second, and in a long run less often."""
+    if file is None:
+        return show
+    try:
+        write = EventWriter(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600))
+    except OSError as error:
+        raise ConfigurationError(f"the events cannot be written into '{file}': {error.strerror}") from error
+    began = due = time.monotonic()
+
+    def taken(event: Event) -> None:
+        nonlocal due
+        show(event)
+        now = time.monotonic()
+        if not isinstance(event, Status) or now >= due:
+            due = now + max(_STATUS_S, _STATUS_SHARE * (now - began))
+            write(event)
+
+    return taken
 
 
 def _gateway(arguments: argparse.Namespace) -> int:

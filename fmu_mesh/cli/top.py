@@ -26,7 +26,7 @@ from ..pictures.tables import shortened, table, wrapped
 from ..wire.views import InstanceStatus, MeshStatus
 from .arguments import Runs, reach
 from .output.json_output import print_json
-from .output.pages import keys, progress, seconds
+from .output.pages import keys, progress, seconds, with_hosts
 from .output.screen import Screen
 from .output.sparklines import Histories, sparkline_signs
 from .output.terminal import may_draw
@@ -157,20 +157,18 @@ def page(look: Look, before: Look | None = None, *, width: int | None = None) ->
         f"real-time factor {status.real_time_factor:.3g}",
         *([f"{status.overruns} overruns"] if status.overruns else []),
     ]
-    rows = [
-        _row(own, before[1].get(own.instance) if before is not None else None, step_size)
-        for _, own in sorted(instances.items())
-    ]
+    shown, heading = [own for _, own in sorted(instances.items())], list(_HEADING)
+    rows = [_row(own, before[1].get(own.instance) if before is not None else None, step_size) for own in shown]
+    rows = with_hosts(shown, rows, heading)
     of_keys = keys(instances.values())
     if width is None:
-        return [", ".join(head), "", *table(rows, heading=_HEADING), *of_keys]
+        return [", ".join(head), "", *table(rows, heading=heading), *of_keys]
     head[0] = f"{shortened(status.mesh, width // 2)}: {status.state}"
-    return [*wrapped(head, width), "", *_cut([*_fitted(rows, width), *of_keys], width)]
+    return [*wrapped(head, width), "", *_cut([*_fitted(rows, heading, width), *of_keys], width)]
 
 
-def _fitted(rows: list[list[str]], width: int) -> list[str]:
+def _fitted(rows: list[list[str]], heading: list[str], width: int) -> list[str]:
     """The table in ``width`` columns: without dispensable columns, with short names and a cut activity."""
-    heading = list(_HEADING)
     rows = [list(row) for row in rows]
     longest = max(len(row[0]) for row in (heading, *rows))
 

@@ -75,7 +75,10 @@ NotFinitePolicy = Annotated[
         "is, and may be set; null: as `simulation` says."
     ),
 ]
-Host = Annotated[str | None, Meta(description="Host the node is meant to run on; `launch` starts those without.")]
+Host = Annotated[
+    str | None,
+    Meta(description="The host of `deploy.hosts` on which its node runs; null: where `launch` runs."),
+]
 
 
 class ProcessConfig(Base, frozen=True, kw_only=True):
@@ -186,7 +189,7 @@ class InstanceSection:
         inputs: what inputs that are not connected do, by variable name.
         step_size: of the instance in s; None: the base step size.
         group: the group that shares one node; None: none.
-        host: the host that the node is meant to run on; None: the one of `launch`.
+        host: the host on which the node runs, by its name in `deploy.hosts`; None: the one of `launch`.
         not_finite: what an output that is NaN or infinite means; None: what the simulation says.
         process: what the process of its node may take; None: what the mesh says.
         interpolation: how a timed value for an unconnected input is used; None: its time is ignored.

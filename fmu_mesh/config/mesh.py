@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig, ZenohConfig
 from fmu_mesh.config.base import NOT_NEGATIVE, POSITIVE, Base, DeadlineSeconds, Name
+from fmu_mesh.config.deploy_section import DeployConfig
 from fmu_mesh.config.instance_sections import KIND, InstanceSection, PhysicsSection, ProcessConfig
 from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
@@ -302,6 +303,7 @@ class Config(Base, frozen=True, kw_only=True):
         Meta(description="Certificates and roles for endpoints at a network; null: there are none."),
     ] = None
     runtime: RuntimeConfig = RuntimeConfig()
+    deploy: DeployConfig = DeployConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     limits: LimitsConfig = LimitsConfig()
     process: ProcessConfig = ProcessConfig()

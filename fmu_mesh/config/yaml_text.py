@@ -41,7 +41,7 @@ from ruamel.yaml.tokens import (
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.text import shown
 
-__all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read", "read_value", "written"]
+__all__ = ["MAXIMUM_DEPTH", "MAXIMUM_VALUES", "Plain", "read", "read_value", "written", "written_for_others"]
 
 Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
@@ -126,6 +126,16 @@ def written(value: Plain) -> str:
     yaml.default_flow_style = None
     yaml.dump(value, text)
     return text.getvalue()
+
+
+def written_for_others(value: Plain) -> str:
+    """A value as YAML text that any reader takes: also one of YAML 1.1, for which `no` and `1:30` are no texts."""
+    text, yaml = StringIO(), YAML()
+    yaml.version, yaml.width = (1, 1), 1 << 16
+    yaml.default_flow_style = None
+    yaml.representer.ignore_aliases = lambda _data: True
+    yaml.dump(value, text)
+    return text.getvalue().partition("---\n")[2]
 
 
 def read_value(text: str) -> tuple[str, Plain]:

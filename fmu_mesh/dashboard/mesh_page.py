@@ -31,6 +31,7 @@ _SPANS: Final = {0: "from the start", 1: "last 1 s", 10: "last 10 s", 60: "last 
 _STATES: Final = {"running": "positive", "paused": "warning", "failed": "negative"}
 _COLUMNS: Final = {
     "instance": "instance",
+    "host": "host",
     "state": "state",
     "point": "point",
     "rate": "points/s",
@@ -98,7 +99,7 @@ class MeshPage:
             with ui.element("div").classes("fm-column"):
                 self._add_plots()
                 with _card("Instances"):
-                    self._table = _InstanceTable()
+                    self._table = _InstanceTable(has_hosts=any(own.deploy_host for own in self._view.infos.values()))
             with ui.element("div").classes("fm-column"):
                 if not self._read_only:
                     self._add_settings()
@@ -282,10 +283,11 @@ def _values(follower: MeshFollower, names: Sequence[str]) -> Mapping[str, Any]:
 class _InstanceTable:
     """A line for each instance, in the order of the mesh."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, has_hosts: bool) -> None:
         columns = [
             {"name": name, "label": label, "field": name, "align": "left", "sortable": name != "share"}
             for name, label in _COLUMNS.items()
+            if has_hosts or name != "host"
         ]
         self._table = ui.table(rows=[], columns=columns, row_key="instance").classes("fm-instances fm-numbers")
         self._table.props("dense flat hide-pagination virtual-scroll :rows-per-page-options=[0]")
@@ -305,6 +307,7 @@ def _row(own: InstanceStatus, before: InstanceStatus | None) -> dict[str, Any]:
     computes, waits = (100.0 * share for share in shares)
     return {
         "instance": own.instance,
+        "host": own.deploy_host,
         "state": own.state,
         "point": own.point,
         "rate": round(rate),

@@ -15,6 +15,7 @@ import msgspec
 
 from ..config.instance_sections import InstanceSection
 from ..config.mesh import LimitsConfig
+from ..files import below
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
 from ..system.process_sharing import Claims
@@ -155,6 +156,14 @@ class Kind(ABC, Generic[Section]):
         Raises:
             OSError, LoadFailed: a file cannot be read.
         """
+
+    def files(self, path: Path) -> Sequence[Path]:
+        """The files that the model consists of, which another host gets: by default that at ``path``, or all below it.
+
+        Raises:
+            OSError, LoadFailed: a file cannot be read.
+        """
+        return (path,) if not path.is_dir() else below(path)
 
     def needs_compiler(self, path: Path, section: Section, limits: LimitsConfig) -> bool:
         """Whether `describe` would compile what the model contains; no by default, and nothing is compiled here.

@@ -6,7 +6,7 @@ are. A kind is imported when a configuration has its key, and what it needs when
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
@@ -35,6 +35,7 @@ __all__ = [
     "decode_section",
     "describe",
     "expected_model",
+    "files_of",
     "needs_compiler",
     "open_instance",
     "preload",
@@ -113,6 +114,11 @@ def content(path: Path, section: InstanceSection) -> str:
         return _kind_of(section).content(path)
     except OSError as error:
         raise LoadFailed(f"'{path}' cannot be read: {error.strerror or error}.") from error
+
+
+def files_of(path: Path, section: InstanceSection) -> Sequence[Path]:
+    """All files of the model of an instance; see `Kind.files`."""
+    return _kind_of(section).files(path)
 
 
 def claims(path: Path, section: InstanceSection, description: ModelDescription, limits: LimitsConfig) -> Claims:

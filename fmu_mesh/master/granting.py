@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from ..errors import DeadlineExceeded, ProtocolBroken
+from ..system.placement import placed
 from ..system.plan import MASTER, RECORDER, Plan
 from ..wire.host_processes import STOPPED
 from ..wire.ways import Ways
@@ -185,8 +186,9 @@ class Granting:
         """The error for ``silent_s`` seconds without progress; names the nodes whose processes are ``stopped``."""
         slowest = min(self.progress, key=self.progress.__getitem__)
         state = f": its process {STOPPED}" if stopped else ""
-        error = DeadlineExceeded(f"no progress for {silent_s:.1f} s{state}", instance=spoken(*(stopped or [slowest])))
-        return error.at(self.slowest, self._plan.grid.time(self.slowest))
+        nodes = stopped or [slowest]
+        error = DeadlineExceeded(f"no progress for {silent_s:.1f} s{state}", instance=spoken(*nodes))
+        return placed(self._plan, error, nodes).at(self.slowest, self._plan.grid.time(self.slowest))
 
     def broken(self, node: str, what: str) -> ProtocolBroken:
         """The error for a node that cannot be where it says."""

@@ -507,6 +507,7 @@ class Master:
             row_streams=self._states.granting.ways.streams,
             host_id=this_host(),
             topics=plan.system.topics,
+            deploy_hosts={name: own.host for name, own in plan.nodes.items() if own.host is not None},
         )
 
     def last_status(self) -> MeshStatus:
@@ -529,4 +530,5 @@ class Master:
             refused=self._inbox.refusals.count,
             cut=self.streams.cut if self.streams is not None else {},
             resets=self._resets,
+            missing=tuple(states.registrations.missing) if states.state == "starting" else (),
         )

@@ -50,6 +50,7 @@ from ..errors import (
     TerminationRequested,
     from_report,
 )
+from ..system.placement import placed
 from ..system.plan import RECORDER, Plan
 from ..wire.host_processes import OR_CUT
 from ..wire.messages import FINISH, GRANT, NodeReport
@@ -258,7 +259,7 @@ class MasterStates:
     def fail(self, error: FmuMeshError) -> None:
         """The run has to end; the first reason counts."""
         if self.failure is None:
-            self.failure = error
+            self.failure = placed(self.plan, error)
 
     def _stop(self, point: int) -> None:
         """End the run: where a pause would be if it has no stop time, otherwise as an interruption."""
@@ -378,7 +379,7 @@ class MasterStates:
 
     def _check_deadline(self, now: float, limit_s: float, what: str, missing: Sequence[str]) -> None:
         if now - self._entered_at > limit_s:
-            self.fail(DeadlineExceeded(f"{what} {spoken(*missing)} within {limit_s:g} s"))
+            self.fail(DeadlineExceeded(f"{what} {self.registrations.named(*missing)} within {limit_s:g} s"))
 
     def _enter(self, state: MeshState, now: float) -> None:
         self.state, self._entered_at = state, now

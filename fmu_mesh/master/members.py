@@ -15,6 +15,7 @@ import zenoh
 
 from ..errors import FmuMeshError
 from ..rings.host_memory import Offer
+from ..system.placement import manual_hosts
 from ..system.plan import RECORDER
 from ..wire.host_processes import is_alive, is_stopped
 from ..wire.inbox import Inbox
@@ -59,6 +60,7 @@ class Members:
         self._keys = keys
         self._offer = offer
         self._launch, self._table = launch, table
+        self._by_hand = {node for own in manual_hosts(nodes.plan).values() for node in own}
         self._meeting = meeting
         self._waiting: dict[str, zenoh.Query] = {}
         self._shared: tuple[str, ...] = ()
@@ -73,7 +75,7 @@ class Members:
     def register(self, query: zenoh.Query) -> None:
         """Answer a process that wants to be a node of this run."""
         registration = decode_json(payload_of(query), Registration)
-        if registration.launch == self._launch:
+        if registration.launch == self._launch or (registration.launch is None and registration.node in self._by_hand):
             reason = self._nodes.register(registration)
             if reason is None:
                 door = None

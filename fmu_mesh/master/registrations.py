@@ -82,6 +82,11 @@ class Registrations:
         pairs = {pair(*(MASTER if name == RECORDER else name for name in both)) for both in ends}
         return sorted(both for both in pairs if ways.way(*both) == "zenoh" and doors.issuperset(both))
 
+    def named(self, *nodes: str) -> str:
+        """The names of participants, with the hosts of those that do not run where `launch` does."""
+        hosts = {node: self.plan.nodes[node].host for node in nodes}
+        return ", ".join(spoken(node) + (f" on {host}" if host is not None else "") for node, host in hosts.items())
+
     @property
     def missing(self) -> list[str]:
         """The nodes that are not ready."""
@@ -96,4 +101,4 @@ class Registrations:
         hint = f"Started, but not ready: {', '.join(there)}." if there else "None of them was started."
         if self._refused:
             hint += f" Refused: {self._refused[-1]}."
-        return DeadlineExceeded(f"not ready within {waited_s:g} s: {spoken(*missing)}", hint=hint)
+        return DeadlineExceeded(f"not ready within {waited_s:g} s: {self.named(*missing)}", hint=hint)

@@ -84,6 +84,7 @@ class Activity:
             timed_out=late,
             running_time=time.monotonic() - self._started if engine is not None else 0.0,
             keys=self._keys.statuses(name) if self._keys is not None else (),
+            deploy_host=self._plan.host or "",
         )
 
     def look_at_steps(self) -> StepFailed | None:

@@ -438,4 +438,5 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
         problems=description.problems,
         clocks=description.clocks,
         keys=key_views(runner.name, *runner.plan.keys_in, *runner.plan.keys_out),
+        deploy_host=plan.host or "",
     )

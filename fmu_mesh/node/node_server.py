@@ -48,6 +48,8 @@ __all__ = ["NodeServer"]
 # says why nothing is declared for a variable.
 
 _TICK_S = 0.25
+_TICK_BEFORE_S = 1.0
+"""Before the first point, when little changes: of hundreds that start, each waits for all others."""
 # A stream whose subscriber Zenoh does not announce (it reports only the first of an instance) begins within about this
 # time; shorter would take the main thread's time for nothing.
 _SEARCH_S = 0.05
@@ -101,6 +103,7 @@ class NodeServer:
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._early_lines: list[LogLine] = []
+        self._begun = False
         self._visible = threading.Event()
         self._closing, self._hurries = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
@@ -146,6 +149,7 @@ class NodeServer:
 
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
+        self._begun = True
         self._answers.begin()
         self.keys.begin()
         looked = threading.Event()
@@ -186,7 +190,8 @@ class NodeServer:
         published = 0.0
         while True:
             with suppress(queue.Empty):
-                if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else _TICK_S)) is None:
+                tick_s = _TICK_S if self._begun else _TICK_BEFORE_S
+                if (job := self._jobs.get(timeout=_SEARCH_S if self._searches else tick_s)) is None:
                     while self._rows and not self._closing.is_set():
                         self._publish_rows()
                     self._answers.tell_refused()

@@ -91,6 +91,7 @@ class GraphNode(msgspec.Struct, frozen=True):
         point: the last point it has reached.
         points_per_second: its speed.
         wait: the share of its time that it waits, from 0 to 1.
+        host: the host of `deploy.hosts` on which it runs; empty for that of `launch`.
     """
 
     instance: str
@@ -100,6 +101,12 @@ class GraphNode(msgspec.Struct, frozen=True):
     point: int | None = None
     points_per_second: float | None = None
     wait: float | None = None
+    host: str = ""
+
+    @property
+    def caption(self) -> str:
+        """Its model, and its host."""
+        return f"{self.model} on {self.host}" if self.host else self.model
 
     @property
     def live(self) -> str:
@@ -208,7 +215,7 @@ def drawing_of(
 ) -> Drawing:
     """The shapes of a graph."""
     is_live = any(node.state is not None for node in nodes)
-    plan = _planned(tuple((node.instance, node.model, node.group) for node in nodes), edges, is_live)
+    plan = _planned(tuple((node.instance, node.caption, node.group) for node in nodes), edges, is_live)
     cycle_of = {name: number for number, cycle in enumerate(cycles) for name in cycle}
     instances = [_drawn_instance(node, plan, cycle_of.get(node.instance), is_live=is_live) for node in nodes]
     wires = [
@@ -249,7 +256,7 @@ def _drawn_instance(node: GraphNode, plan: _Plan, cycle: int | None, *, is_live:
     most = int(box.width / 7.2)
     labels = [
         Label(box.x + _INSET, box.y + 18.0, shortened(node.instance, int(most * 0.92)), 13.0, bold=True),
-        Label(box.x + _INSET, box.y + 33.0, shortened(node.model, most), 11.0, FAINT),
+        Label(box.x + _INSET, box.y + 33.0, shortened(node.caption, most), 11.0, FAINT),
     ]
     dot = None
     if is_live and node.state is not None:

@@ -9,7 +9,8 @@ from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
-from ..system.plan import Plan
+from ..system.placement import two_trips
+from ..system.plan import RECORDER, Plan
 from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
 from ..system.schedule import Course, Schedule
@@ -31,6 +32,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
     sections = [
         ("", _head(plan)),
         ("Instances", _instances(plan)),
+        ("Hosts", _hosts(plan)),
         ("Start values", _start_values(plan, loaded)),
         ("Connections", _connections(plan)),
         ("Zenoh keys", _keys(plan)),
@@ -78,6 +80,20 @@ def _instances(plan: Plan) -> list[str]:
         step = f"step {short_number(own.step_points * plan.grid.step_size)} s"
         rows.append([name, model, step, "a process of its own" if own.node == name else f"group {own.node}"])
     return table(rows, indent=2)
+
+
+def _hosts(plan: Plan) -> list[str]:
+    """What runs where, and which values make two trips; nothing if everything runs on the host of `launch`."""
+    if not (hosts := plan.hosts):
+        return []
+    nodes: dict[str | None, list[str]] = {}
+    for name, node in plan.nodes.items():
+        nodes.setdefault(node.host, []).append("recorder" if name == RECORDER else name)
+    clock = ", whose clock paces all" if plan.system.config.simulation.real_time_factor else ""
+    rows = [["where `launch` runs", ", ".join([f"master{clock}", *nodes.get(None, [])]), ""]]
+    for name, host in hosts.items():
+        rows.append([name, ", ".join(nodes[name]), f"ssh {host.ssh}" if host.ssh is not None else "started by hand"])
+    return [*table(rows, indent=2), *(f"  {sentence}" for sentence in two_trips(plan))]
 
 
 def _start_values(plan: Plan, loaded: LoadedConfig | None) -> list[str]:

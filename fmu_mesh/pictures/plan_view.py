@@ -11,6 +11,7 @@ from ..config.ros_section import MeshTopic
 from ..errors import Finding
 from ..rings.library import why_no_library
 from ..system.input_timeouts import InputTimeout
+from ..system.placement import two_trips
 from ..system.plan import Plan
 from ..system.value_map import map_words
 from ..text import counted
@@ -30,7 +31,11 @@ class PlannedOrigin(msgspec.Struct, frozen=True):
 
 
 class PlannedInstance(msgspec.Struct, frozen=True):
-    """One instance: its model, step size in s, node (process), start values with their origins, timeouts of inputs."""
+    """One instance: its model, step size in s, node (process), start values with their origins, timeouts of inputs.
+
+    Attributes:
+        host: the host of `deploy.hosts` on which it runs; None: that of `launch`.
+    """
 
     name: str
     model: str
@@ -39,6 +44,7 @@ class PlannedInstance(msgspec.Struct, frozen=True):
     start_values: dict[str, PlainValue]
     origins: dict[str, PlannedOrigin]
     timeouts: tuple[InputTimeout, ...] = ()
+    host: str | None = None
 
 
 class PlannedConnection(msgspec.Struct, frozen=True):
@@ -99,6 +105,7 @@ class PlanView(msgspec.Struct, frozen=True):
         keys: the Zenoh keys at ends of connections.
         warnings: findings that do not prevent a run.
         library: why the library of C is not used; None if it is.
+        two_trips: connections between two hosts whose values go through a third one, that of `launch`, in words.
     """
 
     mesh: str
@@ -119,6 +126,7 @@ class PlanView(msgspec.Struct, frozen=True):
     library: str | None
     topics: tuple[MeshTopic, ...] = ()
     keys: tuple[KeyView, ...] = ()
+    two_trips: list[str] = []
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.instances), 'instance')}, {counted(len(self.connections), 'connection')}"
@@ -144,6 +152,7 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
                 for origin in [start_value_origin(loaded, own, name)]
             },
             own.timeouts,
+            plan.nodes[own.node].host,
         )
         for own in system.instances.values()
     ]
@@ -199,4 +208,5 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
         library=why_no_library(),
         topics=system.topics,
         keys=system.keys,
+        two_trips=two_trips(plan),
     )

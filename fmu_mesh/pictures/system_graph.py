@@ -76,9 +76,12 @@ class SystemGraph(msgspec.Struct, frozen=True):
 
     @property
     def title(self) -> str:
-        """One line: how many instances, processes, connections and cycles there are."""
+        """One line: how many instances, processes, hosts, connections and cycles there are."""
+        hosts = {node.host for node in self.nodes}
+        on_hosts = f" on {counted(len(hosts), 'host')}" if hosts - {""} else ""
+        processes = counted(len({n.group for n in self.nodes}), "process")
         counts = [
-            counted(len(self.nodes), "instance") + f" in {counted(len({n.group for n in self.nodes}), 'process')}",
+            f"{counted(len(self.nodes), 'instance')} in {processes}{on_hosts}",
             counted(sum(len(edge.variables) for edge in self.edges), "connection"),
             *([counted(len(self.cycles), "cycle")] if self.cycles else []),
             *([counted(len(self.keys), "key")] if self.keys else []),
@@ -179,7 +182,8 @@ class SystemGraph(msgspec.Struct, frozen=True):
         return html_table(self.title, ["instance", "model", "process", "state"], rows, len(self.nodes))
 
     def _lines_of(self, node: GraphNode, indent: int) -> list[str]:
-        heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), node.live]
+        where = f"on {shortened(node.host, _NAME)}" if node.host else ""
+        heading = [shortened(node.instance, _NAME), shortened(node.model, _NAME), where, node.live]
         rows = []
         for edge in self.edges:
             delay = "closes a cycle" if edge.closes_cycle else ("", "delay 1", "at the start")[edge.delay]
@@ -193,7 +197,12 @@ class SystemGraph(msgspec.Struct, frozen=True):
 def graph_of_plan(plan: Plan) -> SystemGraph:
     """The graph of a mesh that is planned."""
     nodes = [
-        GraphNode(own.name, Path(own.fmu).name or own.description.model_name, own.node)
+        GraphNode(
+            own.name,
+            Path(own.fmu).name or own.description.model_name,
+            own.node,
+            host=plan.nodes[own.node].host or "",
+        )
         for own in plan.system.instances.values()
     ]
     connections = [
@@ -219,7 +228,9 @@ def graph_of_plan(plan: Plan) -> SystemGraph:
 def graph_of_infos(mesh: str, infos: Sequence[InstanceInfo]) -> SystemGraph:
     """The graph of a mesh that runs, from what its instances tell."""
     units = {f"{own.instance}.{v.name}": v.unit or "" for own in infos for v in own.variables}
-    nodes = [GraphNode(own.instance, Path(own.fmu).name or own.model_name, own.node) for own in infos]
+    nodes = [
+        GraphNode(own.instance, Path(own.fmu).name or own.model_name, own.node, host=own.deploy_host) for own in infos
+    ]
     connections = []
     for own in infos:
         for c in own.connections:

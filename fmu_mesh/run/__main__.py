@@ -37,8 +37,10 @@ def _run(role: str, *arguments: str) -> int:
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(encoding="utf-8", errors="backslashreplace", line_buffering=True)  # type: ignore[union-attr]  # they are text files
     if role != "forks":
+        from .process import die_with_parent  # noqa: PLC0415 as above
         from .roles import job_of  # noqa: PLC0415 as above
 
+        die_with_parent()  # a node may have no launcher, only the command that has started all nodes of a host
         job_of(role, *arguments)()
         return 0
     from setproctitle import setproctitle  # noqa: PLC0415 as above

@@ -1,10 +1,10 @@
 """Whether code that a configuration names may run: one rule, asked wherever a file names code.
 
 A configuration of the user's own may name code. A result, the folder of a sweep, a package, and a configuration of
-another user may not, and code that other users can write does not run. `--allow-code` lifts both, and the user is told
-what runs. Models are no code in this sense: an FMU runs wherever it is named. But its sources are compiled only where
-the user's own configuration, program or command names the FMU, or in its sandbox; one that is only looked at (by
-`inspect`, by `new` in a folder, by completion) is not compiled.
+another user may not, nor may they name hosts to log in to; and code that other users can write does not run.
+`--allow-code` lifts these, and the user is told what runs. Models are no code in this sense: an FMU runs wherever it is
+named. But its sources are compiled only where the user's own configuration, program or command names the FMU, or in its
+sandbox; one that is only looked at (by `inspect`, by `new` in a folder, by completion) is not compiled.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def check_code(
     allowed: str,
     compiles: Callable[[Path, InstanceSection, LimitsConfig], bool] = needs_compiler,
 ) -> None:
-    """Check that all code of a configuration may run: add a finding for each instance whose code may not.
+    """Check that all code of a configuration may run: add a finding for each instance or host that may not.
 
     Args:
         loaded: the configuration, with absolute paths of interpreters.
@@ -67,6 +67,21 @@ def check_code(
         code = str(getattr(section, key)).replace(section.path, str(path or ""), 1)
         by = f" with {section.interpreter}" if section.interpreter is not None else ""
         tell(f"instance '{name}' runs {code}{by}, {allowed} ({found})")
+    if source:
+        _check_hosts(loaded, source, findings, tell, allowed)
+
+
+def _check_hosts(
+    loaded: LoadedConfig, source: str, findings: Findings, tell: Callable[[str], None], allowed: str
+) -> None:
+    for name, host in loaded.config.deploy.hosts.items():
+        if host.ssh is not None and allowed:
+            tell(
+                f"nodes run on host '{name}', by `ssh {host.ssh}` and its `{host.python}`, {allowed} (as {source} says)"
+            )
+        elif host.ssh is not None:
+            expected = "a file of your own, or `allow_code=True`"
+            findings.add(f"deploy.hosts.{name}.ssh", f"a host that you would log in to, in {source}", expected)
 
 
 def names_code(loaded: LoadedConfig) -> bool:

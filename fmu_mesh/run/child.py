@@ -11,21 +11,36 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import IO
+from typing import IO, Protocol
 
 from ..errors import Interrupted
 from ..wire.host_processes import is_stopped
-from .fork_server import Forked
 
 __all__ = ["Child", "Process", "how_it_ended"]
 
-Process = subprocess.Popen[bytes] | Forked
-"""A process that was started by exec, or by the fork server. It leads a process group of the number of its `pid`."""
+
+class Process(Protocol):
+    """A process that was started by exec, by the fork server, or on another host.
+
+    It leads a process group of the number of its `pid`, which is None before it has started, and on another host.
+    """
+
+    @property
+    def pid(self) -> int | None: ...  # noqa: D102  those of `subprocess.Popen`
+    @property
+    def stdin(self) -> IO[bytes] | None: ...  # noqa: D102  as above
+    @property
+    def stdout(self) -> IO[bytes] | None: ...  # noqa: D102  as above
+    @property
+    def stderr(self) -> IO[bytes] | None: ...  # noqa: D102  as above
+    def poll(self) -> int | None: ...  # noqa: D102  as above
+    def wait(self) -> int: ...  # noqa: D102  as above
+    def send_signal(self, number: int, /) -> None: ...  # noqa: D102  as above
+
 
 _SHOWN_LINES = 200
 _LINE_BYTES = 1000

@@ -27,16 +27,18 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Protocol
 
 import msgspec
 from msgspec.structs import replace
 
 from ..awake import AwakeClock
 from ..config.deadlines import Deadlines
-from ..errors import Interrupted, MeshLost
+from ..errors import ConfigurationError, Interrupted, MeshLost
 from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
-from ..system.plan import MASTER, RECORDER
+from ..system.placement import manual_hosts, placed
+from ..system.plan import MASTER, RECORDER, NodePlan
 from ..wire.refused_links import RefusedLinks
 from ..wire.runtime import box_of, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
 from .child import Child, Process
@@ -59,8 +61,29 @@ from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
 from .sandbox import Sandboxed
+from .wiring import with_doors
 
-__all__ = ["Launcher"]
+__all__ = ["Elsewhere", "Launcher"]
+
+
+class Elsewhere(Protocol):
+    """The other hosts of a run: `are_ready` again after each event, until it is true; `start`; `close`."""
+
+    def are_ready(self) -> bool:
+        """Whether nodes can be started there; raises `FmuMeshError` if that will never be."""
+        ...
+
+    def start(self, node: NodePlan) -> Process | None:
+        """Start a node; None if it belongs to this host."""
+        ...
+
+    def why(self, node: NodePlan) -> str | None:
+        """How the process of a node has ended, if that is because its host was lost."""
+        ...
+
+    def close(self) -> None:
+        """End what is left there."""
+        ...
 
 
 class Launcher:
@@ -69,14 +92,19 @@ class Launcher:
     Args:
         run: the plan of the run.
         on_event: called with every event, on the thread that calls `run`.
+        elsewhere: connects to the other hosts of the run.
 
     Attributes:
         outcome: how the run ended, also where `run` raises an error; None before.
     """
 
-    def __init__(self, run: RunPlan, on_event: Callable[[Event], None]) -> None:
+    def __init__(
+        self, run: RunPlan, on_event: Callable[[Event], None], elsewhere: Callable[..., Elsewhere] | None = None
+    ) -> None:
+        self._connect = elsewhere
+        self._elsewhere: Elsewhere | None = None
         self.outcome: Outcome | None = None
-        self._run = self._first = replace(run, run=run_name())  # the newest, and the first one
+        self._run = self._first = with_doors(replace(run, run=run_name()))  # the newest, and the first one
         self._on_event = on_event
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._server: ForkServer | None = None
@@ -86,9 +114,14 @@ class Launcher:
         self._clock = AwakeClock()
         self._refused_links = RefusedLinks()
         config, plan = run.loaded.config, run.plan
+        manual = {name for nodes in manual_hosts(plan).values() for name in nodes}
         self._states = LaunchStates(
             LaunchTerms(
-                {n: [item.name for item in node.instances] for n, node in plan.nodes.items() if n != RECORDER},
+                {
+                    n: [item.name for item in node.instances]
+                    for n, node in plan.nodes.items()
+                    if n not in (RECORDER, *manual)
+                },
                 Deadlines.of(config.timeouts),
                 has_gateway=config.ros is not None and config.ros.profile != "rclpy",
                 start_time=plan.grid.start_time,
@@ -102,6 +135,7 @@ class Launcher:
             FmuMeshError: the run ended early, and why.
         """
         self._run.check_memory()
+        self._check_reachable()
         remove_stale_folders()
         self._folder = run_folder(self._run.mesh, self._run.run)
         try:
@@ -110,6 +144,7 @@ class Launcher:
                 if node.process.is_sandboxed:
                     box_of(self._folder, name).mkdir(mode=0o700)
             self._file = str(self._run.write(self._folder))
+            self._reach_others()
             self._do(self._states.begin())
             while not self._states.is_ending:
                 self._turn()
@@ -123,15 +158,40 @@ class Launcher:
             remove_tree(self._folder)
         return self._result(self._files)
 
+    def _check_reachable(self) -> None:
+        """Check that nodes that are started manually on other hosts can reach the master.
+
+        Raises:
+            ConfigurationError: it has no endpoint for them.
+        """
+        zenoh, hosts = self._run.loaded.config.zenoh, manual_hosts(self._run.plan)
+        if hosts and not (zenoh.listen or zenoh.connect):
+            text = f"the nodes of host '{next(iter(hosts))}', which has no `ssh`, cannot reach this mesh"
+            raise ConfigurationError(text, hint="Give it `listen=...` or `connect=...`, or `ssh` to the host.")
+
     def interrupt(self) -> None:
         """From any thread or signal handler: end the run; a second call ends it without waiting."""
         self._happened.put(lambda: self._do(self._states.interrupted(self._clock())))
+
+    def _reach_others(self) -> None:
+        """Wait until nodes can be started on all other hosts of the run."""
+        if self._connect is not None:
+            self._elsewhere = self._connect(self._run, self._folder, self._happened.put, self._take_word)
+            while not self._elsewhere.are_ready():
+                self._happened.get()()
+                if self._states.is_asked:
+                    raise Interrupted("interrupted")
+
+    def _take_word(self, host: str, text: str) -> None:
+        """From any thread: there is something to say about a host."""
+        self._happened.put(lambda: self._on_event(OutputLine(f"host {host}", text)))
 
     # --- waiting and doing; all of it on the thread that called `run`
 
     def _turn(self) -> None:
         for name, process in self._processes.items():
-            if (node := self._run.plan.nodes.get(name)) is not None and node.process.memory is not None:
+            node = self._run.plan.nodes.get(name)
+            if node is not None and node.process.memory is not None and process.pid is not None:
                 self._shares[name] = memory_share(node.process, process.pid) or self._shares.get(name)
         try:
             self._happened.get(timeout=self._states.wait_s)()
@@ -164,8 +224,10 @@ class Launcher:
             self._watch(name, self._fork("gateway"), self._take_gateway_line)
         else:
             node = self._run.plan.nodes[name]
-            process: Process
-            if node.process.is_sandboxed:
+            process = self._elsewhere.start(node) if self._elsewhere is not None else None
+            if process is not None:
+                pass
+            elif node.process.is_sandboxed:
                 own, command = self._run.loaded.config.security, executed_command("node", self._file, name)
                 keys = own.folder if own is not None else None
                 process = Sandboxed(node, self._folder, command, self._is_own, keys)
@@ -195,7 +257,13 @@ class Launcher:
     def _why(self, name: str, code: int) -> str | None:
         """How the process of a node has ended, if its limits say it."""
         node = self._run.plan.nodes.get(name)
-        return why_ended(code, node.process, self._shares.get(name)) if node is not None else None
+        if node is None:
+            return None
+        return self._lost_host(node) or why_ended(code, node.process, self._shares.get(name))
+
+    def _lost_host(self, node: NodePlan) -> str | None:
+        """How the process of a node has ended, if that is because its host was lost."""
+        return self._elsewhere.why(node) if self._elsewhere is not None else None
 
     def _take_event(self, line: bytes) -> None:
         try:
@@ -229,6 +297,8 @@ class Launcher:
     # --- the end
 
     def _close_all(self) -> None:
+        if self._elsewhere is not None:
+            self._elsewhere.close()
         for process in self._processes.values():
             process.close()
         if self._server is not None:
@@ -247,6 +317,11 @@ class Launcher:
             assert outcome is not None
             self.outcome = replace(outcome, warnings=tuple(map(self._states.with_how, outcome.warnings)))
             return self.outcome
+        placed(plan, error)
+        if isinstance(error, MeshLost) and error.instance in plan.system.instances:
+            node = plan.nodes[plan.node_of(error.instance)]
+            if (lost := self._lost_host(node)) is not None:  # that is why, whatever the node had time to say
+                error.saying(f"node '{node.node}' was lost: its process {lost}")
         last = last_recorded(plan, files)
         if type(error) in (Interrupted, MeshLost) and last > (error.point or 0):
             error.at(last, plan.grid.time(last))

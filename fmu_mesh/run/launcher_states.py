@@ -156,6 +156,11 @@ class LaunchStates:
         return self._phase is _Phase.OVER
 
     @property
+    def is_asked(self) -> bool:
+        """Whether somebody has asked for the end."""
+        return self._interrupted_at is not None
+
+    @property
     def wait_s(self) -> float:
         """How long to wait for an event; then comes `go_on`."""
         return self._terms.deadlines.look_at_end if self.is_ending else self._terms.deadlines.look

@@ -23,6 +23,7 @@ from types import FrameType, TracebackType
 from typing import Self
 
 from ..errors import ConfigurationError, Interrupted
+from ..wire.host_processes import is_stopped
 from ..wire.runtime import (
     enter_run_folder,
     leave_run_folder,
@@ -40,6 +41,7 @@ __all__ = [
     "ended_by_signals",
     "forked_by",
     "interrupts_later",
+    "launch_of",
     "only_wake",
 ]
 
@@ -83,6 +85,11 @@ class Interruption:
             end(self.reason)
 
 
+def launch_of(run: str) -> str | None:
+    """What identifies the launch of a run of this host; None if there is no launcher."""
+    return f"{socket.gethostname()}.{run}" if run != MANUAL else None
+
+
 class RunProcess:
     """One process of a run, from its start to its end; use it as a context manager on the main thread.
 
@@ -99,6 +106,8 @@ class RunProcess:
     Args:
         mesh: name of the mesh.
         run: name of the run; `MANUAL` if a person has started this process.
+        launch: identifies the launch, if that of ``run`` is on another host.
+        helper: the process id of the helper of the launcher on this host, if there is one.
 
     Attributes:
         is_child: whether a launcher has started this process and watches it.
@@ -108,9 +117,10 @@ class RunProcess:
         interruption: requests to end, from signals or the parent.
     """
 
-    def __init__(self, mesh: str, run: str) -> None:
+    def __init__(self, mesh: str, run: str, launch: str | None = None, helper: int | None = None) -> None:
+        self._helper = helper
         self.is_child = run != MANUAL
-        self.launch = f"{socket.gethostname()}.{run}" if self.is_child else None
+        self.launch = launch or launch_of(run)
         self.folder = run_folder(mesh, run)
         self.stack = ExitStack()
         self.interruption = Interruption()
@@ -127,6 +137,9 @@ class RunProcess:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stack.__exit__(kind, error, trace)
+        if error is not None and self._helper is not None and is_stopped(self._helper):  # it could not end by itself
+            for number in (signal.SIGCONT, signal.SIGTERM):
+                os.kill(self._helper, number)
 
     def take_place(self, name: str, who: str) -> None:
         """Note in the folder of the run that this process is ``name``, and what to remove if it is killed.

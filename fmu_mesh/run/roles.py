@@ -118,7 +118,7 @@ def run_node(run: NodeRun) -> None:
     if run.run == MANUAL and run.plan.process.is_sandboxed:  # it could ask nobody outside
         text = f"`sandbox` of node '{run.plan.node}' has no effect where the node is started manually"
         raise ConfigurationError(text, hint="`fmu-mesh launch` starts it in a sandbox; `sandbox: none` without.")
-    with RunProcess(run.plan.mesh, run.run) as process:
+    with RunProcess(run.plan.mesh, run.run, run.launch, run.helper) as process:
         _NodeProcess(run, process).run()
 
 
@@ -144,7 +144,8 @@ class _NodeProcess:
             os.chdir(own_folder)
         root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
-        own = replace(patient(ends, plan.timeouts, is_node=True), publishes=f"{root}/**")
+        made = patient(ends, plan.timeouts, is_node=True, is_mirrored=run.launch is not None)
+        own = replace(made, publishes=f"{root}/**")
         own = certified(own, run.security, root)
         session = open_session(own)
         process.stack.callback(close_session, session)

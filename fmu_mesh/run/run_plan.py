@@ -6,6 +6,7 @@ Owns the file through which they get it. Each process decodes only the parts of 
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,13 +29,26 @@ from ..variables.model_description import ModelDescription, Variable
 from ..wire.runtime import MeshNote
 from .limits import ring_problem
 
-__all__ = ["MANUAL", "NodeRun", "PlannedModel", "RunPlan", "numbered", "opening_in", "read_node", "read_run"]
+__all__ = [
+    "MANUAL",
+    "NodeRun",
+    "PlannedModel",
+    "RunPlan",
+    "encoded",
+    "in_parts",
+    "numbered",
+    "opening_in",
+    "read_node",
+    "read_run",
+]
 
 MANUAL = "hand"
 """Name of a run whose processes are started manually."""
 
 _FILE_NAME = "run.plan"
-_MOST_BYTES = 1 << 30
+_LENGTH = struct.Struct("<Q")
+_RUN = ""
+"""The name of the part with all of the run; no node has it."""
 
 T = TypeVar("T")
 
@@ -62,6 +76,8 @@ class NodeRun(msgspec.Struct, frozen=True):
         plan: the plan of the node.
         models: the models of its instances, by instance name.
         security: the certificate of this host.
+        launch: identifies the launch, on another host than that of the launcher; None: this is known.
+        helper: the process id of the helper of the launcher there.
     """
 
     config_file: Path
@@ -71,6 +87,8 @@ class NodeRun(msgspec.Struct, frozen=True):
     plan: NodePlan
     models: Mapping[str, PlannedModel]
     security: SecurityConfig | None = None
+    launch: str | None = None
+    helper: int | None = None
 
 
 class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -215,21 +233,14 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         The format is MessagePack: unlike JSON, it can hold any float and bytes.
         """
-        nodes = {name: _encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
+        nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
         file = folder / _FILE_NAME
         try:
-            file.write_bytes(_encoded(_Parts(nodes, _encoded(self))))
+            file.write_bytes(in_parts({**nodes, _RUN: encoded(self)}))
         except OSError as error:
             text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
         return file
-
-
-class _Parts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file. Each process decodes one part of it; what several of them need stands in each."""
-
-    nodes: dict[str, msgspec.Raw]
-    run: msgspec.Raw
 
 
 def numbered(file: Path, resets: int) -> Path:
@@ -261,16 +272,26 @@ def opening_in(
     )
 
 
+def in_parts(parts: Mapping[str, bytes]) -> bytes:
+    """The content of a file with these parts, each `encoded`, by the names of nodes.
+
+    It has the length of an index, the index, and the parts. So who needs one part reads no other one.
+    """
+    places, end = dict[str, tuple[int, int]](), 0
+    for name, part in parts.items():
+        places[name] = end, len(part)
+        end += len(part)
+    index = msgspec.msgpack.encode(places)
+    return b"".join([_LENGTH.pack(len(index)), index, *parts.values()])
+
+
 def read_node(file: Path, name: str) -> NodeRun:
     """Read what one node needs from the file of a run plan.
 
     Raises:
         ConfigurationError: it cannot be read, or is no run plan.
     """
-    parts = _read(file)
-    if name not in parts.nodes:
-        raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
-    return _decoded(file, parts.nodes[name], NodeRun)
+    return _read(file, name, NodeRun)
 
 
 def read_run(file: Path) -> RunPlan:
@@ -279,25 +300,35 @@ def read_run(file: Path) -> RunPlan:
     Raises:
         ConfigurationError: it cannot be read, or is no run plan.
     """
-    return _decoded(file, _read(file).run, RunPlan)
+    return _read(file, _RUN, RunPlan)
 
 
-def _read(file: Path) -> _Parts:
+def _read(file: Path, name: str, type_: type[T]) -> T:
+    """One part of a file, of which nothing else is read but the index."""
     try:
         with file.open("rb") as source:
-            data = source.read(_MOST_BYTES + 1)
+            head = source.read(_LENGTH.size)
+            most = os.fstat(source.fileno()).st_size
+            length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else most
+            if length > most - len(head):
+                raise ConfigurationError(f"'{file}' is no run plan of this version of fmu_mesh: its index is cut.")
+            places = _decoded(file, source.read(length), dict[str, tuple[int, int]])
+            if name not in places:
+                raise ConfigurationError(f"the run plan '{file}' has no node '{name}'.")
+            begin, size = places[name]
+            source.seek(len(head) + length + begin)
+            data = source.read(min(size, most))
     except OSError as error:
         raise ConfigurationError(f"the run plan '{file}' cannot be read: {error.strerror}.") from error
-    if len(data) > _MOST_BYTES:
-        raise ConfigurationError(f"the run plan '{file}' has more than {_MOST_BYTES} bytes.")
-    return _decoded(file, data, _Parts)
+    return _decoded(file, data, type_)
 
 
-def _encoded(value: object) -> msgspec.Raw:
-    return msgspec.Raw(msgspec.msgpack.encode(value, enc_hook=os.fspath))
+def encoded(value: object) -> bytes:
+    """What a process of a run needs, as it is in the file."""
+    return msgspec.msgpack.encode(value, enc_hook=os.fspath)
 
 
-def _decoded(file: Path, data: bytes | msgspec.Raw, type_: type[T]) -> T:
+def _decoded(file: Path, data: bytes, type_: type[T]) -> T:
     def decoded_value(of_type: type[Any], value: object) -> object:
         return Path(value) if of_type is Path and isinstance(value, str) else decode_section(of_type, value)
 

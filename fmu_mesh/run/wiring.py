@@ -29,7 +29,7 @@ from .run_plan import RunPlan
 if TYPE_CHECKING:  # as below
     from ..wire.security.identity import Identity
 
-__all__ = ["certified", "identity_of", "name_of", "patient", "table_of", "warnings_of", "wiring"]
+__all__ = ["certified", "identity_of", "name_of", "patient", "table_of", "warnings_of", "wiring", "with_doors"]
 
 
 _ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=|\bruntime\.share_with")
@@ -68,6 +68,21 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
         waits=bool(config.connect),
         insecure=config.insecure,
     )
+
+
+def with_doors(run: RunPlan) -> RunPlan:
+    """The plan of a run whose processes here have a door at the network, for hosts that exchange rows directly."""
+    zenoh, direct = (
+        run.loaded.config.zenoh,
+        [host for host in run.plan.hosts.values() if host.rows == "tcp" and host.ssh],
+    )
+    if zenoh.rows_address is not None or not direct:
+        return run
+    from ..wire.meeting import address_towards  # noqa: PLC0415  most launchers meet nobody
+
+    towards = direct[0].address or (direct[0].ssh or "").rpartition("@")[2]
+    zenoh = replace(zenoh, rows_address=address_towards(towards))
+    return replace(run, loaded=replace(run.loaded, config=replace(run.loaded.config, zenoh=zenoh)))
 
 
 def certified(made: Wiring, security: SecurityConfig | None, root: str, ends: tuple[str, ...] = ()) -> Wiring:
@@ -139,14 +154,15 @@ def table_of(own: Wiring) -> int:
     return own.identity.table.number if own.identity is not None and own.identity.table is not None else 0
 
 
-def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool) -> Wiring:
+def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool, is_mirrored: bool = False) -> Wiring:
     """The wiring of a process that waits for the others as long as the configuration says.
 
     On one host the end of a process closes its sockets, so no link is given up before a step is: its deadlines come
     first. Of two hosts the one that connects decides. Between hosts a queue is full during a cut, and links wait for
-    its end. A master that is on one host with all others does not wait so long for a tool that is stopped.
+    its end. A master that is on one host with all others does not wait so long for a tool that is stopped. Sockets that
+    are ``is_mirrored`` are those of another host.
     """
-    is_local = all(map(is_socket, made.connect))
+    is_local = all(map(is_socket, made.connect)) and not is_mirrored
     lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
     waits = is_node or not all(map(is_socket, (*made.listen, *made.connect)))
     return replace(made, lease_s=lease_s, stuck_s=lease_s if waits else made.stuck_s)

@@ -16,10 +16,11 @@ import msgspec
 
 from ..errors import ConfigurationError, MeshLost
 from ..files import decoded_json
+from ..hosts.slurm import SlurmJob
 from ..run.allowed_code import names_code
 from ..text import short_path
 from .planned_sweep import PlannedSweep
-from .slurm import PART, SlurmJob, ended_tasks, submit, unfinished
+from .slurm_array import PART, ended_tasks, submit, unfinished
 from .sweeping import Sweep
 from .variant_run import path_of
 

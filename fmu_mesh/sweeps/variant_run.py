@@ -31,7 +31,7 @@ import numpy as np
 from .. import __version__
 from ..api.mesh_builder import Mesh
 from ..api.repeated_mesh import RepeatedMesh
-from ..api.rerunning import ALONE
+from ..api.rerunning import ALONE, on_this_host
 from ..api.result import Result
 from ..config.loading import PlainConfig
 from ..errors import ConfigurationError, ErrorReport, FmuError, FmuMeshError, NotInOneProcess, from_report
@@ -137,7 +137,8 @@ class _Loaded:
         self._reductions = [read_reduction(text) for text in self._task.reductions]
         data = self._task.data
         if isinstance(data, dict):  # variants must not listen at the same ports, nor write into the same files
-            data = {**data, "zenoh": {**(data.get("zenoh") or {}), **ALONE["zenoh"]}, "runtime": ALONE["runtime"]}
+            zenoh = {**(data.get("zenoh") or {}), **ALONE["zenoh"]}
+            data = {**data, **on_this_host(data), "zenoh": zenoh, "runtime": ALONE["runtime"]}
             if isinstance(records := data.get("record"), list):
                 data["record"] = records[:1]
         self._mesh = Mesh.from_configuration(PlainConfig(data, Path(self._task.file), foreign=self._task.foreign))

@@ -12,6 +12,7 @@ from typing import Literal
 import msgspec
 from msgspec.structs import replace
 
+from ..config.deploy_section import HostConfig
 from ..config.findings import Findings
 from ..config.instance_sections import InstanceSection, ProcessConfig, placed
 from ..config.key_sections import KEY
@@ -53,8 +54,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
         initial_outputs: what is read in Initialization Mode only.
-        finite: those of ``outputs`` that end the run where they are not finite.
-        not_finite: what it means; `record` also allows to set such values.
+        finite: those of ``outputs`` that end the run where they are not finite; ``not_finite``: what that means.
         timeouts: what its inputs do without a value.
         keys_in: the variables that get the values of keys; ``keys_out``: those whose values go to keys.
         recorded_keys: where the values of keys come from instead.
@@ -141,7 +141,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shared_memory: whether processes of one host exchange messages through shared memory.
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder; ``secured``: whether those who set values have names.
-        process: what its process may take of its host.
+        process: what its process may take; ``host``: the host that it runs on; None: that of `launch`.
     """
 
     mesh: str
@@ -169,6 +169,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     restarts: int = 0
     secured: bool = False
     process: ProcessConfig = ProcessConfig()
+    host: str | None = None
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -226,6 +227,12 @@ class Plan(msgspec.Struct, frozen=True):
         """The communication points of the run."""
         return self.system.grid
 
+    @property
+    def hosts(self) -> dict[str, HostConfig]:
+        """The hosts that nodes run on, besides the one of `launch`, by name."""
+        named = {node.host for node in self.nodes.values()}
+        return {name: host for name, host in self.system.config.deploy.hosts.items() if name in named}
+
     def node_of(self, instance: str) -> str:
         """The name of the node of an instance."""
         return self.system.instances[instance].node
@@ -246,12 +253,10 @@ def make_plan(
         ConfigurationError: a cycle has no delay; names the cycle.
     """
     findings = Findings(system.config.mesh) if findings is None else findings
-    algorithm = system.config.simulation.algorithm
-    names = [*system.instances]
-    connections, closing, order, cycles = execution_order(names, system.connections, algorithm, findings)
+    names, how = [*system.instances], system.config.simulation.algorithm
+    connections, closing, order, cycles = execution_order(names, system.connections, how, findings)
     initialization = plan_initialization(system, connections)
-    descriptions = {name: own.description for name, own in system.instances.items()}
-    check_loops(initialization, connections, descriptions, findings)
+    check_loops(initialization, connections, {n: own.description for n, own in system.instances.items()}, findings)
     outputs = system.output_layouts(connections)
     points = window_of(system.config.simulation.window if window is None else window, outputs.values())
     plan = Plan(system, connections, order, cycles, closing, initialization, window=points, digest="", nodes={})
@@ -267,6 +272,7 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
             node,
             limits=LimitsConfig(),
             process=ProcessConfig(),
+            host=None,  # no number depends on it
             records=tuple(replace(record, file="") for record in node.records),
             instances=tuple(
                 replace(
@@ -336,6 +342,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             row_streams=config.row_streams,
             secured=config.security is not None,
             process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
+            host=config.deploy.host_of(config.instances[members[0]]) if members else None,
         )
     return nodes
 
@@ -360,7 +367,6 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     connected = {c.target.name for c in stepped}
     initialized = connected | {c.target.name for c in initial}
     read = {c.source.name for c in plan.connections if c.source_instance == instance.name} - {*outputs.names}
-    levels = plan.initialization.levels
     given = {variable.name for variable in instance.description.with_causality("output")}
     driven = {own.variable for own in instance.scenario} | {own.variable for own in instance.keys_in}
     checked = tuple(c.name for c in outputs.columns if is_float(c.type) and c.name in given)
@@ -372,7 +378,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         outputs=outputs,
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=feeds_of(stepped),
-        initialization={variable: level for (owner, variable), level in levels.items() if owner == instance.name},
+        initialization={v: level for (own, v), level in plan.initialization.levels.items() if own == instance.name},
         section=placed(plan.system.config.instances[instance.name], instance.not_finite),
         linear_inputs=tuple(
             LinearInput(c.target.name, c.delay or 0, plan.system.instances[c.source_instance].step_points)

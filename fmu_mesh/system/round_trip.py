@@ -15,19 +15,22 @@ __all__ = ["round_trip_cost"]
 def round_trip_cost(plan: Plan, round_trip_s: float) -> list[str]:
     """Sentences that say how long a run takes at least if the network between its hosts has this round trip, in s.
 
-    A cycle that is on one host costs nothing, and the plan does not know hosts. So for a cycle, the sentence has an
-    "if".
+    A cycle that is on one host costs nothing. For a plan without hosts, whose nodes can be started anywhere, the
+    sentence for a cycle has an "if".
     """
-    nodes = {name: own.node for name, own in plan.system.instances.items()}
-    if len({*nodes.values()}) < 2:
+    places: dict[str, str | None] = {name: own.node for name, own in plan.system.instances.items()}
+    if len({*places.values()}) < 2:
         return ["one process: nothing goes between hosts"]
+    doubt = "if it is on several hosts, "
+    if plan.hosts:
+        places, doubt = {name: plan.nodes[own.node].host for name, own in plan.system.instances.items()}, ""
     if plan.window == 1:
         return [f"window 1: between hosts {_cost(plan, round_trip_s)}"]
-    turns = [(cycle, _points_per_turn(plan, cycle, nodes)) for cycle in plan.cycles]
+    turns = [(cycle, _points_per_turn(plan, cycle, places)) for cycle in plan.cycles]
     return [
         f"window {plan.window}: between hosts at most {plan.window / round_trip_s:.0f} points/s",
         *(
-            f"cycle {', '.join(cycle)}: if it is on several hosts, {_cost(plan, round_trip_s / points)}"
+            f"cycle {', '.join(cycle)}: {doubt}{_cost(plan, round_trip_s / points)}"
             for cycle, points in turns
             if points is not None
         ),
@@ -44,8 +47,8 @@ def _cost(plan: Plan, point_s: float) -> str:
     )
 
 
-def _points_per_turn(plan: Plan, cycle: Sequence[str], nodes: Mapping[str, str]) -> int | None:
-    """How many points the slowest way around a cycle advances; None if the cycle is in one process."""
+def _points_per_turn(plan: Plan, cycle: Sequence[str], places: Mapping[str, str | None]) -> int | None:
+    """How many points the slowest way around a cycle advances; None if the cycle is in one place."""
     following: dict[str, list[tuple[str, int]]] = {name: [] for name in cycle}
     for one in plan.connections:
         if one.source_instance in following and one.target_instance in following and not one.initial_only:
@@ -54,7 +57,7 @@ def _points_per_turn(plan: Plan, cycle: Sequence[str], nodes: Mapping[str, str])
         points + back[source]
         for source, links in following.items()
         for target, points in links
-        if nodes[source] != nodes[target] and source in (back := _reached(following, target))
+        if places[source] != places[target] and source in (back := _reached(following, target))
     ]
     return max(1, min(turns)) if turns else None  # a loop that is iterated has a turn without a delay
 

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from fmu_mesh import files
 from fmu_mesh.config.access_sections import check_access
+from fmu_mesh.config.deploy_section import check_deploy
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.key_sections import KEY, KeyView
@@ -163,8 +164,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     Raises:
         ConfigurationError: there are findings; it has all of them.
     """
-    config = loaded.config
-    collected = loaded.findings()
+    config, collected = loaded.config, loaded.findings()
     collected.merge(findings)
     descriptions = {
         name: sized(name, description, config.instances[name], collected)
@@ -437,9 +437,8 @@ def _replaced_start_values(config: Config, connections: Iterable[Connection], fi
 
 
 def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> Findings:
-    """Check where the mesh can be reached; returns warnings of what is open to others."""
-    config, warnings = loaded.config, loaded.findings()
-    zenoh = config.zenoh
+    """Check where the mesh can be reached, and where it runs; returns the warnings."""
+    config, zenoh, warnings = loaded.config, loaded.config.zenoh, loaded.findings()
     if zenoh.mode == "client" and not zenoh.connect and zenoh.config is None:
         findings.add("zenoh.mode", "client without a router", "an endpoint in zenoh.connect")
     if zenoh.config is not None and not files.is_file(path := loaded.resolve(zenoh.config)):
@@ -447,4 +446,5 @@ def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> Findings:
         findings.add("zenoh.config", found, "an existing Zenoh configuration", nearest_file(path))
     ros = {f"ros.{name}": getattr(config.ros, name) for name in ("listen", "connect") if config.ros is not None}
     check_access(zenoh, config.security, ros, findings, warnings)
+    check_deploy(config.deploy, zenoh, config.instances, findings, warnings)
     return warnings

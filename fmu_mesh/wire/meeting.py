@@ -25,7 +25,7 @@ from ..rings import native
 from .runtime import rows_socket
 from .session import Wiring
 
-__all__ = ["Door", "Meeting", "Returns", "meeting_of"]
+__all__ = ["Door", "Meeting", "Returns", "address_towards", "meeting_of"]
 
 # Who meets here: two processes, over a socket, and the threads of each. `door` accepts, and gives each connection a
 # thread that has a second to hear who it is; at most `_STRANGERS` of them. A thread of Zenoh notes the doors of others
@@ -91,6 +91,7 @@ class Meeting:
         name: of this participant.
         listen: where the door is: paths of sockets, and hosts; a place where it cannot be is left out.
         connected: the hosts to which it has connected.
+        folder: of the run here: ssh has the doors of other hosts there, under the names that they have on these.
 
     Attributes:
         sockets: by the names of the peers.
@@ -101,12 +102,14 @@ class Meeting:
         name: str,
         listen: Iterable[Path | str],
         connected: Iterable[str] = (),
+        folder: Path | None = None,
     ) -> None:
         self.sockets: dict[str, socket.socket] = {}
         self._returns: Returns | None = None
         self.name = name
         self._key = secrets.token_bytes()
         self._connected = tuple(connected)
+        self._folder = folder
         self._doors: dict[str, Door | None] = {}
         self._dialing: set[str] = set()
         self._changed = threading.Condition()
@@ -225,7 +228,7 @@ class Meeting:
         """Dial one address, and hear whether the peer is there."""
         made: socket.socket | None = None
         try:
-            made = _connected(address)
+            made = self._dialed(address)
             _say(made, _Greeting(self.name, door.secret, self._received(peer)))
             answer = _heard(made)
             if answer.busy or not self._is(peer, answer):
@@ -236,6 +239,23 @@ class Meeting:
                 made.close()
             return None
         return made, answer.received
+
+    def _dialed(self, address: str) -> socket.socket:
+        kind, _, place = address.partition(":")
+        if kind == "unix":
+            here = self._folder / Path(place).name if self._folder is not None else Path(place)
+            made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            made.settimeout(_PATIENCE_S / 2)
+            try:
+                made.connect(str(here) if here.exists() else place)
+            except OSError:
+                made.close()
+                raise
+            return made
+        host, _, port = place.rpartition(":")
+        made = socket.create_connection((host, int(port)), _PATIENCE_S / 2)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return made
 
     def _accept(self, own: socket.socket) -> None:
         while True:
@@ -277,23 +297,6 @@ class Meeting:
 
     def _is(self, peer: str, greeting: _Greeting) -> bool:
         return greeting.name == peer and hmac.compare_digest(greeting.secret, self.door_for(peer).secret)
-
-
-def _connected(address: str) -> socket.socket:
-    kind, _, place = address.partition(":")
-    if kind == "unix":
-        made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        made.settimeout(_PATIENCE_S / 2)
-        try:
-            made.connect(place)
-        except OSError:
-            made.close()
-            raise
-        return made
-    host, _, port = place.rpartition(":")
-    made = socket.create_connection((host, int(port)), _PATIENCE_S / 2)
-    made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return made
 
 
 def _say(to: socket.socket, greeting: _Greeting) -> None:
@@ -345,10 +348,10 @@ def meeting_of(name: str, folder: Path, wiring: Wiring, address: str | None = No
         except OSError as error:
             text = f"cannot listen for row streams at '{address}': {error.strerror or error}"
             raise ConfigurationError(text, hint="`zenoh.rows_address` is an address of this host.") from error
-        return Meeting(name, [rows_socket(folder, name), address], dict.fromkeys(connected))
+        return Meeting(name, [rows_socket(folder, name), address], dict.fromkeys(connected), folder)
     listening = _hosts(wiring.listen)
-    hosts = dict.fromkeys([*listening, *filter(None, map(_own_address, connected))])
-    return Meeting(name, [rows_socket(folder, name), *hosts], dict.fromkeys(connected))
+    hosts = dict.fromkeys([*listening, *filter(None, map(address_towards, connected))])
+    return Meeting(name, [rows_socket(folder, name), *hosts], dict.fromkeys(connected), folder)
 
 
 def _family(host: str) -> socket.AddressFamily:
@@ -360,8 +363,8 @@ def _hosts(endpoints: Sequence[str]) -> list[str]:
     return [host_of(endpoint) for endpoint in endpoints if endpoint.partition("/")[0] in _NETWORKS]
 
 
-def _own_address(host: str) -> str | None:
-    """The address of this host on the way to another one; the system chooses it, and nothing is sent."""
+def address_towards(host: str) -> str | None:
+    """The address of this host on the way to another one; the system chooses it, and nothing is sent. None: no way."""
     with suppress(OSError):
         kind, _, _, _, place = socket.getaddrinfo(host, 1, type=socket.SOCK_DGRAM)[0]
         with socket.socket(kind, socket.SOCK_DGRAM) as own:

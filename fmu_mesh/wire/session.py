@@ -94,8 +94,9 @@ _ADMIN_SPACE_IS_OURS: Final = {
 _SESSION_END_S = 1.0
 _OWN_S = 5.0
 # How late a question notices that its answer is not needed any more, or that the process it asks is gone: neither is
-# an event here.
-_OVER_CHECK_S = 0.05
+# an event here. One that has waited for long already looks less often: of hundreds of nodes that start, each waits for
+# all others, and looking would take the time of those that are not there yet.
+_OVER_CHECK_S, _OVER_LONGEST_S, _OVER_SHARE = 0.05, 0.4, 0.1
 _TIMEOUT = "Timeout"
 """The reply of Zenoh itself if a queryable did not answer in time."""
 _TOKENS_S = 2.0
@@ -163,7 +164,7 @@ def open_session(wiring: Wiring) -> zenoh.Session:
     Raises:
         ConfigurationError: an endpoint or the configuration file cannot be used, or an endpoint and this process do
             not take the certificate of each other.
-        MeshLost: a client has a certificate, and nobody listens.
+        MeshLost: a client has found nobody who listens.
     """
     for endpoint in (*wiring.listen, *wiring.connect):
         secured, own_settings = wiring.identity is not None, wiring.config is not None
@@ -187,11 +188,14 @@ def reason_of(error: zenoh.ZError) -> str:
     return _OWN_SOURCE.sub("", str(error))
 
 
-def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError:
+def _cannot_open(wiring: Wiring, reason: str) -> ConfigurationError | MeshLost:
     # Of TLS, the reason has the address and the port, and neither the protocol nor the name of the host.
     ends = {endpoint: f":{endpoint.rpartition(':')[2]}:" for endpoint in wiring.listen}
     endpoint = next((endpoint for endpoint, port in ends.items() if endpoint in reason or port in reason), None)
     if endpoint is None:
+        if wiring.mode == "client" and reason.endswith("Timeout!"):
+            text = f"nobody listens at {', '.join(wiring.connect)}"
+            return MeshLost(text, hint=f"The router, or the master, had {wiring.patience_s:g} s to start.")
         endpoints = ", ".join((*wiring.listen, *wiring.connect)) or "no endpoints"
         return ConfigurationError(f"no Zenoh session can be opened ({endpoints}): {reason}")
     for words, what, hint in _CANNOT_LISTEN:
@@ -379,7 +383,7 @@ def answers(
                         return samples
                 if over():
                     raise MeshLost(f"{question.whom} has not answered yet, and this process does not wait any more")
-                changed.wait(min(left, _OVER_CHECK_S))
+                changed.wait(min(left, _look_s(end - question.deadline_s)))
         finally:
             listener.undeclare()
     raise DeadlineExceeded(f"{question.whom} did not answer within {question.deadline_s:g} s")
@@ -404,9 +408,10 @@ def _collected(
 ) -> list[zenoh.Sample]:
     """The answers of one query up to its end, which None marks, or only the first one."""
     samples: list[zenoh.Sample] = []
+    began = time.monotonic()
     while every or not samples:
         try:
-            reply = replies.get(timeout=_OVER_CHECK_S)
+            reply = replies.get(timeout=_look_s(began))
         except queue.Empty:  # only then: an answer may come just before the end, as that to `stop`
             try:
                 if over():
@@ -420,6 +425,11 @@ def _collected(
         if (sample := answer_of(reply)) is not None:
             samples.append(sample)
     return samples
+
+
+def _look_s(began: float) -> float:
+    """How long a question that was asked then waits until it looks whether its answer is needed, in s."""
+    return min(max(_OVER_CHECK_S, _OVER_SHARE * (time.monotonic() - began)), _OVER_LONGEST_S)
 
 
 @contextmanager

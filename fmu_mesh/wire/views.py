@@ -133,7 +133,11 @@ class KeyStatus(KeyView, frozen=True):
 
 
 class InstanceInfo(msgspec.Struct, frozen=True):
-    """Answer of `…/<instance>/info`."""
+    """Answer of `…/<instance>/info`.
+
+    Attributes:
+        host: the name that the system has; ``deploy_host``: the one in `deploy.hosts`, empty where `launch` runs.
+    """
 
     instance: str
     model_name: str
@@ -153,6 +157,7 @@ class InstanceInfo(msgspec.Struct, frozen=True):
     problems: tuple[str, ...]
     clocks: tuple[Clock, ...] = ()
     keys: tuple[KeyView, ...] = ()
+    deploy_host: str = ""
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.variables), 'variable')}, {counted(len(self.connections), 'connection')}"
@@ -172,6 +177,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         refused: messages that its process refused: malformed ones, and those of unknown senders.
         timed_out: the inputs without a value for longer than their timeout, and the points of their last values.
         keys: what has come by keys of connections, and gone to them.
+        deploy_host: the host of `deploy.hosts` on which it runs; empty for that of `launch`.
     """
 
     instance: str
@@ -187,6 +193,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     refused: int = 0
     timed_out: dict[str, int] = {}
     keys: tuple[KeyStatus, ...] = ()
+    deploy_host: str = ""
 
     def rates_since(self, before: InstanceStatus | None) -> tuple[float, float, float]:
         """Points per second, and the shares of the time in steps and waiting, since an earlier status.
@@ -278,6 +285,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
         row_streams: the pairs of processes that do it by a row stream; all others do it through Zenoh.
         topics: those in ROS.
         host_id: of the master's host; ``host`` is a name, which two hosts can have.
+        deploy_hosts: the hosts of `deploy.hosts` by the nodes that run there.
     """
 
     mesh: str
@@ -301,6 +309,7 @@ class MeshInfo(msgspec.Struct, frozen=True):
     result_files: tuple[str, ...] = ()
     host_id: str = ""
     topics: tuple[MeshTopic, ...] = ()
+    deploy_hosts: dict[str, str] = {}
 
     @property
     def is_here(self) -> bool:
@@ -331,6 +340,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
         resets: how often the mesh was reset.
         cut: the nodes whose row streams to the master are cut, and for how long in s. Who is cut from another node says
             so in the `activity` of its instances.
+        missing: while it starts, the nodes that are not ready.
     """
 
     mesh: str
@@ -346,6 +356,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     refused: int = 0
     cut: dict[str, float] = {}
     resets: int = 0
+    missing: tuple[str, ...] = ()
 
 
 class RosTopicView(msgspec.Struct, frozen=True):

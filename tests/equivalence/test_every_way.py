@@ -12,7 +12,7 @@ from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.system.plan import RECORDER
 from tests.all_systems import FEATURES, SYSTEMS, written_system
 from tests.helpers import BY_STREAMS, BY_ZENOH, Launched, Place, row_count, wait_until
-from tests.network_hosts import NEEDS_HOSTS, started_apart, two_hosts
+from tests.network_hosts import NEEDS_HOSTS, started_apart, started_hosts
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
@@ -42,7 +42,7 @@ def test_every_system_gives_its_floats_on_two_hosts(tmp_path: Path, name: str) -
 
     `test_cuts` does this with all examples, and cuts the network meanwhile.
     """
-    with two_hosts(tmp_path) as hosts:
+    with started_hosts(tmp_path) as hosts:
         configs = [written_system(name, host.folder / "own-clone" / "system") for host in hosts]
         nodes = [node for node in prepare(configs[0]).nodes if node != RECORDER]
 
@@ -85,7 +85,7 @@ def test_pause_and_set_equal_a_scenario(place: Place, way: Mapping[str, bool]) -
 
 @NEEDS_HOSTS
 def test_pause_and_set_over_two_hosts_equal_a_scenario(tmp_path: Path) -> None:
-    with two_hosts(tmp_path) as (first, second):
+    with started_hosts(tmp_path) as (first, second):
         configs = [
             written_system("set", host.folder / "own-clone" / "system", lasts_s=10.0) for host in (first, second)
         ]

@@ -24,7 +24,7 @@ from fmu_mesh.run.options import PlanOptions
 from fmu_mesh.system.plan import MASTER, RECORDER
 from tests.all_systems import SYSTEMS, written_system
 from tests.helpers import BY_STREAMS, FMUS, Launched, Place, row_count, wait_until
-from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_apart, two_hosts
+from tests.network_hosts import NEEDS_HOSTS, NetworkHost, link_is, started_apart, started_hosts
 from tests.plain_run import PlainRun
 from tests.planning import prepare
 
@@ -73,11 +73,6 @@ class Apart(NamedTuple):
         return "".join(one.story() for one in self.launched)
 
 
-def link_is(host: NetworkHost, state: str) -> None:
-    """Bring the network between the hosts ``up`` or ``down``."""
-    assert host.start("ip", "link", "set", "wire", state).wait() == 0
-
-
 def let_pass(seconds: float) -> None:
     """The time of a cut, or between two."""
     end = time.monotonic() + seconds
@@ -120,7 +115,7 @@ def running(
     folder: Path, name: str, zenoh: Mapping[str, bool], link_s: float = 30.0, *, unreached: str = ""
 ) -> Iterator[Apart]:
     """A system that runs for `LASTS_S`, with some rows written; the door of one participant may be ``unreached``."""
-    with two_hosts(folder) as hosts:
+    with started_hosts(folder) as hosts:
         if unreached:
             (folder / "shared" / "sitecustomize.py").write_text(UNREACHED.format(unreached), encoding="utf-8")
         configs = [
@@ -315,7 +310,7 @@ def test_rows_of_eight_megabytes_survive_a_cut(tmp_path: Path) -> None:
         "connections": ["wide.y -> sum.u"],
         "record": {"file": "system.csv", "variables": ["sum.sum"]},
     }
-    with two_hosts(tmp_path) as hosts:
+    with started_hosts(tmp_path) as hosts:
         configs = [written_parts(host.folder / "own-clone" / CONFIG.parent, WIDE, content) for host in hosts]
         mesh = Apart(hosts, configs[0], started_apart(hosts, CONFIG, ["sum", "wide"]))
         wait_until(lambda: row_count(mesh.result) > 1 or not mesh.launched[0].running, "some rows")
@@ -342,7 +337,7 @@ LONGEST: Final = [2.0, 12.0] if IS_LONG else [2.0]
 @contextmanager
 def prepared(folder: Path) -> Iterator[tuple[list[NetworkHost], Path]]:
     """Two hosts, and the configuration with two gates and the master's result."""
-    with two_hosts(folder) as hosts:
+    with started_hosts(folder) as hosts:
         configs = [written_parts(host.folder / "own-clone" / CONFIG.parent, GATE, STANDING) for host in hosts]
         yield hosts, configs[0]
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import far
 from benchmarks.far_link import FarLink, far_link, why_not
 from tests.helpers import wait_until
-from tests.network_hosts import two_hosts
+from tests.network_hosts import started_hosts
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can be tried here")
 
@@ -46,7 +46,7 @@ print(came, seconds)
 
 def echoes(folder: Path, link: FarLink, count: int, size: int = 8) -> tuple[int, float]:
     """How many of so many packets come back, and after how many seconds the last one."""
-    with two_hosts(folder, wired=False) as (first, second), far_link([first.pid, second.pid], link):
+    with started_hosts(folder, wired=False) as (first, second), far_link([first.pid, second.pid], link):
         answering = first.start(sys.executable, "-c", ANSWERING)
         wait_until(lambda: "here" in answering.output, f"who answers; {answering.errors}")
         asking = second.start(sys.executable, "-c", ASKING, str(count), str(size))

@@ -15,7 +15,7 @@ import pytest
 
 from tests.all_systems import written_system
 from tests.helpers import Launched, Place, on_a_busy_machine, row_count, rows_of, wait_until, write_config
-from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_apart, two_hosts
+from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_apart, started_hosts
 from tests.pages.blocks import ROOT, blocks_of
 
 pytestmark = NEEDS_HOSTS
@@ -57,7 +57,7 @@ def reference(host: NetworkHost) -> bytes:
 @pytest.mark.parametrize("names", [("first", "second"), ("same", "same")], ids=["two names", "one name"])
 def test_the_commands_of_the_readme_run_on_two_hosts(tmp_path: Path, names: tuple[str, str]) -> None:
     router, parts = commands_of_readme()
-    with two_hosts(tmp_path, names) as (first, second):
+    with started_hosts(tmp_path, names) as (first, second):
         expected = reference(second)
         meeting = started(first, router)
         wait_until(lambda: meeting.output, "the router")
@@ -69,7 +69,7 @@ def test_the_commands_of_the_readme_run_on_two_hosts(tmp_path: Path, names: tupl
 
 
 def test_nodes_of_another_host_connect_to_a_master_that_listens(tmp_path: Path) -> None:
-    with two_hosts(tmp_path) as (first, second):
+    with started_hosts(tmp_path) as (first, second):
         expected = reference(second)
 
         by_hand = [
@@ -104,7 +104,7 @@ sys.addaudithook(refuse)
 
 
 def test_hosts_whose_doors_cannot_be_reached_are_told_and_use_zenoh(tmp_path: Path) -> None:
-    with two_hosts(tmp_path) as hosts:
+    with started_hosts(tmp_path) as hosts:
         first, second = hosts
         expected = reference(second)
         (tmp_path / "shared" / "sitecustomize.py").write_text(UNREACHED, encoding="utf-8")
@@ -122,7 +122,7 @@ def test_hosts_whose_doors_cannot_be_reached_are_told_and_use_zenoh(tmp_path: Pa
 
 @pytest.mark.parametrize("victim", ["pendulum", "delay"])
 def test_a_killed_process_is_named_by_the_others_within_two_seconds(tmp_path: Path, victim: str) -> None:
-    with two_hosts(tmp_path) as hosts:
+    with started_hosts(tmp_path) as hosts:
         config = Path("endless", "system.yaml")
         systems = [
             written_system("pendulum_delay", host.folder / "own-clone" / "endless", lasts_s=60.0) for host in hosts

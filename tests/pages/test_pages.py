@@ -328,6 +328,26 @@ NOT_RUN = [
         "there is no engine of containers here; tests/mqtt/test_twin_compose.py runs the commands of the services",
     ),
     (
+        "docs/engines.md",
+        "fmu-mesh security init lab",
+        "the names of hosts are yours; tests/hosts/test_engines.py makes such folders",
+    ),
+    (
+        "docs/engines.md",
+        "fmu-mesh submit slurm configs/pendulum_delay.yaml --insecure --slurm-option=--partition=short",
+        "it needs a Slurm cluster; tests/hosts/test_slurm_mesh.py runs it on one of two hosts",
+    ),
+    (
+        "docs/engines.md",
+        "docker build --file docker/Dockerfile --tag fmu-mesh .",
+        "it needs Docker; tests/hosts/test_engines.py runs the services as processes",
+    ),
+    (
+        "docs/engines.md",
+        "fmu-mesh render kubernetes configs/pendulum_delay.yaml --security lab --claim lab-data -o mesh.yaml",
+        "it needs a cluster",
+    ),
+    (
         "docs/foxglove.md",
         "ssh -L 8765:127.0.0.1:8765 robot fmu-mesh foxglove",
         "robot is yours; tests/equivalence/test_foxglove.py connects to the port",
@@ -351,6 +371,21 @@ NOT_RUN = [
         "docs/gazebo.md",
         "sudo bridges/gazebo_classic/setup.sh /opt/gazebo_classic",
         "it takes 15 minutes; .ci/long runs it",
+    ),
+    (
+        "docs/hosts.md",
+        "ssh user@lab2 python3 -m venv mesh",
+        "it installs on a host of yours; .ci/run installs the same wheel",
+    ),
+    (
+        "docs/hosts.md",
+        "ssh -o BatchMode=yes user@lab2 true",
+        "lab2 is yours; tests/hosts/test_over_ssh.py runs meshes over hosts with an sshd",
+    ),
+    (
+        "docs/hosts.md",
+        "$ fmu-mesh launch two_hosts.yaml --listen tcp/0.0.0.0:7447 --insecure",
+        "two hosts are needed; tests/hosts/test_nodes_by_hand.py types what launch shows",
     ),
     ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
     (

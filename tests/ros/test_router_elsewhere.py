@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.helpers import Launched, rows_of, wait_until, write_config
-from tests.network_hosts import NEEDS_HOSTS, NetworkHost, two_hosts
+from tests.network_hosts import NEEDS_HOSTS, NetworkHost, started_hosts
 from tests.ros.peers import FOLDER, Peer, need
 
 pytestmark = NEEDS_HOSTS
@@ -28,7 +28,7 @@ COUNT = 100
 def hosts(tmp_path: Path) -> Iterator[list[NetworkHost]]:
     """Where ROS is, and where the mesh is."""
     need("zenoh_ros2_sdk", "rclpy")
-    with two_hosts(tmp_path, ("robot", "desk")) as both:
+    with started_hosts(tmp_path, ("robot", "desk")) as both:
         yield both
 
 

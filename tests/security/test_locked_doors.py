@@ -16,7 +16,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError, MeshLost
 from tests.helpers import Launched, Place, free_port, on_a_busy_machine, wait_until, write_config
-from tests.network_hosts import NEEDS_HOSTS, two_hosts
+from tests.network_hosts import NEEDS_HOSTS, started_hosts
 
 pytest.importorskip("cryptography")
 from fmu_mesh.wire.security.authority import Authority
@@ -233,7 +233,7 @@ def test_nodes_over_tls_give_the_floats_of_one_process(
 @NEEDS_HOSTS
 def test_two_hosts_with_a_certificate_each_give_the_floats_of_one(tmp_path: Path, authority: Authority) -> None:
     config, file = "configs/pendulum_delay.yaml", "own-clone/results/pendulum_delay.csv"
-    with two_hosts(tmp_path) as (first, second):
+    with started_hosts(tmp_path) as (first, second):
         assert second.start("fmu-mesh", "launch", config, "--local", "--no-progress").wait() == 0
         for host, name in ((first, "lab"), (second, "rig")):
             shutil.copytree(authority.folder / name, host.folder / "own")

@@ -20,9 +20,10 @@ import yaml
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError, DeadlineExceeded
-from fmu_mesh.sweeps import slurm
+from fmu_mesh.hosts import slurm
+from fmu_mesh.hosts.slurm import SlurmJob, cancel
 from fmu_mesh.sweeps.planned_sweep import planned_sweep
-from fmu_mesh.sweeps.slurm import PART, SlurmJob, cancel, ended_tasks, submit, unfinished
+from fmu_mesh.sweeps.slurm_array import PART, ended_tasks, submit, unfinished
 from fmu_mesh.sweeps.slurm_sweep import SlurmSweep
 from fmu_mesh.sweeps.sweep_folder import SweepFolder
 from fmu_mesh.sweeps.variant_run import Row

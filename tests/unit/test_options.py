@@ -259,7 +259,9 @@ def test_a_replaced_value_is_checked_like_the_file(tmp_path: Path) -> None:
 
 SPELLS_FLAGS = {
     "run/options.py": "it says how the command line spells them",
-    "sweeps/slurm.py": "options of sbatch",
+    "hosts/processes.py": "commands that an engine runs",
+    "hosts/slurm.py": "options of sbatch",
+    "sweeps/slurm_array.py": "options of sbatch",
     "sweeps/slurm_sweep.py": "a command that the tasks of a job run",
     "__main__.py": "it reads the command line",
     "foxglove/foxglove_server.py": "only the command line serves it",

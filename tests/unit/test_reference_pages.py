@@ -76,6 +76,7 @@ def test_every_key_without_an_example_is_a_section(pages: ModuleType) -> None:
             "solver",
             "security",
             "runtime",
+            "deploy",
         )
     }
 

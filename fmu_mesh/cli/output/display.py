@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -10,11 +11,14 @@ from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
 from ...config.access_sections import is_socket
+from ...config.deploy_section import HostConfig
 from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
+from ...pictures.tables import table
 from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status, WasReset
 from ...run.outcome import Outcome
+from ...system.placement import manual_hosts
 from ...system.plan import Plan
 from ...text import short_path
 from ...wire.views import LogLine, MeshStatus
@@ -41,16 +45,29 @@ class Display:
     """Shows the events of a run on standard error; if it is quiet, only errors, and what processes of the run write.
 
     ``waits_for_nodes`` shows the address only when all instances answer: nodes that are started manually need it
-    earlier.
+    earlier. Where persons start the nodes of other hosts, it shows with which commands, and who is missing; ``file`` is
+    the configuration in these.
     """
 
-    def __init__(self, plan: Plan, *, show_progress: bool, quiet: bool = False, waits_for_nodes: bool = True) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        *,
+        show_progress: bool,
+        quiet: bool = False,
+        waits_for_nodes: bool = True,
+        file: str = "CONFIG",
+    ) -> None:
         self._plan = plan
         self._quiet = quiet
         last = plan.grid.last_point if plan.grid.stop_time is not None else None
         console = (lambda: self._console) if show_progress and not quiet else None
-        self._progress = ProgressLine(plan.system.config.mesh, last, partial(progress_parts, plan.grid), console)
+        self._progress = ProgressLine(
+            plan.system.config.mesh, last, partial(progress_parts, plan.grid), console, self._missing
+        )
         self._waits_for_nodes = waits_for_nodes
+        self._file, self._hosts = file, manual_hosts(plan)
+        self._waiting: dict[str, list[str]] = {}
         self._times: Counter[tuple[str, str]] = Counter()
         self._held: deque[LogLine] = deque()
         self._over = False
@@ -78,6 +95,7 @@ class Display:
         match event:
             case Reachable(endpoints):
                 self._endpoints = endpoints if not self._quiet else ()
+                self._show_commands()
                 if not self._waits_for_nodes:
                     self._show_address()
                 elif self._endpoints:
@@ -102,6 +120,26 @@ class Display:
         if shown := ", ".join([one for one in self._endpoints if not is_socket(one)] or self._endpoints):
             self._print(f"mesh '{self._plan.system.config.mesh}' at {shown}")
         self._endpoints = ()
+
+    def _show_commands(self) -> None:
+        """Show what starts the nodes of each host that `launch` does not start."""
+        config = self._plan.system.config
+        where = [one for one in self._endpoints if not is_socket(one)] or config.zenoh.connect
+        name = socket.gethostname()
+        where = [one.replace("/0.0.0.0:", f"/{name}:").replace("/[::]:", f"/{name}:") for one in where]
+        access = " --insecure" if config.zenoh.insecure else " --security DIR" if config.security is not None else ""
+        for host, nodes in self._hosts.items() if not self._quiet else ():
+            python = self._plan.hosts[host].python
+            program = "fmu-mesh" if python == HostConfig().python else f"{python} -m fmu_mesh"
+            command = f"{program} node {self._file} --host {host} --connect {next(iter(where), 'ENDPOINT')}{access}"
+            self._print(f"start on {host} ({', '.join(nodes)}): {command}")
+
+    def _missing(self) -> list[str]:
+        """One line for each host, while nodes of any are missing."""
+        if not any(self._waiting.values()):
+            return []
+        rows = [[host, f"waits for {', '.join(own)}" if own else "is there"] for host, own in self._waiting.items()]
+        return table(rows, indent=2)
 
     def _end(self, outcome: Outcome) -> None:
         """Show why a run ended early; and what its rows warn of, where there is no summary with that."""
@@ -158,6 +196,11 @@ class Display:
 
     def _status(self, status: MeshStatus) -> None:
         self._progress.update(status.point, status)
+        waiting = {host: [n for n in nodes if n in status.missing] for host, nodes in self._hosts.items()}
+        for host, missing in self._waiting.items() if not self._quiet and status.state != "failed" else ():
+            if missing and not waiting[host]:
+                self._print(f"all nodes of {host} are there", "dim")
+        self._waiting = waiting
         if status.state in ("running", "paused", "stopping", "done"):
             self._show_address()
         if status.state == "paused":

@@ -23,6 +23,7 @@ __all__ = [
     "progress",
     "seconds",
     "variables",
+    "with_hosts",
 ]
 
 
@@ -51,7 +52,17 @@ def instances(statuses: Iterable[InstanceStatus]) -> list[str]:
         [s.instance, s.state, str(s.point), seconds(s.time), f"{1e6 * s.step_time:.3g} us", s.activity]
         for s in statuses
     ]
-    return [*table(rows, heading=["instance", "state", "point", "time", "step time", "activity"]), *keys(statuses)]
+    heading = ["instance", "state", "point", "time", "step time", "activity"]
+    return [*table(with_hosts(statuses, rows, heading), heading=heading), *keys(statuses)]
+
+
+def with_hosts(statuses: Iterable[InstanceStatus], rows: list[list[str]], heading: list[str]) -> list[list[str]]:
+    """The rows of instances, and into the heading, with their hosts, if not all of them are on that of `launch`."""
+    hosts = [status.deploy_host for status in statuses]
+    if not any(hosts):
+        return rows
+    heading.insert(1, "host")
+    return [[row[0], host, *row[1:]] for row, host in zip(rows, hosts, strict=True)]
 
 
 def keys(statuses: Iterable[InstanceStatus]) -> list[str]:
@@ -69,6 +80,7 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
             ("point", progress(status)),
             ("time", seconds(status.time)),
             ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),
+            ("missing", ", ".join(map(_part, status.missing))),
             ("overruns", str(status.overruns or "")),
             ("resets", str(status.resets or "")),
             *(("cut", f"the master waits for node '{name}' for {cut_s:.0f} s") for name, cut_s in status.cut.items()),
@@ -125,6 +137,10 @@ def _part(name: str) -> str:
     return _PARTS.get(name, name)
 
 
+def _on(deploy_host: str) -> str:
+    return f" on host '{deploy_host}'" if deploy_host else ""
+
+
 def mesh_info(info: MeshInfo) -> list[str]:
     """The information about a mesh."""
     end = seconds(info.stop_time) if info.stop_time is not None else "an open end"
@@ -137,7 +153,7 @@ def mesh_info(info: MeshInfo) -> list[str]:
             ("window", f"{info.window} points"),
             ("real-time factor", f"{info.real_time_factor:g}" if info.real_time_factor else "as fast as possible"),
             ("instances", ", ".join(info.instances)),
-            ("nodes", ", ".join(info.nodes)),
+            ("nodes", ", ".join(name + _on(info.deploy_hosts.get(name, "")) for name in info.nodes)),
             ("result files" if len(info.result_files) > 1 else "result file", ", ".join(info.result_files) or "none"),
             ("endpoints", ", ".join(info.endpoints)),
             ("shared memory", ", ".join(map(_part, info.shared_memory)) or "not used"),
@@ -161,7 +177,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("FMU" if fmi else "file", info.fmu),
             ("step size", seconds(info.step_size)),
             ("can", ", ".join(can)),
-            ("node", f"{info.node}, process {info.pid} on {info.host}"),
+            ("node", f"{info.node}{_on(info.deploy_host)}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(map(_connection, info.connections))),
             *(("key", "  ".join(own.cells)) for own in info.keys),
             ("timeouts", ", ".join(f"{v.name}: {v.timeout}" for v in info.variables if v.timeout)),

@@ -40,12 +40,18 @@ class ProgressLine(Generic[T]):
         total: how much there is to do; None if that is not known.
         parts: of the last status, what fits into a number of columns beside the bar.
         console: where it is drawn, if standard error is a terminal; None never draws it. Rich is slow to import.
+        below: the lines below it.
     """
 
     def __init__(
-        self, name: str, total: int | None, parts: Callable[[T, int], list[str]], console: Callable[[], Console] | None
+        self,
+        name: str,
+        total: int | None,
+        parts: Callable[[T, int], list[str]],
+        console: Callable[[], Console] | None,
+        below: Callable[[], list[str]] = list,
     ) -> None:
-        self._name, self._total, self._parts = name, total, parts
+        self._name, self._total, self._parts, self._below = name, total, parts, below
         self._done = 0
         self._status: T | None = None
         self._live: Live | None = None
@@ -94,6 +100,8 @@ class ProgressLine(Generic[T]):
         bar = ProgressBar(total=self._total, completed=self._done, pulse=self._total is None)
         line.add_row(Text(name, style="bold"), bar, Text(_GAP.join(parts)))
         yield line
+        for text in self._below():
+            yield Text(shortened(text, width))
 
 
 def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -38,20 +38,12 @@ class MujocoKind(Kind[MujocoConfig]):
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the model at ``path`` and of all files that it refers to, wherever they lie."""
-        files: dict[Path, ET.Element | None] = {}
-        names: dict[Path, set[str]] = {path.resolve(): {""}}
-        while waiting := [file for file in names if file not in files]:
-            files.update((file, _model(file)) for file in waiting)
-            models = [(file, root) for file, root in files.items() if root is not None]
-            folders = {file.parent for file, _ in models}
-            compilers = [compiler for _, root in models for compiler in root.iter("compiler")]
-            assets = {one.get(key, "") for one in compilers for key in ("assetdir", "meshdir", "texturedir")}
-            folders |= {folder / own for folder in folders for own in assets}
-            for reference in sorted({name for _, root in models for name in _references(root)}):
-                for candidate in _candidates(reference, folders):
-                    names.setdefault(candidate, set()).add(reference)
-        found = sorted(f"{sha256_of(file)} {sorted(names[file])}" for file in files)
+        found = sorted(f"{sha256_of(file)} {sorted(names)}" for file, names in _names(path).items())
         return hashlib.sha256("\n".join(found).encode(errors="surrogateescape")).hexdigest()
+
+    def files(self, path: Path) -> Sequence[Path]:
+        """The model, and all files that it refers to."""
+        return [path, *_names(path)]
 
     def check_showing(self, showing: Showing) -> None:
         """Check that there is a screen, or what a film needs. Call it before MuJoCo is imported."""
@@ -79,6 +71,23 @@ def answer_to(request: str) -> bytes:
 
     path, section = msgspec.json.decode(request, type=tuple[str, MujocoConfig])
     return described(lambda: load_world(Path(path), section).description)
+
+
+def _names(path: Path) -> dict[Path, set[str]]:
+    """The model at ``path`` and all files that it refers to, and by which names."""
+    files: dict[Path, ET.Element | None] = {}
+    names: dict[Path, set[str]] = {path.resolve(): {""}}
+    while waiting := [file for file in names if file not in files]:
+        files.update((file, _model(file)) for file in waiting)
+        models = [(file, root) for file, root in files.items() if root is not None]
+        folders = {file.parent for file, _ in models}
+        compilers = [compiler for _, root in models for compiler in root.iter("compiler")]
+        assets = {one.get(key, "") for one in compilers for key in ("assetdir", "meshdir", "texturedir")}
+        folders |= {folder / own for folder in folders for own in assets}
+        for reference in sorted({name for _, root in models for name in _references(root)}):
+            for candidate in _candidates(reference, folders):
+                names.setdefault(candidate, set()).add(reference)
+    return names
 
 
 def _model(file: Path) -> ET.Element | None:

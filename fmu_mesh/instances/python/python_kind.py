@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import msgspec
 
 from ...config.mesh import LimitsConfig
 from ...errors import FmuMeshError, LoadFailed
-from ...files import sha256_of
+from ...files import below, sha256_of
 from ...system.process_sharing import BOTH_USE_PYTHON, Claims
 from ...variables.model_description import ModelDescription
 from ..child_question import ask_description_of, check_version, described
@@ -44,6 +44,10 @@ class PythonKind(Kind[PythonConfig]):
     def content(self, path: Path) -> str:
         """A SHA-256 of the file; empty for a module, whose content is in the description."""
         return hashlib.sha256(path.read_bytes()).hexdigest() if path != Path() else ""
+
+    def files(self, path: Path) -> Sequence[Path]:
+        """All files of the folder of a component: it may import some, and read others."""
+        return below(path.parent)
 
     def claims(self, path: Path, section: PythonConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
         """The interpreter, and the modules of its folder that cannot be imported for one instance alone."""

@@ -7,6 +7,7 @@ cryptography.
 from __future__ import annotations
 
 import base64
+import os
 import stat
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -34,7 +35,7 @@ with importing("cryptography", "certificates"):
     )
     from cryptography.x509.oid import NameOID
 
-__all__ = ["called", "hosts_of", "identity_in"]
+__all__ = ["called", "hosts_in", "hosts_of", "identity_in"]
 
 T = TypeVar("T")
 
@@ -95,7 +96,10 @@ def _check_files(folder: Path) -> None:
     if missing:
         hint = "It has to be a folder DIR/NAME that `fmu-mesh security add DIR NAME` has made."
         raise ConfigurationError(f"there is no {listed(missing)} in '{short_path(folder)}'", hint=hint)
-    if (mode := (folder / KEY).stat().st_mode) & (stat.S_IRWXG | stat.S_IRWXO):
+    state = (folder / KEY).stat()
+    # A key of root, as in a Secret of Kubernetes, is for a group of this process.
+    open_to = stat.S_IRWXO | (stat.S_IWGRP if os.getuid() and not state.st_uid else stat.S_IRWXG)
+    if (mode := state.st_mode) & open_to:
         hint = f"`chmod 600 {short_path(folder / KEY)}` closes it."
         raise ConfigurationError(f"others can read '{short_path(folder / KEY)}' (mode {mode & 0o777:o})", hint=hint)
 
@@ -110,6 +114,11 @@ def hosts_of(certificate: Certificate) -> list[str]:
     """Names and addresses of the hosts that a certificate is for."""
     found = [one for one in certificate.extensions if isinstance(one.value, SubjectAlternativeName)]
     return [str(own.value) for one in found for own in one.value if isinstance(own, DNSName | IPAddress)]
+
+
+def hosts_in(folder: Path) -> list[str]:
+    """Names and addresses of the hosts that the certificate in a folder is for, which `identity_in` has checked."""
+    return hosts_of(load_pem_x509_certificates((folder / CERTIFICATE).read_bytes())[0])
 
 
 def _path(
