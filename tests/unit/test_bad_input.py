@@ -97,7 +97,7 @@ def nothing_is_spawned(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         pytest.fail("a process was started before everything was checked")
 
-    monkeypatch.setattr("fmu_mesh.run.child.subprocess.Popen", fail)
+    monkeypatch.setattr("subprocess.Popen", fail)
 
 
 @pytest.fixture(params=[("launch",), ("launch", "--local"), ("check",)], ids=["launch", "local", "check"])
