@@ -145,6 +145,40 @@ def test_a_stopped_launcher_stops_nothing_but_its_output(pair: SshHosts) -> None
         assert_ends_well(mesh, launched)
 
 
+@pytest.mark.parametrize("part", ["delay", "pendulum", "master"] if IS_LONG else ["delay"])
+def test_a_process_that_was_stopped_for_a_while_costs_only_time(pair: SshHosts, part: str) -> None:
+    with mesh_over_ssh(pair, lasts_s=8.0, timeouts={"link": 3.0}) as mesh:
+        launched = mesh.running()
+        process = mesh.process(part)
+
+        process.suspend()
+        let_pass(5.0)
+        process.resume()
+
+        assert_ends_well(mesh, launched)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("delay", "node 'delay' on b, point "),
+        ("pendulum", "its process is stopped (state T)"),
+        ("master", "the master was lost: its process is stopped (state T)"),
+    ],
+    ids=["delay", "pendulum", "master"],
+)
+@pytest.mark.skipif(not IS_LONG, reason="it takes half a minute; FMU_MESH_HOSTS asks for it")
+def test_a_process_that_stays_stopped_ends_the_run(pair: SshHosts, part: str, words: str) -> None:
+    with mesh_over_ssh(pair, lasts_s=ENDLESS_S, timeouts={"step": 3.0, "stop": 3.0}) as mesh:
+        launched = mesh.running()
+
+        mesh.process(part).suspend()
+
+        assert launched.wait() == 4, mesh.story()
+        assert words in launched.message
+        mesh.assert_nothing_left()
+
+
 def test_an_interrupt_ends_the_run_in_order_on_all_hosts(pair: SshHosts) -> None:
     with mesh_over_ssh(pair, lasts_s=ENDLESS_S) as mesh:
         launched = mesh.running()
