@@ -14,7 +14,6 @@ from msgspec import Meta
 from fmu_mesh.config.access_sections import ZenohConfig
 from fmu_mesh.config.base import Base, Name
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.config.instance_sections import InstanceSection
 from fmu_mesh.text import listed, nearest
 
 __all__ = ["DeployConfig", "HostConfig", "check_deploy"]
@@ -75,24 +74,24 @@ class DeployConfig(Base, frozen=True, kw_only=True):
         Meta(description="The hosts that instances can name as their `host`, by name."),
     ] = {}
 
-    def host_of(self, section: InstanceSection) -> str | None:
-        """The host of the node of an instance; None: that of `launch`, which a `host` without an entry means, too."""
-        return section.host if section.host in self.hosts else None
+    def known(self, host: str | None) -> str | None:
+        """The `host` of an instance; None: that of `launch`, which a `host` without an entry means, too."""
+        return host if host in self.hosts else None
 
 
 def check_deploy(
     deploy: DeployConfig,
     zenoh: ZenohConfig,
-    instances: Mapping[str, InstanceSection],
+    placed: Mapping[str, str | None],
     findings: Findings,
     warnings: Findings,
 ) -> None:
-    """Check the hosts of instances.
+    """Check the hosts, and the `host` of each instance.
 
     A file without any entry is as it was before there were entries, for two versions: `host` has no effect in it.
     """
-    for name, section in instances.items():
-        place, host = f"instances.{name}.host", section.host
+    for name, host in placed.items():
+        place = f"instances.{name}.host"
         if host is None or host in deploy.hosts:
             continue
         if deploy.hosts:

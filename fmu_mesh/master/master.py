@@ -226,8 +226,11 @@ class Master:
             if not isinstance(states.failure, RunReset):
                 self._server.publish_status(at_once=True)
                 if states.failure is not None:
-                    # The log lines that nodes had said before they were told to end.
-                    self._inbox.wait_until(lambda: self._members.have_left, _LAST_WORDS_S)
+                    # The log lines that nodes had said before they were told to end. And when this process is gone,
+                    # what the network has not delivered yet is lost: why they have to end.
+                    asked = isinstance(states.failure, Interrupted) and self._members.some_are_far
+                    limit_s = states.deadlines.finish if asked else _LAST_WORDS_S
+                    self._inbox.wait_until(lambda: self._members.have_left, limit_s)
                 undeclare_all([own for own in (self._run_token, self._token) if own is not None])
         if states.failure is not None:
             raise states.failure

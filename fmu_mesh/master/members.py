@@ -120,6 +120,11 @@ class Members:
         """Whether no node of a model has a token any more."""
         return self._present <= {RECORDER}
 
+    @property
+    def some_are_far(self) -> bool:
+        """Whether a node of another host has a token: a message may be on its way to it for long, and need this end."""
+        return not self._present <= {RECORDER, *self._shared}
+
     def lost(self, router: RouterLink, link_s: float, silent_s: Callable[[str], float]) -> list[str]:
         """The nodes whose processes are gone.
 

@@ -342,7 +342,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             row_streams=config.row_streams,
             secured=config.security is not None,
             process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
-            host=config.deploy.host_of(config.instances[members[0]]) if members else None,
+            host=config.deploy.known(config.instances[members[0]].host) if members else None,
         )
     return nodes
 

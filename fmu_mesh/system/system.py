@@ -446,5 +446,5 @@ def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> Findings:
         findings.add("zenoh.config", found, "an existing Zenoh configuration", nearest_file(path))
     ros = {f"ros.{name}": getattr(config.ros, name) for name in ("listen", "connect") if config.ros is not None}
     check_access(zenoh, config.security, ros, findings, warnings)
-    check_deploy(config.deploy, zenoh, config.instances, findings, warnings)
+    check_deploy(config.deploy, zenoh, {n: own.host for n, own in config.instances.items()}, findings, warnings)
     return warnings

@@ -430,6 +430,7 @@ NOT_RUN = [
         ".venv/bin/python -m benchmarks.tls",
         "it takes minutes; tests/security/test_locked_doors.py compares the floats",
     ),
+    ("docs/performance.md", ".venv/bin/python -m benchmarks.over_ssh", "it takes minutes"),
     (
         "docs/performance.md",
         ".venv/bin/python -m benchmarks.floods --floods large stopped --repeat 1",
