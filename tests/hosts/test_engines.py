@@ -338,10 +338,15 @@ def test_a_compose_file_shows_each_container_only_its_files(tmp_path: Path, caps
 
 
 @pytest.mark.skipif(not all(map(shutil.which, ("podman", "podman-compose"))), reason="podman-compose is not installed")
-def test_podman_compose_starts_what_the_file_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_podman_compose_starts_what_the_file_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = main_job(tmp_path, memory="512 MiB")
     (tmp_path / "compose.yaml").write_text(rendered(capsys, "compose", config, "--insecure"), encoding="utf-8")
     command = ["podman-compose", "--dry-run", "-f", "compose.yaml", "run", "--rm", "--name", "pair-master", "master"]
+    # Also a dry run makes the network.
+    (settings := tmp_path / "podman.conf").write_text(f'[network]\nnetwork_config_dir = "{tmp_path}"\n')
+    monkeypatch.setenv("CONTAINERS_CONF", str(settings))
 
     # Debian's has no `config`: this shows the commands of Podman.
     shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=DEADLINE_S)

@@ -340,7 +340,7 @@ NOT_RUN = [
     (
         "docs/engines.md",
         "docker build --file docker/Dockerfile --tag fmu-mesh .",
-        "it needs Docker; tests/hosts/test_engines.py runs the services as processes",
+        "it needs Docker; tests/hosts/test_containers.py runs such a file with podman-compose",
     ),
     (
         "docs/engines.md",

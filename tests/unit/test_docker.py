@@ -1,6 +1,7 @@
 """The files in docker/ keep their promises: small, pinned, not root, and one service per instance.
 
-They are read, not run; `tests/equivalence/test_compose.py` and `tests/mqtt/test_twin_compose.py` run the commands.
+They are read, not run; `tests/equivalence/test_compose.py` and `tests/mqtt/test_twin_compose.py` run the commands, and
+`tests/hosts/test_containers.py` the containers.
 """
 
 import json
@@ -64,8 +65,10 @@ def test_the_final_stage_takes_over_only_what_an_earlier_one_built(
 
 def test_every_base_image_is_pinned_to_an_exact_version(instructions: list[tuple[str, str]]) -> None:
     images = [value.split()[0] for name, value in instructions if name == "FROM"]
+    defaults = dict(value.split("=", 1) for name, value in instructions if name == "ARG")
 
-    assert [image for image in images if not EXACT_VERSION.search(image)] == []
+    assert set(images) == {"${BASE}"}
+    assert EXACT_VERSION.search(defaults["BASE"])
 
 
 def test_the_image_runs_as_a_user_of_its_own(instructions: list[tuple[str, str]]) -> None:
@@ -107,7 +110,8 @@ def test_every_dependency_of_the_package_has_an_exact_version_in_the_image() -> 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = (DOCKER / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = dict(line.lower().split("==") for line in lines if not line.startswith("#"))
-    needed = {re.split(r"[<>=\[;]", requirement)[0].lower() for requirement in project["dependencies"]}
+    requirements = [*project["dependencies"], *project["optional-dependencies"]["security"]]
+    needed = {re.split(r"[<>=\[;]", requirement)[0].lower() for requirement in requirements}
 
     assert needed <= pins.keys()
 
