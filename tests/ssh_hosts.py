@@ -116,6 +116,7 @@ def _settings(own: Mapping[str, str]) -> dict[str, str]:
         "UsePAM": "no",
         "StrictModes": "no",
         "PidFile": "none",
+        "Subsystem": "sftp internal-sftp",
         "LogLevel": "VERBOSE",
     }
     if measured := os.environ.get("COVERAGE_PROCESS_START"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -155,7 +156,9 @@ class MeshOverSsh:
     @staticmethod
     def _files(host: NetworkHost) -> set[Path]:
         own = [path for path in host.folder.iterdir() if path.name not in _STAYS]
-        found = {*own, *(path for folder in own if folder.is_dir() for path in folder.rglob("*"))}
+        # A folder that goes away meanwhile is no error of `os.walk`, as it is of `rglob`.
+        inner = ((Path(at), names) for folder in own for at, *both in os.walk(folder) for names in both)
+        found = {*own, *(at / name for at, names in inner for name in names)}
         return {path for path in found if not _RUNTIME.match(str(path.relative_to(host.folder)))}
 
 
@@ -167,7 +170,7 @@ _LINES: Final = {
     "relay": r"\S*python\S* .*relay",
     "ssh": r"(\S*/)?ssh ",
     "session": r"sshd: ",
-    "helper": r"\S*python\S* .*fmu_mesh\.hosts\.helper",
+    "helper": r"\S+ -Pu -m fmu_mesh\.hosts\.helper ",
     "master": r"fmu-mesh master",
 }
 """How the command of each part begins; a node is named by its title."""

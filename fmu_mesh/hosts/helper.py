@@ -68,9 +68,10 @@ class _Helper:
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, lambda *_: self._happened.put(self._leave))
         os.write(self._output, frames.MAGIC)
-        self._say(
-            frames.HelperHello(__version__, *frames.this_system(), self._run, os.getpid(), str(self._cache.trees))
-        )
+        ends = [*os.environ.get("SSH_CONNECTION", "").split(), "", "", ""]  # address and port of ssh, then of sshd
+        address = ends[2] if ends[2] != "UNKNOWN" else ""  # of an sshd behind a pipe
+        this = frames.this_system()
+        self._say(frames.HelperHello(__version__, *this, self._run, os.getpid(), str(self._cache.trees), address))
         threading.Thread(target=self._read, name="frames", daemon=True).start()
         folder: Path | None = None
         try:

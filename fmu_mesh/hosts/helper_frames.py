@@ -58,6 +58,7 @@ class HelperHello(msgspec.Struct, frozen=True, tag=True):
         run: the name of the run there.
         pid: of the helper.
         cache: where the files of models are.
+        address: of that host in the connection of ssh; empty: it is not known.
     """
 
     version: str
@@ -67,6 +68,7 @@ class HelperHello(msgspec.Struct, frozen=True, tag=True):
     run: str
     pid: int
     cache: str
+    address: str = ""
 
 
 class OfferTrees(msgspec.Struct, frozen=True, tag=True):

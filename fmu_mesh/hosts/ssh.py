@@ -197,8 +197,7 @@ class _Host:
         self.failure: FmuMeshError | None = None
         self.lost: str | None = None
         self._name, self._config, self._run, self._control = name, run.plan.hosts[name], run, control
-        self._ssh = self._config.ssh or ""
-        self._post, self._tell = post, tell
+        self._ssh, self._post, self._tell = self._config.ssh or "", post, tell
         self._link_s = run.loaded.config.timeouts.link
         self._nodes = {key: node for key, node in run.plan.nodes.items() if node.host == name}
         results = [Path(record.file) for record in run.plan.system.records]
@@ -306,15 +305,18 @@ class _Host:
             with suppress(subprocess.TimeoutExpired):
                 self._relay.wait(_LEAVE_S)
         self._kill()
-        code = self._relay.wait()  # that of ssh, and 128 more than the number of a signal
+        code = self._relay.wait()  # that of ssh, and 128 more than the number of a signal; below 0: its own
         self._threads[1].join(1.0)
-        how = f"ssh {how_it_ended(code if not 128 < code < 255 else 128 - code)}"
+        who = "the relay to ssh" if code < 0 else "ssh"
+        how = f"{who} {how_it_ended(code if not 128 < code < 255 else 128 - code)}"
         if self._is_silent:
             how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
         elif self.failure is not None:
             how = self.failure.message
         elif self._said:
             how += f": {self._said[-1]}"
+        elif code == 255:  # of ssh, which has words where a connection breaks
+            how += ": a signal has ended the helper there"
         self.lost = f"is gone: the ssh connection to {self._name} was lost ({how})"
         if self.failure is None and not self.is_ready:
             self.failure = self._in_words(code, how)
@@ -368,7 +370,7 @@ class _Host:
                     if last:
                         break
         plans, launch = {}, launch_of(self._run.run)
-        rows = self._config.address if self._config.rows == "tcp" else None
+        rows = (self._config.address or hello.address or None) if self._config.rows == "tcp" else None
         for name in self._nodes:
             own = self._run.node(name)
             zenoh = replace(own.zenoh, config=self._zenoh, rows_address=rows)

@@ -77,11 +77,16 @@ def written(host: NetworkHost, deploy: dict[str, Any], **sections: object) -> Pa
     return folder / "many.yaml"
 
 
-@pytest.mark.parametrize("rows", ["sockets", "tcp"])
-def test_models_of_all_kinds_go_to_the_other_host(pair: SshHosts, rows: str) -> None:
+@pytest.mark.parametrize(
+    "deploy",
+    [{}, {"rows": "tcp"}, {"rows": "tcp", "ssh": "other", "address": "10.77.0.2"}],
+    ids=["sockets", "tcp", "tcp to a name of ssh"],
+)
+def test_models_of_all_kinds_go_to_the_other_host(pair: SshHosts, deploy: dict[str, str]) -> None:
     here = pair["a"]
-    deploy = {"rows": rows, "address": "10.77.0.2"} if rows == "tcp" else {}
-    config = written(here, deploy, zenoh={"insecure": rows == "tcp"})
+    config = written(here, deploy, zenoh={"insecure": "rows" in deploy})
+    names = "Host other\n  HostName b\nHost *\n  StrictHostKeyChecking yes\n"  # only ssh knows the first one
+    (here.home / ".ssh" / "config").write_text(names, encoding="utf-8")
     shutil.rmtree(pair["b"].folder / "own-clone" / "fmus", ignore_errors=True)
 
     results = []

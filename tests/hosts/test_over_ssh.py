@@ -7,9 +7,7 @@ takes minutes: all systems, and each fault more than once.
 from __future__ import annotations
 
 import os
-import shutil
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +18,6 @@ import pytest
 from tests.all_systems import SYSTEMS
 from tests.helpers import Launched, on_a_busy_machine, row_count, wait_until
 from tests.network_hosts import link_is
-from tests.pages.blocks import ROOT, blocks_of
 from tests.ssh_hosts import NEEDS_SSH, SshHosts, ssh_hosts
 from tests.ssh_meshes import MeshOverSsh, mesh_over_ssh
 
@@ -55,27 +52,6 @@ def test_a_system_over_two_hosts_has_the_result_of_one_process(pair: SshHosts, s
         assert_ends_well(mesh, mesh.launch())
 
 
-def test_the_commands_of_the_page_run_as_they_are(tmp_path: Path) -> None:
-    blocks = blocks_of(ROOT / "docs" / "hosts.md")
-    [file] = [block for block in blocks if block.detail == "two_hosts.yaml"]
-    [block] = [block for block in blocks if block.text.startswith("ssh -o BatchMode=yes user@lab2 true")]
-    with ssh_hosts(tmp_path, ("lab1", "lab2")) as entered:
-        here, there = entered.hosts
-        (here.folder / "own-clone" / file.detail).write_text(file.text, encoding="utf-8")
-        (there.home / "mesh").symlink_to(sys.prefix)
-        for folder in ("configs", "fmus"):
-            shutil.rmtree(there.folder / "own-clone" / folder)
-        path = f"{sys.prefix}/bin:{os.environ['PATH']}"
-
-        typed: list[Launched] = []
-        for command in block.commands(None):
-            typed.append(here.start("sh", "-c", command.line, PATH=path))
-            assert typed[-1].wait() == 0, typed[-1].story()
-
-        assert len(typed) == 5
-        assert "equal" in typed[-1].output
-
-
 def test_three_hosts_reach_each_other_through_the_one_of_launch(tmp_path: Path) -> None:
     with ssh_hosts(tmp_path, ("a", "b", "c")) as entered, mesh_over_ssh(entered, "star") as mesh:
         launched = mesh.running() if IS_LONG else mesh.launch()
@@ -98,7 +74,16 @@ def test_second_start_finds_the_files_of_the_first_in_the_cache(pair: SshHosts) 
         assert {path: inode for path, (inode, _) in cached().items()} == {path: one for path, (one, _) in first.items()}
 
 
-@pytest.mark.parametrize("part", ["ssh", "session", "helper", "relay", "delay", "pendulum", "master"])
+CONNECTION: Final = {
+    "ssh": "ssh was ended by SIGKILL)",
+    "session": "ssh ended with exit code 255: ",
+    "helper": "ssh ended with exit code 255: a signal has ended the helper there)",
+    "relay": "the relay to ssh was ended by SIGKILL)",
+}
+"""How it is lost if a part of it is killed."""
+
+
+@pytest.mark.parametrize("part", [*CONNECTION, "delay", "pendulum", "master"])
 def test_whatever_is_killed_the_run_ends_and_says_so(pair: SshHosts, part: str) -> None:
     with mesh_over_ssh(pair, lasts_s=ENDLESS_S) as mesh:
         launched = mesh.running()
@@ -128,7 +113,7 @@ def test_a_killed_launcher_leaves_nothing_on_any_host(pair: SshHosts) -> None:
         mesh.assert_nothing_left(on_a_busy_machine(3.0))
 
 
-@pytest.mark.parametrize("part", ["ssh", "session", "helper", "relay"])
+@pytest.mark.parametrize("part", CONNECTION)
 def test_what_is_stopped_is_seen_by_its_silence(pair: SshHosts, part: str) -> None:
     with mesh_over_ssh(pair, lasts_s=ENDLESS_S, timeouts={"link": LINK_S}) as mesh:
         launched = mesh.running()
@@ -158,6 +143,40 @@ def test_a_stopped_launcher_stops_nothing_but_its_output(pair: SshHosts) -> None
 
         assert more > rows
         assert_ends_well(mesh, launched)
+
+
+@pytest.mark.parametrize("part", ["delay", "pendulum", "master"] if IS_LONG else ["delay"])
+def test_a_process_that_was_stopped_for_a_while_costs_only_time(pair: SshHosts, part: str) -> None:
+    with mesh_over_ssh(pair, lasts_s=8.0, timeouts={"link": 3.0}) as mesh:
+        launched = mesh.running()
+        process = mesh.process(part)
+
+        process.suspend()
+        let_pass(5.0)
+        process.resume()
+
+        assert_ends_well(mesh, launched)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("delay", "node 'delay' on b, point "),
+        ("pendulum", "its process is stopped (state T)"),
+        ("master", "the master was lost: its process is stopped (state T)"),
+    ],
+    ids=["delay", "pendulum", "master"],
+)
+@pytest.mark.skipif(not IS_LONG, reason="it takes half a minute; FMU_MESH_HOSTS asks for it")
+def test_a_process_that_stays_stopped_ends_the_run(pair: SshHosts, part: str, words: str) -> None:
+    with mesh_over_ssh(pair, lasts_s=ENDLESS_S, timeouts={"step": 3.0, "stop": 3.0}) as mesh:
+        launched = mesh.running()
+
+        mesh.process(part).suspend()
+
+        assert launched.wait() == 4, mesh.story()
+        assert words in launched.message
+        mesh.assert_nothing_left()
 
 
 def test_an_interrupt_ends_the_run_in_order_on_all_hosts(pair: SshHosts) -> None:

@@ -248,7 +248,7 @@ NOT_RUN = [
     (
         "README.md",
         "fmu-mesh master CONFIG --connect tcp/router:7447 --insecure",
-        "CONFIG and router are yours; tests/faults/test_by_hand.py starts these parts",
+        "CONFIG and router are yours; tests/hosts/test_hosts_page.py types them on two hosts",
     ),
     ("bridges/ros2dds/README.md", "./build", ".ci/long builds it, and tests/ros/test_bridge.py runs it"),
     ("bridges/zenoh/README.md", "./build", ".ci/long builds it, and tests/mqtt/test_mqtt_and_http.py runs it"),
@@ -375,17 +375,17 @@ NOT_RUN = [
     (
         "docs/hosts.md",
         "ssh user@lab2 python3 -m venv mesh",
-        "it installs on a host of yours; .ci/run installs the same wheel",
+        "it installs on a host of yours; tests/hosts/test_hosts_page.py types it on one of two hosts",
     ),
     (
         "docs/hosts.md",
         "ssh -o BatchMode=yes user@lab2 true",
-        "lab2 is yours; tests/hosts/test_over_ssh.py runs meshes over hosts with an sshd",
+        "lab2 is yours; tests/hosts/test_hosts_page.py types them on one of two hosts",
     ),
     (
         "docs/hosts.md",
         "$ fmu-mesh launch two_hosts.yaml --listen tcp/0.0.0.0:7447 --insecure",
-        "two hosts are needed; tests/hosts/test_nodes_by_hand.py types what launch shows",
+        "two hosts are needed; tests/hosts/test_hosts_page.py has them",
     ),
     ("docs/installation.md", "pipx install '.[plot]'", "it installs into your home; .ci/run installs the same wheel"),
     (
