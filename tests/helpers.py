@@ -41,6 +41,7 @@ __all__ = [
     "Place",
     "assert_readable",
     "braked",
+    "examples",
     "free_port",
     "on_a_busy_machine",
     "row_count",
@@ -94,6 +95,11 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     with socket.socket(type=kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def examples(most: int) -> int:
+    """How many random examples a test takes: ``most`` where `FMU_MESH_EXAMPLES` asks for all of them, else a third."""
+    return most if "FMU_MESH_EXAMPLES" in os.environ else -(-most // 3)
 
 
 def wait_until(condition: Callable[[], Value | None], what: str, deadline_s: float = DEADLINE_S) -> Value:

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmu_mesh import FMIAdapter
+from tests.helpers import examples
 
 GAIN = Path(__file__).resolve().parents[2] / "fmus" / "Gain.fmu"
 TICK = 1 / 64
@@ -24,7 +25,7 @@ starts = st.sampled_from([0.0, 17.25, -3.5, 1.7e9])
 values = st.floats(min_value=-1e6, max_value=1e6)
 stamps = st.tuples(st.integers(-20, 60), values)
 """A time in ticks after the start, and a value."""
-few = settings(deadline=None, max_examples=60)  # each example loads an FMU
+few = settings(deadline=None, max_examples=examples(60))  # each example loads an FMU
 
 
 def inputs_of(

@@ -22,7 +22,7 @@ from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
 from fmu_mesh.run import preparing
 from fmu_mesh.run.run_plan import RunPlan
-from tests.helpers import FMUS
+from tests.helpers import FMUS, examples
 
 H = 0.01
 COPIES = 3
@@ -225,7 +225,7 @@ class Driven:
 
 
 @given(st.data())
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(15), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_copies_equal_systems_whatever_is_done_with_them(pair: Pair, data: st.DataObject) -> None:
     drawn = data.draw(actions(pair.kind))
     with ExitStack() as stack:
@@ -243,7 +243,7 @@ def test_inputs_over_time_go_on_after_any_restore(
     kind: str, way: str, most: int, tmp_path: Path, event_fmu: Callable[..., Path]
 ) -> None:
     @given(over_times(kind), st.data())
-    @settings(max_examples=most, deadline=None)
+    @settings(max_examples=examples(most), deadline=None)
     def equal(over_time: OverTime, data: st.DataObject) -> None:
         mesh = mesh_of(kind, tmp_path, event_fmu, over_time)
         with ExitStack() as stack:

@@ -16,6 +16,7 @@ from lxml import etree
 import fmu_mesh
 from fmu_mesh.api.converting import convert
 from fmu_mesh.api.mesh_check import Check
+from tests.helpers import examples
 from tests.ssp.bad_packages import GOOD
 from tests.ssp.packages import Files, write_package
 from tests.ssp.ship import SHIP
@@ -148,7 +149,7 @@ def test_the_packages_run_as_they_are(name: str, tmp_path: Path) -> None:
     assert fmu_mesh.load(write_package(tmp_path / "good.ssp", PACKAGES[name])).check()
 
 
-@settings(max_examples=50, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(50), suppress_health_check=[HealthCheck.too_slow])
 @given(changed_files())
 def test_changed_package_has_findings_with_file_and_line_or_is_exported_alike(files: Files) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -18,7 +18,7 @@ from fmu_mesh.node.stepping import Runner
 from fmu_mesh.rings import native
 from fmu_mesh.rings.host_memory import Counter, HostMemory
 from fmu_mesh.system.plan import NodePlan, Plan
-from tests.helpers import wait_until
+from tests.helpers import examples, wait_until
 from tests.property.test_random_systems import (
     Drawn,
     Mixer,
@@ -74,7 +74,7 @@ def assert_reference(drawn: Drawn, mesh: EngineMesh, mixers: list[Mixer], plan: 
 
 @pytest.mark.parametrize("make", [pytest.param(burst_engine, marks=needs_library), plain_engine])
 @given(systems())
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_system_gives_the_reference_result_on_one_memory(make: MakeEngine, drawn: Drawn) -> None:
     drawn = replace(drawn, feedthrough=(False,) * len(drawn.steps))
     plan = planned(drawn)
@@ -88,7 +88,7 @@ def test_any_system_gives_the_reference_result_on_one_memory(make: MakeEngine, d
 
 @needs_library
 @given(systems())
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_system_gives_the_reference_result_in_threads(drawn: Drawn) -> None:
     drawn = replace(drawn, feedthrough=(False,) * len(drawn.steps))
     plan = planned(drawn)
@@ -377,7 +377,7 @@ def test_a_step_with_a_forged_row_can_be_taken_later() -> None:
 
 @needs_library
 @given(st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_forged_numbers_never_become_values(data: st.DataObject) -> None:
     """Whatever is written into counters and stamps: the steps that are taken are those of the reference."""
     drawn = chain(3, 60, data.draw(st.integers(1, 8)))

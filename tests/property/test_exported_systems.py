@@ -17,7 +17,7 @@ from fmu_mesh.ssp.system_reading import read_system
 from fmu_mesh.system.plan import Plan
 from fmu_mesh.variables.units import Linear
 from tests.fmus.helpers import find_fmu
-from tests.helpers import FMUS
+from tests.helpers import FMUS, examples
 from tests.ssp.unit_fmus import with_units
 
 H = 0.125
@@ -147,7 +147,7 @@ def fmus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @given(drawn=meshes(), version=st.sampled_from(["1.0", "2.0", None]))
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=examples(150), suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 def test_a_mesh_and_its_package_are_one_system(
     fmus: dict[str, Path], drawn: dict[str, Any], version: Literal["1.0", "2.0"] | None
 ) -> None:

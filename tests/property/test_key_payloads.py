@@ -22,6 +22,7 @@ from fmu_mesh.system.live_keys import KeyInput, KeyOutput
 from fmu_mesh.variables.model_description import Value, Variable, VariableType
 from fmu_mesh.variables.value_conversion import ValueRefused, is_finite, to_plain, to_value
 from fmu_mesh.variables.value_types import INTEGERS, TYPES, nested
+from tests.helpers import examples
 
 ITEMS = (("low", 1), ("high", 9223372036854775807))
 MESSAGES = {
@@ -115,7 +116,7 @@ def assert_comes_back(one: Variable, out: KeyOutput, into: KeyInput, sent: Calla
     reader = KeyReader(into, one, finite=False)
     size = math.prod(one.shape)
 
-    @settings(max_examples=40)
+    @settings(max_examples=examples(40))
     @given(st.lists(elements(one.type), min_size=size, max_size=size))
     def comes_back(flat: list[Any]) -> None:
         value = nested(flat, one.shape)

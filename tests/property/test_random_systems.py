@@ -38,6 +38,7 @@ from fmu_mesh.system.plan import Plan, make_plan
 from fmu_mesh.system.records import RecordPlan
 from fmu_mesh.system.system import ResolvedSystem, SystemInstance
 from fmu_mesh.variables.model_description import Causality, ModelDescription, Value, Variable, VariableType
+from tests.helpers import examples
 from tests.plain_run import PlainRun
 from tests.scenarios.simulated import SimulatedMesh
 
@@ -411,13 +412,13 @@ def bits(rows: list[list[Row]]) -> list[list[tuple[str, int]]]:
 
 
 @given(systems())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(150), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_system_gives_the_reference_result_on_nodes(drawn: Drawn) -> None:
     assert_reference_on_nodes(drawn)
 
 
 @given(looped())
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(60), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_system_with_a_loop_at_start_gives_reference_result_on_nodes(drawn: Drawn) -> None:
     assert_reference_on_nodes(drawn)
 
@@ -448,7 +449,7 @@ def assert_reference_on_nodes(drawn: Drawn) -> None:
 
 
 @given(systems())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_any_system_gives_the_reference_result_in_one_process(drawn: Drawn) -> None:
     drawn = msgspec.structs.replace(drawn, recorded=False)
     plan = planned(drawn)
@@ -497,7 +498,7 @@ LIBRARIES = pytest.mark.parametrize(
 
 @LIBRARIES
 @given(st.one_of(systems(), looped()))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_system_gives_the_reference_result_in_each_of_many_runs(library: bool, drawn: Drawn) -> None:  # noqa: FBT001 a parameter of tests
     plan = planned(drawn)
     run_plan = RunPlan(LoadedConfig(plan.system.config, Path()), plan, {})
@@ -561,7 +562,7 @@ def ending_systems(draw: st.DrawFn) -> tuple[Drawn, list[tuple[int, bool] | None
 @pytest.mark.parametrize("slow", [False, True])
 @LIBRARIES
 @given(ending_systems())
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_many_runs_end_where_a_run_point_by_point_ends(
     library: bool,  # noqa: FBT001 a parameter of tests
     slow: bool,  # noqa: FBT001 as above

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fmu_mesh.api.open_system import System
 from fmu_mesh.api.system_state import SystemState
-from tests.helpers import FMUS
+from tests.helpers import FMUS, examples
 from tests.planning import plan_run
 
 H = 0.01
@@ -102,7 +102,7 @@ def row(system: System) -> Row:
 
 
 @given(actions)
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(200), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_system_that_went_back_equals_one_that_did_not(  # noqa: C901  one case for each action
     systems: tuple[System, System], drawn: list[tuple[str, Any]]
 ) -> None:

@@ -20,7 +20,7 @@ from fmu_mesh.rings import native
 from fmu_mesh.simtime import ENDLESS, TimeGrid
 from fmu_mesh.system.schedule import Course
 from tests.equivalence.reference import Pipe, Reference, Unit, run_fmpy
-from tests.helpers import FMUS
+from tests.helpers import FMUS, examples
 
 LAST = 24
 FMU_OF = {"gain": "Gain", "integral": "Integrator", "slow": "Gain"}
@@ -170,7 +170,7 @@ def little_ahead() -> Iterator[None]:
 
 
 @given(drawn_scenarios())
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_every_way_of_running_gives_the_floats_of_a_loop_over_fmpy(drawn: Drawn) -> None:
     mesh = mesh_of(drawn)
     event("linear" if any(linear for *_, linear in drawn.values.values()) else "held")
@@ -193,7 +193,7 @@ def test_every_way_of_running_gives_the_floats_of_a_loop_over_fmpy(drawn: Drawn)
 
 
 @given(drawn_scenarios(), st.integers(1, 4))
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_system_stepped_by_program_follows_scenario_also_after_it_went_back(drawn: Drawn, before: int) -> None:
     mesh = mesh_of(drawn)
     wanted = mesh.run(record="memory", processes=False)

@@ -18,7 +18,7 @@ from fmu_mesh.rings import native
 from fmu_mesh.run.hosted_system import HostedSystem
 from fmu_mesh.run.preparing import OtherStartValues
 from tests.fmus.helpers import FMUS
-from tests.helpers import PAIR, write_config
+from tests.helpers import PAIR, examples, write_config
 from tests.onnx_models import write_network
 
 ENGINES = pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_random_values_and_lengths_have_the_floats_of_runs_alone(tmp_path: Path)
 
     with mesh.repeated() as runs:
 
-        @settings(max_examples=25, deadline=None)
+        @settings(max_examples=examples(25), deadline=None)
         @given(st.lists(run, min_size=1, max_size=4))
         def check(wanted: list[tuple[float, float, float, str]]) -> None:
             for d, delay, stop_time, name in wanted:

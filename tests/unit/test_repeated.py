@@ -30,7 +30,7 @@ from fmu_mesh.run.repeated import RepeatedRuns
 from fmu_mesh.run.run_plan import RunPlan
 from tests.fmus.helpers import FMUS, NO_COMPILER, find_fmu
 from tests.fmus.packing import repacked
-from tests.helpers import rows_of, wait_until, write_config
+from tests.helpers import examples, rows_of, wait_until, write_config
 from tests.onnx_models import write_network
 from tests.plain_run import PlainRun
 
@@ -628,7 +628,7 @@ def test_the_memory_stays_the_same(tmp_path: Path) -> None:
 
     with repeating(tmp_path) as runs:
         before = 0
-        for number in range(2000):
+        for number in range(300 + examples(1700)):
             repeated(runs, mesh.plan(start_values={"pendulum.d": number * 1e-4}))
             if number == 300:
                 before = process.memory_info().rss
