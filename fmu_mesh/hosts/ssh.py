@@ -435,7 +435,7 @@ class _Host:
                 tried.connect(str(probe))
                 if tried.recv(1):
                     return
-        hint = "`AllowStreamLocalForwarding yes` in its sshd_config allows it."
+        hint = "`AllowStreamLocalForwarding yes` in its sshd_config allows it. Without `ssh`, TLS is the way."
         text = f"the sshd of {self._name} forwards no Unix sockets"
         raise ConfigurationError(f"{text}: {said}" if said else text, hint=hint)
 
