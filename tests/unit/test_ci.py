@@ -37,7 +37,9 @@ def test_a_script_of_ci_ends_with_its_stages_and_pytests_line(code: int, verdict
     ]
 
 
-STAGES = "bridge browser containers cuts examples floods gazebo hosts kills learning live_data ros slurm tsan zenoh_bridge"
+STAGES = (
+    "bridge browser containers cuts examples floods gazebo hosts kills learning live_data ros slurm tsan zenoh_bridge"
+)
 
 
 def test_a_stage_that_there_is_not_is_refused() -> None:
