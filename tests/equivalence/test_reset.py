@@ -246,6 +246,7 @@ def test_many_resets_take_no_more_memory_and_threads(tmp_path: Path, way: Mappin
                 sizes.append([(one.num_threads(), one.num_fds(), one.memory_info().rss >> 20) for one in own])
         run.stop()
     for before, after in zip(*sizes, strict=True):
-        assert after[0] <= before[0], sizes
-        assert after[1] - before[1] < 5, sizes  # one may be open at this moment; a leak would show 39 times
+        # One may be there at this moment, of a thread or of a file; a leak would show 39 times.
+        assert after[0] - before[0] < 5, sizes
+        assert after[1] - before[1] < 5, sizes
         assert after[2] - before[2] < 20, sizes

@@ -185,7 +185,7 @@ def outcome_of(mesh: fmu_mesh.Mesh, file: Path) -> bytes | str | fmu_mesh.Config
     except fmu_mesh.ConfigurationError as error:
         return error
     except fmu_mesh.FmuMeshError as error:
-        return str(error)
+        return str(error).replace(file.name, "result.csv")
     return file.read_bytes()
 
 

@@ -657,7 +657,13 @@ from fmu_mesh.ros.node import entry
 
 entry._END_S = 0.5
 rclpy.try_shutdown = threading.Event().wait
-threading.Timer(1.0, rclpy.shutdown).start()
+spin = rclpy.spin
+
+def spin_for_a_while(*node):
+    threading.Timer(2.0, rclpy.shutdown).start()
+    spin(*node)
+
+rclpy.spin = spin_for_a_while
 sys.exit(entry.main(["--ros-args", "-p", "fmu_path:=" + sys.argv[1], "-p", "autostart:=true"]))
 """
 
