@@ -34,6 +34,7 @@ __all__ = [
     "BY_STREAMS",
     "BY_ZENOH",
     "DEADLINE_S",
+    "FAILING",
     "FMUS",
     "NUMBERS_OF_ZENOH",
     "PAIR",
@@ -95,6 +96,19 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     with socket.socket(type=kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+FAILING = """
+import fmu_mesh
+
+class Failing(fmu_mesh.Component):
+    y = fmu_mesh.Output(start=0.0)
+
+    def step(self, time, step_size):
+        if time > 0.5:
+            raise ValueError("the tank is empty")
+"""
+"""A component whose step at more than 0.5 s fails."""
 
 
 def examples(most: int) -> int:

@@ -72,10 +72,8 @@ def wiring(config: ZenohConfig, config_file: Path, folder: Path, process: str, p
 
 def with_doors(run: RunPlan) -> RunPlan:
     """The plan of a run whose processes here have a door at the network, for hosts that exchange rows directly."""
-    zenoh, direct = (
-        run.loaded.config.zenoh,
-        [host for host in run.plan.hosts.values() if host.rows == "tcp" and host.ssh],
-    )
+    zenoh = run.loaded.config.zenoh
+    direct = [host for host in run.plan.hosts.values() if host.rows == "tcp" and host.ssh]
     if zenoh.rows_address is not None or not direct:
         return run
     from ..wire.meeting import address_towards  # noqa: PLC0415  most launchers meet nobody

@@ -18,24 +18,13 @@ import psutil
 import pytest
 
 from fmu_mesh.wire.security.authority import Authority
-from tests.helpers import DEADLINE_S, FMUS, Place, row_count, wait_until, write_config
+from tests.helpers import DEADLINE_S, FAILING, FMUS, Place, row_count, wait_until, write_config
 
 pytestmark = pytest.mark.skipif(
     "FMU_MESH_CONTAINERS" not in os.environ, reason="it needs images and Podman; `.ci/long containers` has them"
 )
 
 DOCKER = Path(__file__).resolve().parents[2] / "docker"
-
-FAILING = """
-import fmu_mesh
-
-class Failing(fmu_mesh.Component):
-    y = fmu_mesh.Output(start=0.0)
-
-    def step(self, time, step_size):
-        if time > 0.5:
-            raise ValueError("the tank is empty")
-"""
 
 
 class Containers:

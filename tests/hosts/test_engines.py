@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from fmu_mesh.cli.main import main
 from fmu_mesh.hosts.processes import names_for
 from fmu_mesh.wire.security.authority import Authority
-from tests.helpers import DEADLINE_S, Place, free_port, row_count, wait_until, write_config
+from tests.helpers import DEADLINE_S, FAILING, Place, free_port, row_count, wait_until, write_config
 
 SRUN = """\
 #!/bin/sh
@@ -32,17 +32,6 @@ while read -r _ command; do eval "$command" & done <"$file"
 wait
 """
 """Stands for srun on one host: it starts each task of the file of `--multi-prog`."""
-
-FAILING = """
-import fmu_mesh
-
-class Failing(fmu_mesh.Component):
-    y = fmu_mesh.Output(start=0.0)
-
-    def step(self, time, step_size):
-        if time > 0.5:
-            raise ValueError("the tank is empty")
-"""
 
 
 @pytest.fixture
