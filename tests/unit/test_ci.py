@@ -37,6 +37,41 @@ def test_a_script_of_ci_ends_with_its_stages_and_pytests_line(code: int, verdict
     ]
 
 
+UNSTEADY = """
+set -euo pipefail
+. STAGES
+trap 'tell_stages; exit $?' EXIT
+stage "all tests"
+mkdir -p .pytest_cache/v/cache
+echo '{"test_a": true, "test_b": true}' > .pytest_cache/v/cache/lastfailed
+tests sh -c 'echo "== 2 failed in 9 s"; exit 1' || alone sh -c 'echo "== SECOND in 1 s"; exit CODE'
+"""
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_a_test_that_fails_beside_others_only_is_named(tmp_path: Path, code: int) -> None:
+    script = UNSTEADY.replace("CODE", str(code)).replace("STAGES", str(ROOT / ".ci" / "stages"))
+
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert done.returncode == code
+    told = done.stdout.split("== Stages\n")[1].splitlines()
+    assert told[0].startswith("FAILED" if code else "ran ")
+    names = [f"UNSTEADY test_{name}: failed beside others, and passed alone" for name in "ab" if not code]
+    assert told[1:] == [*names, "", "== SECOND in 1 s"]
+    assert "== 2 failed in 9 s\ntest_a\ntest_b\n" in done.stdout
+
+
+def test_many_failed_tests_are_not_tried_again(tmp_path: Path) -> None:
+    many = ", ".join(f'"test_{number}": true' for number in range(6))
+    script = UNSTEADY.replace('"test_a": true, "test_b": true', many).replace("STAGES", str(ROOT / ".ci" / "stages"))
+
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert done.returncode == 1
+    assert "SECOND" not in done.stdout
+
+
 STAGES = (
     "bridge browser containers cuts examples floods gazebo hosts kills learning live_data ros slurm tsan zenoh_bridge"
 )
