@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from ...errors import FmuError, FmuMeshError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
+from ...text import listed
 from ...variables.model_description import Variable
 from ...variables.value_conversion import ValueRefused, to_value
 from ...variables.value_types import DTYPES, INTEGERS, Value, is_float, is_text, nested
@@ -26,6 +28,7 @@ from ..call_guard import lines_shown_of
 from ..contract import LogMessage, Opening
 from .component import Component, declared_variables
 from .importing import ImportedComponent
+from .plain_state import NotPlain, encoded, plain, shared_memory
 from .python_section import PythonConfig, class_place_of
 
 __all__ = ["PythonInstance"]
@@ -177,12 +180,31 @@ class PythonInstance:
         """Nothing to free: a state is Python objects."""
 
     def serialize_state(self, state: object) -> bytes:
-        """Refused with an `FmuError`: a state has Python objects of any kind, which only this process can use."""
-        raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
+        """The state as bytes; only plain values have such (`fmu_mesh.instances.python.plain_state`).
+
+        Raises:
+            FmuError: the state has another value; names its attribute.
+        """
+        assert isinstance(state, _State)
+        component = self._live()
+        hint = "Leave it out of what `get_state` of the component returns, and make it again in `set_state`."
+        both = shared_memory(vars(component)) if type(component).get_state is Component.get_state else None
+        try:
+            refused = f"has two attributes {listed(both)} whose arrays share memory" if both is not None else ""
+            data = msgspec.msgpack.encode((encoded(state.own), encoded(state.values)))
+        except NotPlain as error:
+            refused = str(error)
+        if refused:
+            raise FmuError(f"its state cannot be written: it {refused}", instance=self.name, hint=hint)
+        return data
 
     def deserialize_state(self, data: bytes) -> object:
         """See `serialize_state`."""
-        raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
+        try:
+            own, values = msgspec.msgpack.decode(data, type=tuple[bytes, bytes])
+            return _State(plain(own), plain(values))
+        except ValueError as error:  # `msgspec.DecodeError` is one
+            raise FmuError(f"this is no state of a component: {error}", instance=self.name) from error
 
     def close(self) -> None:
         """Call `close` of the component; what it raises is logged, because the run has ended."""

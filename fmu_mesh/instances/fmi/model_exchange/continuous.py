@@ -19,6 +19,7 @@ from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
 
+from ....errors import FmuError
 from ....rings.native import NativeStep, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
@@ -30,6 +31,7 @@ from ..fmu_instance import Bookkeeping
 from ..fmu_values import Verb
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
+from ..step_options import NO_STATE_OF_CVODE
 from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
 from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
@@ -107,6 +109,12 @@ class ContinuousInstance(NativeInstance):
         self._inputs = inputs
         linear = [inputs.layout.place(item.name).first for item in self._options.linear_inputs]
         self._linear_columns = np.array(linear, dtype=np.intp)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `KeepsState`; refused where the solver has a history."""
+        if self._event_loop().solver.has_history:
+            raise FmuError(f"its state cannot be written: {NO_STATE_OF_CVODE}", instance=self.name)
+        return super().serialize_state(state)
 
     def close(self) -> None:
         """See `Instance`."""

@@ -199,6 +199,11 @@ class AutoSolver(DormandPrinceSolver):
         self._cvode: CVodeSolver | None = None
         self._by_cvode = False  # whether CVode has taken the last step, or takes the next one
 
+    @property
+    def has_history(self) -> bool:
+        """See `Solver.has_history`."""
+        return self.is_stiff
+
     def restart(self) -> None:
         """See `Solver.restart`."""
         self._by_cvode = self.is_stiff

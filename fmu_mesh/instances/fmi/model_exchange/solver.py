@@ -109,6 +109,11 @@ class Solver:
         """What a state keeps besides that of the model."""
         return ()
 
+    @property
+    def has_history(self) -> bool:
+        """Whether the next steps also depend on earlier ones, which `place` does not have."""
+        return False
+
     def resume(self, place: tuple[float, ...]) -> None:
         """Continue where `place` was, after `restart`."""
 
@@ -244,6 +249,11 @@ class CVodeSolver(Solver):
         self._linear = api.SUNLinSol_Dense(self._x, self._matrix, self._context)
         self._memory = ctypes.c_void_p(api.CVodeCreate(_CV_BDF, self._context))
         self._maximum = maximum_step_size
+
+    @property
+    def has_history(self) -> bool:
+        """See `Solver.has_history`."""
+        return True
 
     def restart(self) -> None:
         """See `Solver.restart`."""
