@@ -12,7 +12,7 @@ from typing import NamedTuple
 import msgspec
 
 from ..config.instance_sections import placed
-from ..text import listed, shown
+from ..text import counted, listed, shown
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .plan import Plan
@@ -21,7 +21,13 @@ from .system import ResolvedSystem
 
 __all__ = ["AgreedInstance", "Differences", "agreed_of", "differences", "stateless"]
 
-_HASHES = ("variables", "options", "connections", "scenario", "timeouts")
+_HASHES = {
+    "variables": "variables",
+    "options": "options",
+    "connections": "connections",
+    "scenario": "values over time",
+    "timeouts": "timeouts",
+}
 
 
 class AgreedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,12 +111,17 @@ def differences(saved: Mapping[str, AgreedInstance], plan: Plan, contents: Mappi
         if (before := saved.get(name)) is None:
             found.refused.append((name, "the state has no such instance"))
             continue
-        told = [("kind", before.kind, there.kind), ("step", f"{before.step} points", f"{there.step} points")]
+        told = [
+            ("kind", before.kind, there.kind),
+            ("step", counted(before.step, "point"), counted(there.step, "point")),
+        ]
         wrong = [f"its {what} was {was} and is {now}" for what, was, now in told if was != now]
         if before.model != there.model:
             wrong.append("its model is another one: the SHA-256 of its files, or its GUID, differs")
         else:
-            wrong += [f"its {what} differ" for what in _HASHES if getattr(before, what) != getattr(there, what)]
+            wrong += [
+                f"its {said} differ" for what, said in _HASHES.items() if getattr(before, what) != getattr(there, what)
+            ]
             wrong += _start_values(plan, name, before, found.set_again)
         found.refused.extend((name, why) for why in wrong)
     return found

@@ -63,9 +63,9 @@ def encoded(value: object) -> bytes:  # noqa: C901  one case for each type
         if kind is np.random.Generator and type(source := own.bit_generator).__name__ in _GENERATORS:
             seed = getattr(source.seed_seq, "state", None)  # `spawn` goes on from it
             return ["g", type(source).__name__, tree(seed, place), tree(source.state, place)]
-        raise NotPlain(
-            f"has {place or 'a state'} of the type {kind.__module__}.{kind.__qualname__}; expected {_EXPECTED}"
-        )
+        type_ = kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
+        of = f" of {own.dtype}" if isinstance(own, np.ndarray) else ""
+        raise NotPlain(f"has a {type_}{of} in {place or 'the place of all attributes'}; expected {_EXPECTED}")
 
     try:
         return msgspec.msgpack.encode(tree(value, ""))
@@ -155,4 +155,4 @@ def _dtype(text: object) -> np.dtype[Any]:
 
 def _inside(place: str, key: object) -> str:
     """The place of a value in a dict; that of the attribute itself in the outer one."""
-    return f"{place}[{key!r}]" if place else f"an attribute '{key}'"
+    return f"{place}[{key!r}]" if place else f"attribute '{key}'"

@@ -189,11 +189,13 @@ class PythonInstance:
         component = self._live()
         hint = "Leave it out of what `get_state` of the component returns, and make it again in `set_state`."
         both = shared_memory(vars(component)) if type(component).get_state is Component.get_state else None
+        refused, data = "", b""
         try:
-            refused = f"has two attributes {listed(both)} whose arrays share memory" if both is not None else ""
             data = msgspec.msgpack.encode((encoded(state.own), encoded(state.values)))
         except NotPlain as error:
             refused = str(error)
+        if both is not None:
+            refused = f"has arrays in {listed(both)} that share memory"
         if refused:
             raise FmuError(f"its state cannot be written: it {refused}", instance=self.name, hint=hint)
         return data

@@ -25,9 +25,10 @@ from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ...contract import LogMessage
+from ...instance_wrapper import of_kind
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
-from ..fmu_instance import Bookkeeping
+from ..fmu_instance import Bookkeeping, FmuState
 from ..fmu_values import Verb
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
@@ -112,7 +113,7 @@ class ContinuousInstance(NativeInstance):
 
     def serialize_state(self, state: object) -> bytes:
         """See `KeepsState`; refused where the solver has a history."""
-        if self._event_loop().solver.has_history:
+        if self._event_loop().solver.has_history(of_kind(FmuState, state).kept.solver):
             raise FmuError(f"its state cannot be written: {NO_STATE_OF_CVODE}", instance=self.name)
         return super().serialize_state(state)
 

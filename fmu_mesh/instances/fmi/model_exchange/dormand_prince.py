@@ -199,10 +199,9 @@ class AutoSolver(DormandPrinceSolver):
         self._cvode: CVodeSolver | None = None
         self._by_cvode = False  # whether CVode has taken the last step, or takes the next one
 
-    @property
-    def has_history(self) -> bool:
+    def has_history(self, place: tuple[float, ...]) -> bool:
         """See `Solver.has_history`."""
-        return self.is_stiff
+        return bool(place) and place[3] >= _IS_STIFF
 
     def restart(self) -> None:
         """See `Solver.restart`."""

@@ -109,9 +109,8 @@ class Solver:
         """What a state keeps besides that of the model."""
         return ()
 
-    @property
-    def has_history(self) -> bool:
-        """Whether the next steps also depend on earlier ones, which `place` does not have."""
+    def has_history(self, place: tuple[float, ...]) -> bool:
+        """Whether the steps from a `place` on also depend on those before it."""
         return False
 
     def resume(self, place: tuple[float, ...]) -> None:
@@ -250,8 +249,7 @@ class CVodeSolver(Solver):
         self._memory = ctypes.c_void_p(api.CVodeCreate(_CV_BDF, self._context))
         self._maximum = maximum_step_size
 
-    @property
-    def has_history(self) -> bool:
+    def has_history(self, place: tuple[float, ...]) -> bool:
         """See `Solver.has_history`."""
         return True
 
