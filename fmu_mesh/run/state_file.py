@@ -18,8 +18,7 @@ import msgspec
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
-from ..simtime import ENDLESS
-from ..system.states import AgreedInstance, agreed_of, differences
+from ..system.states import SavedInstance, differences, saved_instances
 from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
@@ -31,43 +30,24 @@ _VERSION = 1
 _START = struct.Struct("<8sIQ32s")  # letters, version, length of the head, its SHA-256
 
 
-class _Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True, array_like=True):
-    """The state of one instance in the file: its size in bytes, and its SHA-256."""
-
-    instance: str
-    size: int
-    sha256: bytes
-
-
 class _Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The head; ``time``, ``start_time`` and ``step_size`` in s."""
+    """The head: times in s; of each block, in their order, its instance, and its size in bytes and its SHA-256."""
 
     fmu_mesh: str
     mesh: str
     point: int
-    time: float
     start_time: float
     step_size: float
-    instances: dict[str, AgreedInstance]
-    blocks: tuple[_Block, ...]
+    instances: dict[str, SavedInstance]
+    blocks: dict[str, tuple[int, bytes]]
 
 
 class StateFile(NamedTuple):
-    """A state that was read from a file.
-
-    Attributes:
-        point: its communication point.
-        states: the state of each instance, as `fmu_mesh.run.local_member.LocalMember.packed` makes it.
-    """
+    """A state that was read from a file; ``states`` has that of each instance, as `LocalMember.packed` makes it."""
 
     file: Path
     head: _Head
     states: Mapping[str, bytes]
-
-    @property
-    def point(self) -> int:
-        """Its communication point."""
-        return self.head.point
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -100,11 +80,10 @@ class StateFile(NamedTuple):
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise damaged from error
         states = {}
-        for block in known.blocks:
-            content, rest = rest[: block.size], rest[block.size :]
-            if hashlib.sha256(content).digest() != block.sha256:
+        for name, (size, expected) in known.blocks.items():
+            states[name], rest = bytes(rest[:size]), rest[size:]
+            if hashlib.sha256(states[name]).digest() != expected:
                 raise damaged
-            states[block.instance] = bytes(content)
         if rest or states.keys() != known.instances.keys():
             raise damaged
         return cls(file, known, states)
@@ -120,8 +99,8 @@ class StateFile(NamedTuple):
             if (was := getattr(head, what)) != (now := getattr(grid, what)):
                 text = f"was {short_number(was)} s where the state was written, and is {short_number(now)} s"
                 findings.append(Finding(str(self.file), f"simulation.{what}", text, ""))
-        if grid.last_point < min(head.point, ENDLESS):
-            text = f"{short_number(grid.stop_time or 0.0)} s, and the state is of {short_number(head.time)} s"
+        if (stop := grid.stop_time) is not None and grid.last_point < head.point:
+            text = f"{short_number(stop)} s, and the state is of {short_number(grid.time(head.point))} s"
             findings.append(Finding(str(self.file), "simulation.stop_time", text, "a later time"))
         refused, values = differences(head.instances, run.plan, run.contents)
         findings += [Finding(str(self.file), f"instances.{name}", why, "") for name, why in refused]
@@ -132,17 +111,21 @@ class StateFile(NamedTuple):
         return values
 
 
-def write_state(file: Path, run: RunPlan, point: int, states: Mapping[str, bytes]) -> None:
+def write_state(
+    file: Path, run: RunPlan, others: Mapping[str, Mapping[str, PlainValue]], point: int, states: Mapping[str, bytes]
+) -> None:
     """Write a state of a run at a point into a file, in the place of an older one; see `StateFile`.
+
+    ``others`` are the start values that are not as in the plan, by instance and variable.
 
     Raises:
         ConfigurationError: the file cannot be written; an older one is as it was.
     """
     grid = run.plan.grid
-    blocks = tuple(_Block(name, len(own), hashlib.sha256(own).digest()) for name, own in states.items())
-    instances = agreed_of(run.plan, run.contents)
-    times = grid.time(point), grid.start_time, grid.step_size
-    head = msgspec.msgpack.encode(_Head(__version__, run.mesh, point, *times, instances, blocks))
+    blocks = {name: (len(own), hashlib.sha256(own).digest()) for name, own in states.items()}
+    instances = saved_instances(run.plan, run.contents, others)
+    own = _Head(__version__, run.mesh, point, grid.start_time, grid.step_size, instances, blocks)
+    head = msgspec.msgpack.encode(own)
     try:
         with files.replaced(file) as draft, draft.open("wb") as target:
             target.write(_START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest()))
