@@ -328,7 +328,8 @@ class System:
         Raises:
             CallRefused: an FMU cannot get and set its state, or write it; or see `close`.
             ConfigurationError: the file cannot be written.
-            FmuError: an FMU failed. Only `reset` and `close` are allowed now.
+            FmuError: an FMU failed: only `reset` and `close` are allowed now. Or an instance cannot write its state, as a
+                component with an attribute that is no plain value: nothing has changed.
         """
         self._demand("save")
         if file is not None and not isinstance(file, str | Path):
