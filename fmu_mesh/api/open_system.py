@@ -328,8 +328,8 @@ class System:
         Raises:
             CallRefused: an FMU cannot get and set its state, or write it; or see `close`.
             ConfigurationError: the file cannot be written.
-            FmuError: an FMU failed: only `reset` and `close` are allowed now. Or its state cannot be written, as that of a
-                component with an attribute that is no plain value: nothing has changed.
+            FmuError: an FMU failed: only `reset` and `close` are allowed now. Or the state of an instance cannot be
+                written, as that of a component with an attribute that is no plain value: nothing has changed.
         """
         self._demand("save")
         if file is not None and not isinstance(file, str | Path):
