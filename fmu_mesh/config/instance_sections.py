@@ -258,6 +258,10 @@ class InstanceSection:
         """In a few words what computes the model, for the page of `fmu-mesh check`."""
         return description.generation_tool or key_of(self)
 
+    def stateless(self, description: ModelDescription) -> str | None:
+        """Why the state of an instance cannot outlive its process, as the end of a sentence; None if it can."""
+        return None if description.can_serialize_state else f"`{key_of(self)}` has none that can be written"
+
 
 def key_of(section: InstanceSection | type[InstanceSection]) -> str:
     """The key that says of which kind a section is: `fmu`, `mujoco`, ..."""
