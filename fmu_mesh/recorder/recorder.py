@@ -8,7 +8,8 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 # other processes, often on the same host. They meet in two places: counters in shared memory, which the nodes raise and
 # this thread reads (and the other way round for the progress), and the inbox, into which Zenoh's threads put frames and
 # messages, and the main thread the end of the run (`__exit__`). Only this thread touches the sources and the files
-# until it has ended; then the main thread writes what is left and closes them.
+# until it has ended; then a second one writes what is left and closes them. The main thread reads in which file a
+# write is under way, and for how long (`check_writing`).
 #
 # What may go wrong:
 # * A node could overwrite rows that are not written yet. The windows forbid it, and the stamps of all rows are compared
@@ -17,6 +18,8 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 #   says that all nodes have begun (ADR 50): the last result stays.
 # * A run that ends early still has rows on their way. This thread waits half a second for the nodes to say that they
 #   have sent their last ones, and not for those that are lost.
+# * A disk may not take what is written (a network disk whose server is gone). A write cannot be cancelled, and not even
+#   SIGKILL ends it. So the main thread ends the run after `timeouts.write`, and this thread is left behind (ADR 89).
 # * The reason of such an end comes from the master of this process and not by a message: on the other thread a message
 #   may arrive after the end.
 #
