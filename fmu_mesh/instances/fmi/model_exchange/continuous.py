@@ -224,7 +224,7 @@ class ContinuousInstance(NativeInstance):
     def _tell_doubt(self) -> None:
         """Tell once that another solver would be better."""
         if (doubt := self._event_loop().solver.doubt()) is not None:
-            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, is_stiff=True))
+            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, noted="stiff"))
 
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.
