@@ -59,7 +59,17 @@ from ..wire.ways import Ways
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "RaiseSent", "SendToAll"]
+__all__ = [
+    "Action",
+    "AnswerAll",
+    "Commanded",
+    "EndAll",
+    "FollowClock",
+    "MasterStates",
+    "RaiseGrant",
+    "RaiseSent",
+    "SendToAll",
+]
 
 
 class AnswerAll(msgspec.Struct, frozen=True):
@@ -103,6 +113,14 @@ class EndAll(msgspec.Struct, frozen=True):
 Action = AnswerAll | FollowClock | RaiseGrant | RaiseSent | SendToAll | EndAll
 
 
+class Commanded(msgspec.Struct, frozen=True):
+    """What a command has changed, for the journal: where the mesh pauses, or the point at which it is stopped."""
+
+    command: str
+    hold: int | None
+    stopped_at: int | None = None
+
+
 class MasterStates:
     """The state of one run, as its master sees it.
 
@@ -114,12 +132,16 @@ class MasterStates:
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
         warnings: nodes that failed or were lost after their last step.
+        replays_to: after a restart, the last point that was seen before: the wall clock does not limit the grant up to
+            it.
 
     Call sequence: any events, then `decide` and do what it says until it says nothing; then wait for events, for at
     most as long as a heartbeat.
     """
 
-    def __init__(self, plan: Plan, *, paused: bool = False) -> None:
+    def __init__(
+        self, plan: Plan, *, paused: bool = False, replays_to: int = 0, commanded: Commanded | None = None
+    ) -> None:
         self.plan = plan
         self.state: MeshState = "starting"
         self.deadlines = Deadlines.of(
@@ -128,6 +150,11 @@ class MasterStates:
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
         self.hold = 0 if paused else None
+        self._stop_again: int | None = None
+        if commanded is not None:
+            self.hold, self._stop_again = commanded.hold, commanded.stopped_at
+        self.replays_to = replays_to
+        self._is_paced = plan.system.config.simulation.real_time_factor > 0.0
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -162,7 +189,14 @@ class MasterStates:
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
         last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
+        if self._is_paced and self.is_replaying:
+            last_point = min(last_point, self.replays_to)
         return last_point if hold is None else min(hold, last_point)
+
+    @property
+    def is_replaying(self) -> bool:
+        """Whether the run has not yet come to where it was before a restart."""
+        return self.replays_to > 0 and self.granting.slowest < self.replays_to
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
@@ -249,7 +283,7 @@ class MasterStates:
                 text = f"reset by a command at point {slowest}"
                 self.fail(RunReset(text, point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
-            self._actions.append(FollowClock(granting.reached, command.paced))
+            self._actions.append(FollowClock(granting.reached, command.paced and not self.is_replaying))
         self._moved_at = self._slowest_moved_at = None
         if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
             self._sent_at = -math.inf
@@ -329,7 +363,9 @@ class MasterStates:
     def _wait_for_initialization(self, now: float) -> None:
         if self.granting.slowest >= 0:
             self._enter("running" if self.hold is None else "paused", now)
-            self._actions.append(FollowClock(0))
+            self._actions.append(FollowClock(0, paced=not self.is_replaying))
+            if self._stop_again is not None and self.plan.grid.stop_time is None:
+                self._stop(self._stop_again)
             self._moved_at = self._slowest_moved_at = now
             return
         missing = [node for node, point in self.granting.progress.items() if point < 0]
@@ -338,6 +374,12 @@ class MasterStates:
 
     def _go_on(self, now: float, paced: int, stopped: Sequence[str]) -> None:
         granting = self.granting
+        if self.replays_to and not self.is_replaying:
+            self.replays_to = 0
+            self._actions.append(FollowClock(granting.reached))
+        if self._stop_again is not None and self.plan.grid.stop_time is not None and not self.is_replaying:
+            self._stop(self._stop_again)
+            return
         if granting.slowest >= granting.last_point:
             if isinstance(self.ended_by, NotFinite):
                 self.fail(self.ended_by)

@@ -25,7 +25,7 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine, MeshHello, MeshStatus
 
-__all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
+__all__ = ["STATUS_S", "Attempt", "Events", "MasterServer", "MasterSettings"]
 
 STATUS_S = 0.1
 """Time in s between two publications of the status."""
@@ -48,6 +48,25 @@ class Events(Protocol):
         ...
 
 
+class Attempt(msgspec.Struct, frozen=True):
+    """Which attempt of a run this is.
+
+    Attributes:
+        number: 1 for the first one.
+        most: how many there may be; 1: the run never starts again.
+        replays_to: the last point that was seen in those before.
+        journal: the file with the commands to the mesh; empty: there is none.
+    """
+
+    number: int = 1
+    most: int = 1
+    replays_to: int = 0
+    journal: str = ""
+
+    def __str__(self) -> str:
+        return f"attempt {self.number} of {self.most}, from point {self.replays_to}" if self.number > 1 else ""
+
+
 class MasterSettings(msgspec.Struct, frozen=True):
     """How a master runs its mesh, besides the plan.
 
@@ -58,6 +77,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
         table: number of the table of roles; 0: it has none of our authority.
+        attempt: which attempt of the run this is.
     """
 
     endpoints: tuple[str, ...] = ()
@@ -66,6 +86,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     profile: bool = False
     paused: bool = False
     table: int = 0
+    attempt: Attempt = Attempt()
 
 
 class MasterServer:

@@ -24,7 +24,7 @@ from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
 from ..master.master import Master
-from ..master.mesh_server import MasterSettings
+from ..master.mesh_server import Attempt, MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
 from ..results.growth import GrowthWatch
@@ -207,7 +207,11 @@ class _NodeProcess:
         plan, showing = self._first.plan, self._first.showing
         if showing.video is not None:
             showing = replace(showing, video=numbered(showing.video, start.resets))
-        self._run = replace(self._first, showing=showing, plan=replace(plan, digest=start.digest, instances=instances))
+        self._run = replace(
+            self._first,
+            showing=showing,
+            plan=replace(plan, digest=start.digest, instances=instances, replays_to=0, journal=""),
+        )
 
     def _open(self, name: str) -> Guarded:
         opening = _opening(self._run, name, self._process.folder, self._log)
@@ -283,6 +287,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 launch=process.launch,
                 profile=run.profile,
                 paused=run.paused,
+                attempt=Attempt(run.restarts + 1, run.max_restarts + 1, run.replays_to, run.journal_of(MASTER)),
                 table=table_of(own),
             )
             router = RouterLink(session, config.zenoh.connect)
@@ -413,7 +418,7 @@ class _MasterRuns:
 
 
 def _opened_results(run: RunPlan) -> Sequence[ResultFile]:
-    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents)
+    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents, rows=run.rows)
 
 
 def _outcome_of(

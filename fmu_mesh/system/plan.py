@@ -167,6 +167,8 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shared_memory: bool = True
     row_streams: bool = True
     restarts: int = 0
+    replays_to: int = 0
+    journal: str = ""
     secured: bool = False
     process: ProcessConfig = ProcessConfig()
     host: str | None = None
