@@ -383,6 +383,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
         InitializationFailed,
         LoopNotConverged,
         StepFailed,
+        NotDeterministic,
         NotFinite,
         MeshLost,
         DeadlineExceeded,

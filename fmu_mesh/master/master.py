@@ -545,7 +545,7 @@ class Master:
         goes_on = type(failure) is MeshLost and attempt.number < attempt.most and not self._resets
         is_again = attempt.number > 1 and not self._resets and (states.state == "starting" or states.is_replaying)
         state: MeshState = states.state
-        if goes_on or (is_again and state == "running"):
+        if goes_on or (is_again and states.takes_commands):
             state = "restarting"
         return MeshStatus(
             mesh=self._keys.mesh,

@@ -244,7 +244,7 @@ def _channels(content: McapContent) -> list[_ChannelReader]:
                 case Schema():
                     types.define(record.name, record.data.decode())
                     schemas[record.id] = record.name
-                case Channel() if record.topic in topics:
+                case Channel() if record.topic in topics and record.id not in channels:  # who resumes writes it again
                     channels[record.id] = _ChannelReader(topics[record.topic], types, schemas[record.schema_id])
     return list(channels.values())
 
