@@ -18,6 +18,7 @@ from zenoh.handlers import Callback
 
 from ..config.access_sections import Role
 from ..errors import MessageRefused
+from ..system.attempt import Attempt
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
@@ -25,7 +26,7 @@ from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
 from ..wire.views import LogLine, MeshHello, MeshStatus
 
-__all__ = ["STATUS_S", "Attempt", "Events", "MasterServer", "MasterSettings"]
+__all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
 
 STATUS_S = 0.1
 """Time in s between two publications of the status."""
@@ -46,25 +47,6 @@ class Events(Protocol):
     def log(self, line: LogLine) -> None:
         """A log message of an FMU, or about a setting that was refused."""
         ...
-
-
-class Attempt(msgspec.Struct, frozen=True):
-    """Which attempt of a run this is.
-
-    Attributes:
-        number: 1 for the first one.
-        most: how many there may be; 1: the run never starts again.
-        replays_to: the last point that was seen in those before.
-        journal: the file with the commands to the mesh; empty: there is none.
-    """
-
-    number: int = 1
-    most: int = 1
-    replays_to: int = 0
-    journal: str = ""
-
-    def __str__(self) -> str:
-        return f"attempt {self.number} of {self.most}, from point {self.replays_to}" if self.number > 1 else ""
 
 
 class MasterSettings(msgspec.Struct, frozen=True):

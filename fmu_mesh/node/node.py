@@ -42,7 +42,7 @@ from ..system.live_keys import KeyValue
 from ..system.plan import MASTER, RECORDER, Link, NodePlan
 from ..wire.frames import FrameReceiver, SourceRows, of_text
 from ..wire.inbox import Inbox, Message
-from ..wire.journal import Journal
+from ..wire.journal import NodeJournal
 from ..wire.meeting import Meeting
 from ..wire.membership import Membership, Welcome
 from ..wire.messages import (
@@ -166,8 +166,7 @@ class Node:
         self._streams: RowStreams | None = None
         self._keeper: StreamKeeper | None = None
         self._profiler: Profiler | None = None
-        self._journal: Journal[SetValue | list[KeyValue]] = Journal(plan.journal, SetValue | list[KeyValue])
-        self._given: list[SetValue | list[KeyValue]] = []
+        self._journal = NodeJournal(plan.attempt.journal)
         self._activity = Activity(plan, self._inbox.refusals)
         self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self.tell_recorder)
 
@@ -224,8 +223,7 @@ class Node:
 
     def tell_recorder(self, news: SetValue | AuditEntry | Stiff | Sequence[KeyValue]) -> None:
         """What the metadata of results and the audit get, such as a value that another program has set."""
-        if not isinstance(news, AuditEntry | Stiff):
-            self._journal.add(news if isinstance(news, SetValue) else [*news])
+        self._journal.keep(news)
         self._put_set(encode_news(news))
 
     def report_hang(self, error: FmuError) -> bool:
@@ -250,10 +248,10 @@ class Node:
         plan = self._plan
         self._activity.enter("loading")
         instances = {}
-        given = self._given_before()
+        given = self._journal.given()
         for item in plan.instances:
-            instance = self._open_instance(item.name)
-            instances[item.name] = with_times(instance, item, plan.grid, self._warn, given.get(item.name, ()))
+            own, instance = given.get(item.name, ()), self._open_instance(item.name)
+            instances[item.name] = with_times(instance, item, plan.grid, self._warn, own)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.memory or self._own_memory
@@ -262,18 +260,6 @@ class Node:
                 ring, counter = self._memory.ring(place), self._memory.counter(place.counter)
                 item = plan.instance(place.instance)
                 self._runners[place.instance] = Runner(item, instances[place.instance], plan.grid, ring, counter)
-
-    def _given_before(self) -> dict[str, list[KeyValue]]:
-        """What each instance was given before a restart, in its order."""
-        given: dict[str, list[KeyValue]] = {}
-        self._given = [*self._journal.entries()]
-        for entry in self._given:
-            own = entry
-            if isinstance(own, SetValue):
-                own = [(f"{own.instance}.{own.variable}", own.point, own.time, own.value)]
-            for value in own:
-                given.setdefault(value[0].partition(".")[0], []).append(value)
-        return given
 
     def _warn(self, message: LogMessage) -> None:
         point = message.step * self._plan.instance(message.instance).step_points
@@ -333,7 +319,7 @@ class Node:
         for runner in self._runners.values():
             runner.begin()
             runner.flush()
-        for news in self._given:  # it belongs to the metadata of this attempt, too
+        for news in self._journal.entries():  # it belongs to the metadata of this attempt, too
             self._put_set(encode_news(news))
         self.server.started()
         self._memory.progress[plan.node].raise_to(engine.covered + 1)
@@ -400,9 +386,7 @@ class Node:
             try:
                 has_more = self._inbox.is_direct or self._inbox.has_posted
                 wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
-                stepped = engine.run(
-                    wait_s, eager=eager, quiet=quiet and self.server.is_live and not self.server.is_followed
-                )
+                stepped = engine.run(wait_s, eager=eager, quiet=quiet and self.server.is_unfollowed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)

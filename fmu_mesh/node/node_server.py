@@ -135,16 +135,17 @@ class NodeServer:
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
     @property
-    def is_followed(self) -> bool:
-        """Whether somebody would get the next row at once: some streams have subscribers, or rows go to keys."""
-        return self.is_live and (
-            self.keys.publishes or any(own.is_active and self._waiting_rows <= own.backlog for own in self._streams)
+    def is_unfollowed(self) -> bool:
+        """Whether nobody would get the next row at once: no streams have subscribers, and no rows go to keys."""
+        follow = self.keys.publishes or any(
+            own.is_active and self._waiting_rows <= own.backlog for own in self._streams
         )
+        return self.is_live and not follow
 
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers, and to keys."""
         if not self.is_live:
-            if any(own.runner.point < self._plan.replays_to for own in self._streams):
+            if any(own.runner.point < self._plan.attempt.replays_to for own in self._streams):
                 return
             self._go_live()
         self.keys.publish_now()

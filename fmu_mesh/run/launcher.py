@@ -27,7 +27,6 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Protocol
 
 import msgspec
@@ -174,12 +173,12 @@ class Launcher:
 
     def _clear_for_next(self) -> None:
         """Remove what the processes of this attempt have left, but for their journals and the note about the mesh."""
-        for entry in [*self._folder.iterdir()]:
-            if entry.is_dir():
-                for own in [*entry.iterdir()]:
-                    _remove_unless(own, JOURNAL)
-            else:
-                _remove_unless(entry, JOURNAL, ".json")
+        journals = [*self._folder.glob(f"**/*{JOURNAL}")]
+        kept = {*journals, *(file.parent for file in journals), self._folder / "mesh.json"}
+        boxes = [entry for entry in kept if entry.is_dir()]
+        for entry in [entry for folder in {self._folder, *boxes} for entry in folder.iterdir()]:
+            if entry not in kept:
+                remove_tree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
 
     def _next(self, files: Sequence[tuple[str, int]]) -> RunPlan | None:
         """The plan of the next attempt; None if there is none."""
@@ -360,8 +359,3 @@ class Launcher:
         seconds, warnings = (outcome.seconds, outcome.warnings) if outcome is not None else (0.0, ())
         self.outcome = outcome_at(plan, error.point or 0, files, error, seconds=seconds, warnings=warnings)
         raise error.with_hint(what_is_kept(files))
-
-
-def _remove_unless(entry: Path, *endings: str) -> None:
-    if entry.suffix not in endings:
-        remove_tree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)

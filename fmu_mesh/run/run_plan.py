@@ -21,6 +21,7 @@ from ..errors import ConfigurationError, UnknownName
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
 from ..simtime import ENDLESS
+from ..system.attempt import Attempt
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
 from ..system.start_values import why_not_settable
@@ -192,12 +193,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             run=self.run,
             zenoh=self.zenoh(),
             showing=self.showing,
-            plan=replace(
-                plan.nodes[name],
-                restarts=self.restarts,
-                replays_to=self.replays_to,
-                journal=self.journal_of(name),
-            ),
+            plan=replace(plan.nodes[name], attempt=self.attempt_of(name)),
             models={
                 item.name: PlannedModel(plan.system.instances[item.name].description, self.contents[item.name])
                 for item in plan.nodes[name].instances
@@ -205,13 +201,14 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             security=self.loaded.config.security,
         )
 
-    def journal_of(self, participant: str) -> str:
-        """The file with what a node or the master was given from outside; empty if the run never starts again."""
-        if not self.max_restarts:
-            return ""
-        folder = run_folder(self.mesh, self.run)
-        box = box_of(folder, participant)
-        return str((box if box.is_dir() else folder) / f"{box.name}{JOURNAL}")
+    def attempt_of(self, participant: str) -> Attempt:
+        """Which attempt this is, for a node or the master."""
+        number, most, journal = self.restarts + 1, self.max_restarts + 1, ""
+        if self.max_restarts:
+            folder = run_folder(self.mesh, self.run)
+            box = box_of(folder, participant)
+            journal = str((box if box.is_dir() else folder) / f"{box.name}{JOURNAL}")
+        return Attempt(number, most, self.replays_to, journal)
 
     def variable(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
         """The instance and the variable ``instance.variable``; with ``elements``, it may be an element of the variable.

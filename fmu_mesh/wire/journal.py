@@ -6,15 +6,17 @@ One line of JSON for each entry, in the folder of the run. Who reads it leaves o
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
 from ..errors import ConfigurationError
+from ..system.live_keys import KeyValue
+from .messages import SetValue
 
-__all__ = ["JOURNAL", "Journal"]
+__all__ = ["JOURNAL", "Journal", "NodeJournal"]
 
 JOURNAL: Final = ".journal"
 """How the names of these files end."""
@@ -63,7 +65,7 @@ class Journal(Generic[Entry]):
                 whole = os.pread(self._descriptor, os.fstat(self._descriptor).st_size, 0).rfind(b"\n") + 1
                 os.ftruncate(self._descriptor, whole)
                 os.lseek(self._descriptor, whole, os.SEEK_SET)
-            left = memoryview(b"".join(_lines(entries)))
+            left = memoryview(b"".join(msgspec.json.encode(entry) + b"\n" for entry in entries))
             while left:
                 left = left[os.write(self._descriptor, left) :]
         except OSError as error:
@@ -77,5 +79,24 @@ class Journal(Generic[Entry]):
             self._descriptor = None
 
 
-def _lines(entries: Iterable[object]) -> Iterator[bytes]:
-    return (msgspec.json.encode(entry) + b"\n" for entry in entries)
+class NodeJournal(Journal[SetValue | list[KeyValue]]):
+    """What the instances of a node got from outside; ``path`` as for `Journal`."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__(path, SetValue | list[KeyValue])
+
+    def keep(self, news: object) -> None:
+        """Append what a node tells the recorder, if an instance got a value; the errors are those of `add`."""
+        if isinstance(news, SetValue | list):
+            self.add(news)
+
+    def given(self) -> Mapping[str, Sequence[KeyValue]]:
+        """What each instance got before a restart, in its order; the errors are those of `entries`."""
+        given: dict[str, list[KeyValue]] = {}
+        for entry in self.entries():
+            own = entry
+            if isinstance(own, SetValue):
+                own = [(f"{own.instance}.{own.variable}", own.point, own.time, own.value)]
+            for value in own:
+                given.setdefault(value[0].partition(".")[0], []).append(value)
+        return given

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import Generic, Self, TypeVar
 
 import zenoh
@@ -31,8 +32,8 @@ __all__ = ["COMES_BACK_S", "Follower", "ValueStream"]
 # wait; of what is stored there is a limit. The token may be reported as gone before samples that were sent earlier
 # have arrived (another priority, another thread), so the end is only the end after `latecomers`. And Zenoh may report
 # one token twice: a mesh that has ended does not begin again for the same follower (ADR 67 on lost tokens). A mesh that
-# may start again says so in its status: then its token is waited for, with a timer, whose thread ends the follower, and
-# the lock is for this timer alone (ADR 87).
+# may start again says so in its status: then a thread waits for its token, and ends the follower if none comes (ADR
+# 87).
 
 Item = TypeVar("Item")
 
@@ -54,8 +55,7 @@ class Follower(Generic[Item]):
         self._stack = ExitStack()
         self._over = False
         self._may_restart = False
-        self._lost: threading.Timer | None = None
-        self._changing = threading.Lock()
+        self._back: threading.Event | None = None  # set when the master is there again
         self.arrived: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self.there = threading.Event()
 
@@ -118,11 +118,10 @@ class Follower(Generic[Item]):
             self.there.set()  # Zenoh may report it twice, for example if other code with this session queries tokens
             self._stop_waiting()
         elif self._may_restart and not self._over:
-            with self._changing:
-                if self._lost is None:
-                    self._lost = threading.Timer(COMES_BACK_S, self._end)
-                    self._lost.daemon = True
-                    self._lost.start()
+            if self._back is None or self._back.is_set():
+                self._back = threading.Event()
+                wait = partial(self._wait, self._back)
+                threading.Thread(target=wait, name="waits for a master", daemon=True).start()
         else:
             self._end()
 
@@ -130,8 +129,12 @@ class Follower(Generic[Item]):
         with suppress(ValueError):
             status = decoded_json(sample.payload.to_bytes(), MeshStatus)
             self._may_restart = status.may_restart and status.state in GOING_ON
-            if not self._may_restart and self._lost is not None:
+            if not self._may_restart and self._back is not None and not self._back.is_set():
                 self._end()
+
+    def _wait(self, back: threading.Event) -> None:
+        if not back.wait(COMES_BACK_S):
+            self._end()
 
     def _end(self) -> None:
         self._over = True
@@ -140,10 +143,8 @@ class Follower(Generic[Item]):
         self._on_end()
 
     def _stop_waiting(self) -> None:
-        with self._changing:
-            if self._lost is not None:
-                self._lost.cancel()
-                self._lost = None
+        if self._back is not None:
+            self._back.set()
 
 
 class ValueStream:
