@@ -300,21 +300,17 @@ class RunThread:
 
 
 def _recovering(plan: RunPlan, settings: StartOptions) -> RunPlan:
-    """The plan with what follows when a process is lost.
+    """The plan with what follows when a process is lost; all of a run in this process is lost with it.
 
     Raises:
-        ConfigurationError: it cannot be, for this mesh.
+        ConfigurationError: the mesh cannot start again.
     """
     config, restarts = plan.loaded.config, settings.restarts
     most = config.recovery.restarts if restarts is None else restarts
-    if not most:
+    if not most or not settings.processes:
         return plan
-    why = config.why_not_restarted
-    if not settings.processes:
-        why = "all of it runs in this process, with which it is lost"
-    if why is not None:
-        hint = "Start it with processes=True, or without `recovery` and `restarts`." if not settings.processes else None
-        raise ConfigurationError(f"the run of '{plan.mesh}' cannot be started again: {why}", hint=hint)
+    if (why := config.why_not_restarted) is not None:
+        raise ConfigurationError(f"the run of '{plan.mesh}' cannot be started again: {why}")
     return replace(plan, max_restarts=most)
 
 

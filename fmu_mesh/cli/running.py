@@ -80,6 +80,9 @@ def run_mesh(
 ) -> None:
     """Run a mesh, show its events, and at the end what the arguments ask for."""
     plan = planned_run(mesh, options, arguments)
+    if plan.loaded.config.recovery.restarts and not how.get("processes", True):
+        text = "`recovery.mode: restart` and --local do not go together: all of it runs in one process"
+        raise ConfigurationError(text, hint="Leave --local out, or add `--set-config recovery.mode=stop`.")
     with (
         plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),

@@ -257,4 +257,4 @@ def test_restarts_and_one_process_do_not_go_together(place: Place) -> None:
     launched = place.run("launch", written(place), "--local")
 
     assert launched.wait() == 2
-    assert "cannot be started again" in launched.message
+    assert "`recovery.mode: restart` and --local do not go together" in launched.message
