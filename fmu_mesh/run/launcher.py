@@ -142,6 +142,7 @@ class Launcher:
         self._check_reachable()
         remove_stale_folders()
         self._folder = run_folder(self._run.mesh, self._run.run)
+        has_run = False
         try:
             socket_endpoint(self._folder, MASTER)  # a path that is too long is found here
             for name, node in self._run.plan.nodes.items():
@@ -152,6 +153,7 @@ class Launcher:
             self._do(self._states.begin())
             while not self._states.is_ending:
                 self._turn()
+            has_run = True
         finally:
             self._do(self._states.end(self._clock()))
             while not self._states.is_over:
@@ -160,7 +162,7 @@ class Launcher:
             if self._files is None:  # the master could not say it any more
                 self._files = rows_left([record.file for record in self._run.plan.system.records], self._folder)
             self._files = self._run.with_earlier(self._files)
-            self.next = self._next(self._files)
+            self.next = self._next(self._files) if has_run else None
             if self.next is None:
                 self.clear()
             else:

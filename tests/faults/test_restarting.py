@@ -16,6 +16,7 @@ import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.results.formats import read_result
 from tests.helpers import BY_ZENOH, FMUS, Launched, Place, row_count, rows_of, wait_until
+from tests.key_meshes import client, key_lines, put_values
 
 POINTS = 4000
 
@@ -206,6 +207,7 @@ def test_values_and_pauses_are_given_again(place: Place) -> None:
         launched.wait_for_error_line("restart 1 of 3")
         wait_until(lambda: run.status.state == "paused" and run.status.restarts == 1, "a pause")
         assert run.status.point == point
+        assert run.instance_status("slow").restarts == 1
         run.set("slow.v", 0.5)
         run.resume()
     killed(launched, result, "master", point + 200)
@@ -214,6 +216,27 @@ def test_values_and_pauses_are_given_again(place: Place) -> None:
     text = result.with_name("again.csv.json").read_text(encoding="utf-8")
     values = json.loads(text)["set"]
     assert sorted(value["value"] for value in values) == [0.25, 0.5, 3.0]  # two nodes have told them
+    again = fmu_mesh.rerun(result, output=place.folder / "rerun.csv", allow_code=True)
+    assert again["gain.y"].tolist() == fmu_mesh.Result.read(result)["gain.y"].tolist()
+
+
+def test_values_of_keys_are_given_again(place: Place) -> None:
+    connections = ["pendulum.a -> slow.u", "slow.y -> gain.u", {"key": "plant/v", "to": "slow.v"}]
+    config = written(place, simulation={"real_time_factor": 4.0}, connections=connections)
+    launched = place.start("launch", config, "--no-progress")
+    result = config.with_suffix(".csv")
+
+    for number, victim in enumerate(["slow", "master", "gain"]):
+        wait_until(lambda: row_count(result) > 500 * (number + 1), "some rows")  # noqa: B023 it is called within the turn
+        with client(place.note().endpoints[0]) as session:
+            put_values(session, "plant/v", [float(number)])
+            lines = result.with_name("again.csv.keys.jsonl")
+            wait_until(lambda: lines.exists() and lines.read_bytes().count(b"\n") > number, "the value")  # noqa: B023 as above
+        launched.child(victim).kill()
+        launched.wait_for_error_line(f"restart {number + 1} of 3")
+
+    assert launched.wait() == 0, launched.story()
+    assert [line[3] for line in key_lines(result)] == [0.0, 1.0, 2.0]
     again = fmu_mesh.rerun(result, output=place.folder / "rerun.csv", allow_code=True)
     assert again["gain.y"].tolist() == fmu_mesh.Result.read(result)["gain.y"].tolist()
 
