@@ -18,6 +18,7 @@ from zenoh.handlers import Callback
 
 from ..config.access_sections import Role
 from ..errors import MessageRefused
+from ..system.attempt import Attempt
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
@@ -58,6 +59,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
         table: number of the table of roles; 0: it has none of our authority.
+        attempt: which attempt of the run this is.
     """
 
     endpoints: tuple[str, ...] = ()
@@ -66,6 +68,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     profile: bool = False
     paused: bool = False
     table: int = 0
+    attempt: Attempt = Attempt()
 
 
 class MasterServer:

@@ -80,7 +80,7 @@ class Activity:
             time=self._plan.grid.time(step * points),
             step_time=step_time,
             wait_time=engine.waited_s if engine is not None else 0.0,
-            restarts=self._plan.restarts,
+            restarts=self._plan.attempt.number - 1,
             refused=self._refusals.count,
             timed_out=late,
             running_time=time.monotonic() - self._started if engine is not None else 0.0,

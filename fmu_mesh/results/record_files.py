@@ -33,6 +33,7 @@ from .formats import reading, required_format
 from .growth import GrowthWatch, ReadColumn
 from .keys_file import KeysFile, keys_beside
 from .recording import Recording, ResultFile
+from .resumed_file import opened_again
 
 __all__ = ["ReadColumn", "RecordFiles", "open_result", "open_results", "rows_left", "what_is_kept"]
 
@@ -40,12 +41,18 @@ _NOTE = struct.Struct("<qq")
 
 
 def open_results(
-    loaded: LoadedConfig, system: ResolvedSystem, *, digest: str = "", contents: Mapping[str, str] = {}
+    loaded: LoadedConfig,
+    system: ResolvedSystem,
+    *,
+    digest: str = "",
+    contents: Mapping[str, str] = {},
+    rows: Sequence[int] = (),
 ) -> list[ResultFile]:
     """Open the result files of a run, in their order; none if nothing is recorded.
 
     Their metadata have the digest of the mesh and the SHA-256 of the model of each instance (``contents``). Without a
-    digest they have no metadata, which saves milliseconds.
+    digest they have no metadata, which saves milliseconds. If the run starts again, ``rows`` has the number of rows
+    that each file has of it.
 
     Raises:
         ConfigurationError: a file cannot be written, or another run is writing it. All files are as they were.
@@ -54,13 +61,14 @@ def open_results(
     places = {str(file): place for place, file in record_paths(loaded).items()}
     files: list[ResultFile] = []
     try:
-        for record in system.records:
+        for number, record in enumerate(system.records):
             place = places.get(record.file, "record")
             recording = Recording(loaded, descriptions, record.variables, place, record.first, record.every)
             if digest:
                 metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
                 recording = replace(recording, metadata=to_builtins(metadata) | _keys_of(system, record.file))
-            files.append(required_format(record.file).open(Path(record.file), recording))
+            there = rows[number] if number < len(rows) else 0
+            files.append(opened_again(Path(record.file), recording, there))
     except BaseException:
         for file in files:
             with suppress(OSError):

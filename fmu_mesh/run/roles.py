@@ -30,6 +30,7 @@ from ..recorder.recorder import Recorder
 from ..results.growth import GrowthWatch
 from ..results.record_files import open_results
 from ..results.recording import ResultFile
+from ..system.attempt import Attempt
 from ..system.plan import MASTER, RECORDER, Plan
 from ..variables.value_types import PlainValue
 from ..wire.host_processes import ask_outside
@@ -207,7 +208,8 @@ class _NodeProcess:
         plan, showing = self._first.plan, self._first.showing
         if showing.video is not None:
             showing = replace(showing, video=numbered(showing.video, start.resets))
-        self._run = replace(self._first, showing=showing, plan=replace(plan, digest=start.digest, instances=instances))
+        plan = replace(plan, digest=start.digest, instances=instances, attempt=Attempt())
+        self._run = replace(self._first, showing=showing, plan=plan)
 
     def _open(self, name: str) -> Guarded:
         opening = _opening(self._run, name, self._process.folder, self._log)
@@ -283,6 +285,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 launch=process.launch,
                 profile=run.profile,
                 paused=run.paused,
+                attempt=run.attempt_of(MASTER),
                 table=table_of(own),
             )
             router = RouterLink(session, config.zenoh.connect)
@@ -374,7 +377,7 @@ class _MasterRuns:
         from .preparing import KnownModels, planned_reset  # noqa: PLC0415  most runs are never reset
 
         self._known = self._known or KnownModels.of(self._first)
-        run = planned_reset(self._first, start_values, resets, self._known)
+        run = replace(planned_reset(self._first, start_values, resets, self._known), rows=())
         self._files = _opened_results(run)
         self.run, self.resets = run, resets
         return run.plan
@@ -415,7 +418,7 @@ class _MasterRuns:
 
 
 def _opened_results(run: RunPlan) -> Sequence[ResultFile]:
-    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents)
+    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents, rows=run.rows)
 
 
 def _outcome_of(
@@ -425,15 +428,8 @@ def _outcome_of(
     point, ended_by = master.last_status().point, master.ended_by if error is None else None
     if isinstance(error, RunReset):
         point, error, ended_by = max(point, last_recorded(run.plan, files)), None, error
-    outcome = outcome_at(
-        run.plan,
-        point,
-        files,
-        error,
-        ended_by,
-        seconds=master.seconds,
-        warnings=(*warnings, *master.warnings),
-    )
+    told = (*warnings, *master.warnings)
+    outcome = outcome_at(run.plan, point, files, error, ended_by, seconds=master.seconds, warnings=told)
     return replace(outcome, profile=master.profile(), signal=signal)
 
 

@@ -38,12 +38,12 @@ __all__ = [
     "Way",
 ]
 
-MeshState = Literal["starting", "initializing", "running", "paused", "stopping", "done", "failed"]
+MeshState = Literal["starting", "initializing", "restarting", "running", "paused", "stopping", "done", "failed"]
 
 Way = Literal["ring", "stream", "zenoh"]
 """How rows go between two processes: by memory that both share, by a row stream, or in messages of Zenoh."""
 
-GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "running", "paused"))
+GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "restarting", "running", "paused"))
 """The states of a mesh that has not ended."""
 
 
@@ -348,6 +348,9 @@ class MeshStatus(msgspec.Struct, frozen=True):
         cut: the nodes whose row streams to the master are cut, and for how long in s. Who is cut from another node says
             so in the `activity` of its instances.
         missing: while it starts, the nodes that are not ready.
+        restarts: how often all processes were started again, because one was lost.
+        restarting: while it comes back, such as `attempt 2 of 3, from point 812`.
+        may_restart: whether it starts again if a process is lost.
     """
 
     mesh: str
@@ -364,6 +367,9 @@ class MeshStatus(msgspec.Struct, frozen=True):
     cut: dict[str, float] = {}
     resets: int = 0
     missing: tuple[str, ...] = ()
+    restarts: int = 0
+    restarting: str = ""
+    may_restart: bool = False
 
 
 class RosTopicView(msgspec.Struct, frozen=True):
