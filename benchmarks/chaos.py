@@ -22,6 +22,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.chaos_meshes import LASTS_S, Mesh, mesh_of, written_meshes
+from benchmarks.cutting import CUT, cut_apart, why_no_cuts
 from benchmarks.disturbing import (
     FAULTS,
     ROLES,
@@ -48,7 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=100, metavar="N", help="how many faults of any kind (100)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="decides kind, role and moment of each (1)")
     parser.add_argument("--roles", nargs="+", choices=ROLES, default=ROLES, help="what is disturbed; fork: its server")
-    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS, help="what is done (all of them)")
+    parser.add_argument(
+        "--faults", nargs="+", choices=(*FAULTS, CUT), default=(*FAULTS, CUT), help="what is done (all of them)"
+    )
     parser.add_argument("--per-run", type=int, default=3, metavar="N", help="faults in one run (3)")
     parser.add_argument(
         "--while-coming-back", type=float, default=0.0, metavar="P", help="probability of a kill after a kill (0)"
@@ -85,6 +88,13 @@ def _runs(options: argparse.Namespace, values: Sequence[str], folder: Path) -> l
     Raises:
         RuntimeError: a mesh cannot run undisturbed, or ends too soon to be disturbed.
     """
+    kinds = [kind for kind in options.faults if kind != CUT]
+    if CUT in options.faults and (reason := why_no_cuts()):
+        print(f"left out: cuts of a network: {reason}", flush=True)
+    elif CUT in options.faults:
+        kinds.append(CUT)
+    if not kinds:
+        raise RuntimeError("there is nothing left to do")
     everything = options.config == "all"
     meshes = list(written_meshes(folder)) if everything else [mesh_of(Path(options.config), options.lasts)]
     runs: list[Disturbed] = []
@@ -97,18 +107,21 @@ def _runs(options: argparse.Namespace, values: Sequence[str], folder: Path) -> l
             known[mesh.name] = undisturbed(mesh, values)
         expected = known[mesh.name]
         chance = random.Random(f"{options.seed} {number}")  # noqa: S311  faults
-        faults = drawn_faults(
-            chance, min(options.per_run, left), options.faults, options.roles, options.while_coming_back
-        )
-        run = disturbed(mesh, own, expected, faults, number)
+        count = min(options.per_run, left)
+        if CUT in kinds and chance.random() < 1 / len(kinds):  # for cuts, a mesh runs on two hosts
+            run = cut_apart(mesh, expected, chance, count, number)
+        else:
+            own_kinds = [kind for kind in kinds if kind != CUT]
+            faults = drawn_faults(chance, count, own_kinds, options.roles, options.while_coming_back)
+            run = disturbed(mesh, own, expected, faults, number)
         runs.append(run)
         left -= len(run.given)
         in_vain = 0 if run.given or run.problem else in_vain + 1
         gave = ", ".join(f"{given.label} at row {given.row}" for given in run.given) or "no fault"
-        print(f"run {number}: {mesh.name} {' '.join(own)}: {gave}: {run.problem or 'equal'}", flush=True)
-        if left <= 0:
+        print(f"run {number}: {mesh.name} {' '.join(run.options)}: {gave}: {run.problem or 'equal'}", flush=True)
+        if left <= 0 or (run.problem and not run.given):  # it differs by itself
             break
-        if in_vain == _IN_VAIN or (run.problem and not run.given):
+        if in_vain == _IN_VAIN:
             msg = f"{mesh.name} ends before its faults. Give it more points, or a larger --lasts"
             raise RuntimeError(msg)
     return runs

@@ -24,19 +24,24 @@ from tests.helpers import Launched, Place
 __all__ = [
     "FAULTS",
     "ROLES",
+    "RUN_S",
     "Differences",
     "Disturbed",
     "Fault",
     "Given",
     "GrowingFile",
+    "Run",
     "Undisturbed",
     "differences",
     "disturbed",
     "drawn_faults",
+    "factor",
     "undisturbed",
 ]
 
 FAULTS: Final = ("kill", "stop", "delay")
+"""What is done to a process."""
+
 ROLES: Final = ("node", "master", "fork")
 """Of processes; `fork` is the fork server."""
 
@@ -47,7 +52,7 @@ RUN_S: Final = 120.0
 """Of a run with its faults, besides what an undisturbed one takes."""
 
 _LATER_S: Final = 0.25
-"""A fault comes up to so much after its row. The recorder writes every 0.2 s; faults come between two writes as well."""
+"""A fault comes up to so much after its row: the recorder writes every 0.2 s, and faults come between writes, too."""
 
 _STOPPED_S: Final = (0.05, 1.0)
 _DELAYED_S: Final = (0.2, 1.0)
@@ -226,7 +231,7 @@ def undisturbed(mesh: Mesh, options: Sequence[str]) -> Undisturbed:
         RuntimeError: it failed.
     """
     with Place() as place:
-        run = _Run(place, mesh, [*options, "--real-time-factor", "0"], 10 * RUN_S)
+        run = _started(place, mesh, [*options, "--real-time-factor", "0"], 10 * RUN_S)
         run.wait(lambda: run.file.rows > 0, "the first row")
         first_row_s = time.monotonic() - run.begun
         if run.launched.wait(10 * RUN_S):
@@ -239,28 +244,33 @@ def disturbed(
 ) -> Disturbed:
     """Run a mesh with faults, until it has ended."""
     told = Disturbed(mesh.name, number, options, expected.first_row_s)
-    factor = expected.time_span_s / mesh.lasts_s if mesh.lasts_s else 0.0
+    pace = ["--real-time-factor", str(factor(mesh, expected)), "--restarts", str(MOST_RESTARTS)]
     with Place() as place:
-        pace = ["--real-time-factor", str(factor), "--restarts", str(MOST_RESTARTS)]
-        run = _Run(place, mesh, [*options, *pace], RUN_S + expected.seconds + mesh.lasts_s)
+        run = _started(place, mesh, [*options, *pace], RUN_S + expected.seconds + mesh.lasts_s)
         try:
             for fault in faults:
                 run.give(fault, expected.rows, told)
             code = run.launched.wait(run.left_s)
         except AssertionError as error:
             told.problem = f"{error}\n{place.story()}"
-        else:
-            found = run.file.path.read_bytes() if run.file.path.exists() else b""
-            told.found = differences(expected.content, found)
-            if code:
-                told.problem = run.launched.story()
-            elif told.found.other:
-                told.problem = _first_difference(expected.content, found)
-            else:
-                with suppress(AssertionError):
-                    run.wait(lambda: not place.left(), "an empty place", _LEFT_S)
-                told.problem = "\n".join(f"left: {one}" for one in place.left())
+            return told
+        run.judge(code, expected.content, told)
+        if not told.problem:
+            with suppress(AssertionError):
+                run.wait(lambda: not place.left(), "an empty place", _LEFT_S)
+            told.problem = "\n".join(f"left: {one}" for one in place.left())
     return told
+
+
+def factor(mesh: Mesh, expected: Undisturbed) -> float:
+    """The real-time factor of a mesh whose runs last as long as they should; 0: as fast as possible."""
+    return expected.time_span_s / mesh.lasts_s if mesh.lasts_s else 0.0
+
+
+def _started(place: Place, mesh: Mesh, options: Sequence[str], most_s: float) -> Run:
+    file = place.folder / "result.csv"
+    launched = place.start("launch", mesh.config, "--no-progress", "--output", file, *options)
+    return Run(launched, GrowingFile(file), most_s)
 
 
 def _first_difference(expected: bytes, found: bytes) -> str:
@@ -271,21 +281,24 @@ def _first_difference(expected: bytes, found: bytes) -> str:
     return f"{len(got)} lines, not {len(wanted)}"
 
 
-class _Run:
-    """A run, and what is done to it.
+class Run:
+    """A run that has just been started, and what is done to it.
+
+    Args:
+        launched: its command, or that of its master.
+        file: its result.
+        most_s: its deadline.
 
     Attributes:
-        launched: its command.
-        file: its result.
-        begun: when the command was started.
+        launched: as above.
+        file: as above.
+        begun: when it was started.
     """
 
-    def __init__(self, place: Place, mesh: Mesh, options: Sequence[str], most_s: float) -> None:
-        self.file = GrowingFile(place.folder / "result.csv")
+    def __init__(self, launched: Launched, file: GrowingFile, most_s: float) -> None:
+        self.launched = launched
+        self.file = file
         self.begun = time.monotonic()
-        self.launched: Launched = place.start(
-            "launch", mesh.config, "--no-progress", "--output", self.file.path, *options
-        )
         self._end = self.begun + most_s
         self._never = threading.Event()
 
@@ -301,14 +314,18 @@ class _Run:
             assert time.monotonic() < end, f"not in time: {what}"
             self._never.wait(_LOOK_S)
 
-    def give(self, fault: Fault, rows: int, told: Disturbed) -> None:
-        """Give a fault, and wait for the next new row; nothing is done if the run ends before."""
-        first, wanted = not told.given and fault.after > 0, max(0, int(fault.after * rows))
-        if first:
+    def reach(self, fault: Fault, rows: int, told: Disturbed) -> None:
+        """Wait for the moment of a fault in a result of so many rows."""
+        if not told.given and fault.after > 0:
             self.wait(lambda: self.file.rows > 0, "the first row")
             told.first_row_s = time.monotonic() - self.begun
+        wanted = max(0, int(fault.after * rows))
         self.wait(lambda: self.file.rows >= wanted, f"row {wanted}")
-        self._pass(fault.later_s)
+        self.let_pass(fault.later_s)
+
+    def give(self, fault: Fault, rows: int, told: Disturbed) -> None:
+        """Give a fault, and wait for the next new row; nothing is done if the run ends before."""
+        self.reach(fault, rows, told)
         victim = self._found(fault, ())
         if victim is None:
             return
@@ -319,9 +336,9 @@ class _Run:
             case "stop":
                 with suppress(psutil.NoSuchProcess):
                     victim.suspend()
-                    self._pass(fault.lasts_s)
+                    self.let_pass(fault.lasts_s)
                     victim.resume()
-                told.given.append(self._next_row(label, row, self.file.recounted()))
+                told.given.append(self.next_row(label, row, self.file.recounted()))
             case _:
                 end = time.monotonic() + fault.lasts_s
                 with suppress(psutil.NoSuchProcess):
@@ -330,7 +347,16 @@ class _Run:
                         self._never.wait(_PART_S)
                         victim.resume()
                         self._never.wait(_PART_S)
-                told.given.append(self._next_row(label, row, self.file.recounted()))
+                told.given.append(self.next_row(label, row, self.file.recounted()))
+
+    def judge(self, code: int, expected: bytes, told: Disturbed) -> None:
+        """Compare the result of a run that has ended with this exit code."""
+        found = self.file.path.read_bytes() if self.file.path.exists() else b""
+        told.found = differences(expected, found)
+        if code:
+            told.problem = self.launched.story()
+        elif told.found.other:
+            told.problem = _first_difference(expected, found)
 
     def _kill(self, victim: psutil.Process, fault: Fault, label: str, row: int, told: Disturbed) -> None:
         """Kill a process, and others while the run comes back."""
@@ -344,25 +370,26 @@ class _Run:
             self.wait(lambda: not any(map(_is_there, masters)), "the end of the master")  # noqa: B023  called here
             kept = self.file.recounted()
             if not again:
-                told.given.append(self._next_row(label, row, kept, begun))
+                told.given.append(self.next_row(label, row, kept, begun))
                 return
             told.given.append(Given(label, row, None))
             old = [process.pid for process, _ in attempt]
             fault, row = again.pop(0), kept
-            self._pass(fault.later_s)
+            self.let_pass(fault.later_s)
             found = self._found(fault, old, kept)
             if found is None:
                 return
             victim = found
             label = f"kill {fault.role}, {'coming back' if self.file.rows <= kept else 'again'}"
 
-    def _next_row(self, label: str, row: int, kept: int, begun: float | None = None) -> Given:
+    def next_row(self, label: str, row: int, kept: int, begun: float | None = None) -> Given:
+        """A fault given at ``row``, after the first row beyond ``kept``; its time begins at ``begun``, or now."""
         begun = begun or time.monotonic()
         self.wait(lambda: self.file.rows > kept, "a new row")
         came = self.file.rows > kept
         return Given(label, row, time.monotonic() - begun if came else None)
 
-    def _pass(self, seconds: float) -> None:
+    def let_pass(self, seconds: float) -> None:
         """Let time pass, as long as the run goes on."""
         end = time.monotonic() + seconds
         while time.monotonic() < end and self.launched.running:

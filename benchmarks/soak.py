@@ -19,7 +19,7 @@ from benchmarks.chaos_meshes import chain
 from benchmarks.publishing import markdown_table
 from tests.helpers import Place
 
-__all__ = ["Sample", "is_flat", "soak"]
+__all__ = ["Sample", "has_grown", "soak"]
 
 _EVERY_S: Final = 0.5
 _MOST_S: Final = 3600.0
@@ -34,7 +34,7 @@ _ROOM: Final = (8.0, 2.0, 0.5)
 
 @dataclass(frozen=True)
 class Sample:
-    """What a run has at one time: seconds since the command, PSS of all processes, open files, files, and its result."""
+    """What a run has at one time: seconds since the command, PSS, open files, files of the run, and its result."""
 
     at_s: float
     memory_mb: float
@@ -78,7 +78,7 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
             print(f"error: {launched.story()}")
             return 1
         print(launched.output)
-    grown = is_flat(samples)
+    grown = has_grown(samples)
     shown = samples[:: max(1, len(samples) // _SHOWN)]
     header = ["at, s", "memory (PSS), MB", "open files", "files of the run, MB", "result, MB"]
     rows = [
@@ -92,16 +92,17 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
     return int(bool(grown))
 
 
-def is_flat(samples: Sequence[Sample]) -> list[str]:
+def has_grown(samples: Sequence[Sample]) -> list[str]:
     """What has grown from the second quarter of a run to its last one, in words; nothing if all is flat."""
-    quarter = len(samples) // 4
+    steady = [sample for sample in samples if sample.result_mb]  # without its start
+    quarter = len(steady) // 4
     grown = []
     if not quarter:
         return ["too short to be looked at"]
     for name, room in zip(("memory_mb", "open_files", "folder_mb"), _ROOM, strict=True):
         early, late = (
             statistics.median(getattr(sample, name) for sample in part)
-            for part in (samples[quarter : 2 * quarter], samples[-quarter:])
+            for part in (steady[quarter : 2 * quarter], steady[-quarter:])
         )
         if late > max(_GROWTH * early, early + room):
             grown.append(f"{name} has grown from {early:.1f} to {late:.1f}")
