@@ -204,7 +204,7 @@ def drawn_faults(
         while_coming_back: the probability that a kill is followed by another one, and that one again.
     """
     faults = []
-    for after in sorted(chance.uniform(-0.05, 0.95) for _ in range(count)):
+    for after in sorted(chance.uniform(-0.05, 1.0) for _ in range(count)):
         kind, role = chance.choice(kinds), chance.choice(roles)
         lasts_s = chance.uniform(*(_STOPPED_S if kind == "stop" else _DELAYED_S))
         again = []
