@@ -22,6 +22,8 @@ LASTS_S: Final = 2.5
 
 _WINDOWS: Final = ("1", "16", "auto")
 
+_FILES: Final = ("result.csv", "result.parquet", "result.mcap")
+
 _SLOW: Final = """
 import time
 
@@ -47,12 +49,14 @@ class Mesh:
         config: its file; all that it needs is in its folder, or has an absolute path.
         lasts_s: at least so long an undisturbed run takes by the wall clock; 0: as fast as possible.
         variants: options of `launch` in each of the ways in which it runs; the values of all results are the same.
+        files: the results beside the file, a CSV file first; empty: there is one, whose name `launch` is told.
     """
 
     name: str
     config: Path
     lasts_s: float = LASTS_S
     variants: Sequence[Sequence[str]] = ((),)
+    files: Sequence[str] = ()
 
 
 def mesh_of(config: Path, lasts_s: float) -> Mesh:
@@ -73,7 +77,7 @@ def written_meshes(folder: Path) -> Iterator[Mesh]:
         except (pytest.skip.Exception, RuntimeError) as reason:
             print(f"left out: {name}: {reason}", flush=True)
         else:
-            yield Mesh(name, config, 0.0 if "fast" in name else LASTS_S, ways)
+            yield Mesh(name, config, 0.0 if "fast" in name else LASTS_S, ways, _FILES if "formats" in name else ())
 
 
 def _fmu(name: str, **start_values: float) -> dict[str, Any]:
@@ -101,6 +105,10 @@ def _fast(folder: Path) -> dict[str, Any]:
     content["simulation"]["stop_time"] = 25.0
     content["instances"]["gain"] = {"python": "slow.py:Slow"}
     return content
+
+
+def _formats(_: Path) -> dict[str, Any]:
+    return {**chain(), "record": [{"file": name} for name in _FILES]}
 
 
 def _stateless(folder: Path) -> Mapping[str, Any]:
@@ -143,6 +151,7 @@ def _known(name: str) -> Callable[[Path], Path]:
 ALL: Final[Mapping[str, Callable[[Path], Path]]] = {
     "chain of 4": _own(lambda _: chain()),
     "chain of 4, as fast as possible": _own(_fast),
+    "chain of 4, in three formats": _own(_formats),
     "cycle of 2": _known("cycle2"),
     "star of 5": _known("star"),
     "groups": _known("groups"),

@@ -63,7 +63,8 @@ def _written(mesh: Mesh, host: NetworkHost, real_time_factor: float) -> Path:
     shutil.copytree(mesh.config.parent, folder)
     content = yaml.safe_load(mesh.config.read_text(encoding="utf-8"))
     content["simulation"]["real_time_factor"] = real_time_factor
-    content["record"] = {**(content.get("record") or {}), "file": "result.csv"}
+    record = content.get("record") or {}
+    content["record"] = {**(record[0] if isinstance(record, list) else record), "file": "result.csv"}
     path = folder / mesh.config.name
     path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return path

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Final
 
 import psutil
 
+import fmu_mesh
 from benchmarks.chaos_meshes import Mesh
 from tests.helpers import Launched, Place
 
@@ -140,11 +141,19 @@ class Disturbed:
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """A run without faults: its result, the time from the command to its first row, and to its end, in s."""
+    """A run without faults.
+
+    Attributes:
+        content: of its result.
+        first_row_s: from the command to its first row.
+        seconds: from the command to its end.
+        others: the values of its other results, by the name of a file and of a variable.
+    """
 
     content: bytes
     first_row_s: float
     seconds: float
+    others: Mapping[str, Mapping[str, bytes]]
 
     @property
     def rows(self) -> int:
@@ -236,7 +245,8 @@ def undisturbed(mesh: Mesh, options: Sequence[str]) -> Undisturbed:
         first_row_s = time.monotonic() - run.begun
         if run.launched.wait(10 * RUN_S):
             raise RuntimeError(run.launched.story())
-        return Undisturbed(run.file.path.read_bytes(), first_row_s, time.monotonic() - run.begun)
+        seconds = time.monotonic() - run.begun
+        return Undisturbed(run.file.path.read_bytes(), first_row_s, seconds, _values(mesh))
 
 
 def disturbed(
@@ -256,6 +266,8 @@ def disturbed(
             return told
         run.judge(code, expected.content, told)
         if not told.problem:
+            told.problem = ". ".join(_other_values(expected.others, _values(mesh)))
+        if not told.problem:
             with suppress(AssertionError):
                 run.wait(lambda: not place.left(), "an empty place", _LEFT_S)
             told.problem = "\n".join(f"left: {one}" for one in place.left())
@@ -268,9 +280,32 @@ def factor(mesh: Mesh, expected: Undisturbed) -> float:
 
 
 def _started(place: Place, mesh: Mesh, options: Sequence[str], most_s: float) -> Run:
-    file = place.folder / "result.csv"
-    launched = place.start("launch", mesh.config, "--no-progress", "--output", file, *options)
+    for name in mesh.files:  # of the run before
+        mesh.config.with_name(name).unlink(missing_ok=True)
+    file = mesh.config.with_name(mesh.files[0]) if mesh.files else place.folder / "result.csv"
+    output = [] if mesh.files else ["--output", str(file)]
+    launched = place.start("launch", mesh.config, "--no-progress", *output, *options)
     return Run(launched, GrowingFile(file), most_s)
+
+
+def _values(mesh: Mesh) -> dict[str, dict[str, bytes]]:
+    """All values of the results that are no CSV files."""
+    results = {name: fmu_mesh.Result.read(mesh.config.with_name(name)) for name in mesh.files[1:]}
+    return {
+        name: {"time": result.times.tobytes(), **{own: result[own].tobytes() for own in result}}
+        for name, result in results.items()
+    }
+
+
+def _other_values(expected: Mapping[str, Mapping[str, bytes]], found: Mapping[str, Mapping[str, bytes]]) -> list[str]:
+    """In words, which results have other values than those of the undisturbed run."""
+    told = []
+    for name, values in expected.items():
+        wrong = [own for own in values if found[name].get(own) != values[own]]
+        if wrong:
+            rows, others = (len(one[name]["time"]) // 8 for one in (expected, found))
+            told.append(f"{name} has {others} rows of {rows}, and other values of {', '.join(wrong)}")
+    return told
 
 
 def _first_difference(expected: bytes, found: bytes) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import statistics
 import threading
 import time
@@ -47,7 +48,7 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
     """Run a mesh for so many points with `--restarts 3`, and print the table; 1 if it fails, or something grows.
 
     Args:
-        config: a file; `all`: a chain of four.
+        config: a file; `all`: a chain of four, of which the last output is recorded.
         points: steps of the mesh.
         options: more of `launch`.
         file: gets all samples as JSON.
@@ -57,7 +58,8 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
         own = place.folder / "soak.yaml"
         source = Path(config).resolve() if config != "all" else own
         if config == "all":
-            own.write_text(yaml.safe_dump({"mesh": "soak", **chain()}, sort_keys=False), encoding="utf-8")
+            content = {"mesh": "soak", **chain(), "record": {"variables": ["delay.y"]}}
+            own.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
         simulation = yaml.safe_load(source.read_text(encoding="utf-8"))["simulation"]
         stop_time = simulation.get("start_time", 0.0) + points * simulation["step_size"]
         result = place.folder / "result.csv"
@@ -116,7 +118,9 @@ def _sample(pid: int, folders: Sequence[Path], result: Path, begun: float) -> Sa
             with suppress(psutil.Error):
                 memory += process.memory_full_info().pss
                 files += process.num_fds()
-    size = sum(_size(path) for folder in folders for path in folder.rglob("*"))
+    size = sum(  # unlike `Path.rglob`, `os.walk` bears with folders that are removed meanwhile
+        _size(Path(parent, name)) for folder in folders for parent, _, names in os.walk(folder) for name in names
+    )
     return Sample(time.monotonic() - begun, memory / _MB, files, size / _MB, _size(result) / _MB)
 
 
