@@ -25,6 +25,7 @@ from benchmarks.chaos_meshes import LASTS_S, Mesh, mesh_of, written_meshes
 from benchmarks.cutting import CUT, cut_apart, why_no_cuts
 from benchmarks.disturbing import (
     FAULTS,
+    GATEWAY,
     ROLES,
     Disturbed,
     Given,
@@ -48,7 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("config", metavar="CONFIG", help="a configuration file; all: one mesh of each kind")
     parser.add_argument("--kills", type=int, default=100, metavar="N", help="how many faults of any kind (100)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="decides kind, role and moment of each (1)")
-    parser.add_argument("--roles", nargs="+", choices=ROLES, default=ROLES, help="what is disturbed; fork: its server")
+    parser.add_argument(
+        "--roles", nargs="+", choices=(*ROLES, GATEWAY), default=ROLES, help="what is disturbed; fork: its server"
+    )
     parser.add_argument(
         "--faults", nargs="+", choices=(*FAULTS, CUT), default=(*FAULTS, CUT), help="what is done (all of them)"
     )

@@ -24,6 +24,7 @@ from tests.helpers import Launched, Place
 
 __all__ = [
     "FAULTS",
+    "GATEWAY",
     "ROLES",
     "RUN_S",
     "Differences",
@@ -44,7 +45,10 @@ FAULTS: Final = ("kill", "stop", "delay")
 """What is done to a process."""
 
 ROLES: Final = ("node", "master", "fork")
-"""Of processes; `fork` is the fork server."""
+"""Of processes that each run has; `fork` is the fork server."""
+
+GATEWAY: Final = "gateway"
+"""The role of the process that a mesh with the section `ros` has besides."""
 
 MOST_RESTARTS: Final = 50
 """More than one run needs; a mesh that is lost again and again meets its deadline first."""
