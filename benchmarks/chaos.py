@@ -24,6 +24,7 @@ from pathlib import Path
 from benchmarks.chaos_meshes import LASTS_S, Mesh, mesh_of, written_meshes
 from benchmarks.cutting import CUT, cut_apart, why_no_cuts
 from benchmarks.disturbing import (
+    EVERYBODY,
     FAULTS,
     GATEWAY,
     ROLES,
@@ -50,7 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=100, metavar="N", help="how many faults of any kind (100)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="decides kind, role and moment of each (1)")
     parser.add_argument(
-        "--roles", nargs="+", choices=(*ROLES, GATEWAY), default=ROLES, help="what is disturbed; fork: its server"
+        "--roles",
+        nargs="+",
+        choices=(*ROLES, GATEWAY, EVERYBODY),
+        default=ROLES,
+        help="what is disturbed; fork: the fork server",
     )
     parser.add_argument(
         "--faults", nargs="+", choices=(*FAULTS, CUT), default=(*FAULTS, CUT), help="what is done (all of them)"

@@ -12,7 +12,8 @@ from typing import Final
 import yaml
 
 from benchmarks.chaos_meshes import Mesh
-from benchmarks.disturbing import RUN_S, Disturbed, Fault, GrowingFile, Run, Undisturbed, factor
+from benchmarks.disturbing import RUN_S, Disturbed, Fault, Run, Undisturbed, factor
+from benchmarks.kept_rows import GrowingFile
 from fmu_mesh.system.plan import RECORDER
 from tests.helpers import Launched
 from tests.network_hosts import NEEDS_HOSTS, NetworkHost, link_is, started_apart, started_hosts

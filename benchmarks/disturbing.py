@@ -8,33 +8,32 @@ left at its end, whatever happens.
 from __future__ import annotations
 
 import random
+import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 import psutil
 
 import fmu_mesh
 from benchmarks.chaos_meshes import Mesh
+from benchmarks.kept_rows import Differences, GrowingFile, differences, first_difference, other_values
 from tests.helpers import Launched, Place
 
 __all__ = [
+    "EVERYBODY",
     "FAULTS",
     "GATEWAY",
     "ROLES",
     "RUN_S",
-    "Differences",
     "Disturbed",
     "Fault",
     "Given",
-    "GrowingFile",
     "Run",
     "Undisturbed",
-    "differences",
     "disturbed",
     "drawn_faults",
     "factor",
@@ -49,6 +48,9 @@ ROLES: Final = ("node", "master", "fork")
 
 GATEWAY: Final = "gateway"
 """The role of the process that a mesh with the section `ros` has besides."""
+
+EVERYBODY: Final = "all"
+"""All processes of a run at once, but `launch` itself."""
 
 MOST_RESTARTS: Final = 50
 """More than one run needs; a mesh that is lost again and again meets its deadline first."""
@@ -111,15 +113,6 @@ class Given:
     next_row_s: float | None
 
 
-@dataclass(frozen=True)
-class Differences:
-    """What is wrong with a result: rows without a time of the undisturbed result, or with one twice, or other bytes."""
-
-    lost: int = 0
-    doubled: int = 0
-    other: bool = False
-
-
 @dataclass
 class Disturbed:
     """One run with faults.
@@ -171,39 +164,6 @@ class Undisturbed:
         return float((others or [first])[-1].split(b",")[0]) - float(first.split(b",")[0])
 
 
-class GrowingFile:
-    """The rows of a CSV file that grows, and may be begun again or cut; only what is new is read.
-
-    Args:
-        path: of the file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._at, self._lines, self._number = 0, 0, 0
-
-    @property
-    def rows(self) -> int:
-        """How many whole rows there are by now, without the header."""
-        try:
-            with self.path.open("rb") as file:
-                facts = Path(f"/proc/self/fd/{file.fileno()}").stat()
-                if facts.st_ino != self._number or facts.st_size < self._at:
-                    self._at, self._lines, self._number = 0, 0, facts.st_ino
-                file.seek(self._at)
-                new = file.read()
-        except FileNotFoundError:
-            return 0
-        self._at += len(new)
-        self._lines += new.count(b"\n")
-        return max(0, self._lines - 1)
-
-    def recounted(self) -> int:
-        """As `rows`, from its first byte: between two looks it may have been cut, and have grown again."""
-        self._number = 0
-        return self.rows
-
-
 def drawn_faults(
     chance: random.Random, count: int, kinds: Sequence[str], roles: Sequence[str], while_coming_back: float = 0.0
 ) -> list[Fault]:
@@ -227,14 +187,6 @@ def drawn_faults(
             )
         faults.append(Fault(kind, role, chance.random(), after, chance.uniform(0.0, _LATER_S), lasts_s, again))
     return faults
-
-
-def differences(expected: bytes, found: bytes) -> Differences:
-    """Compare two results row by row; the first column of a row is its time."""
-    if expected == found:
-        return Differences()
-    wanted, times = ([row.split(b",")[0] for row in content.splitlines()[1:]] for content in (expected, found))
-    return Differences(len({*wanted} - {*times}), len(times) - len({*times}), other=True)
 
 
 def undisturbed(mesh: Mesh, options: Sequence[str]) -> Undisturbed:
@@ -270,7 +222,7 @@ def disturbed(
             return told
         run.judge(code, expected.content, told)
         if not told.problem:
-            told.problem = ". ".join(_other_values(expected.others, _values(mesh)))
+            told.problem = ". ".join(other_values(expected.others, _values(mesh)))
         if not told.problem:
             with suppress(AssertionError):
                 run.wait(lambda: not place.left(), "an empty place", _LEFT_S)
@@ -299,25 +251,6 @@ def _values(mesh: Mesh) -> dict[str, dict[str, bytes]]:
         name: {"time": result.times.tobytes(), **{own: result[own].tobytes() for own in result}}
         for name, result in results.items()
     }
-
-
-def _other_values(expected: Mapping[str, Mapping[str, bytes]], found: Mapping[str, Mapping[str, bytes]]) -> list[str]:
-    """In words, which results have other values than those of the undisturbed run."""
-    told = []
-    for name, values in expected.items():
-        wrong = [own for own in values if found[name].get(own) != values[own]]
-        if wrong:
-            rows, others = (len(one[name]["time"]) // 8 for one in (expected, found))
-            told.append(f"{name} has {others} rows of {rows}, and other values of {', '.join(wrong)}")
-    return told
-
-
-def _first_difference(expected: bytes, found: bytes) -> str:
-    wanted, got = expected.splitlines(), found.splitlines()
-    for number, (one, other) in enumerate(zip(wanted, got, strict=False), 1):
-        if one != other:
-            return f"line {number} is {other[:200].decode()}, not {one[:200].decode()}"
-    return f"{len(got)} lines, not {len(wanted)}"
 
 
 class Run:
@@ -365,26 +298,23 @@ class Run:
     def give(self, fault: Fault, rows: int, told: Disturbed) -> None:
         """Give a fault, and wait for the next new row; nothing is done if the run ends before."""
         self.reach(fault, rows, told)
-        victim = self._found(fault, ())
-        if victim is None:
+        victims = self._found(fault, ())
+        if not victims:
             return
         label, row = f"{fault.kind} {fault.role}", self.file.recounted()
         match fault.kind:
             case "kill":
-                self._kill(victim, fault, label, row, told)
+                self._kill(victims, fault, label, row, told)
             case "stop":
-                with suppress(psutil.NoSuchProcess):
-                    victim.suspend()
-                    self.let_pass(fault.lasts_s)
-                    victim.resume()
+                _signal(victims, signal.SIGSTOP)
+                self.let_pass(fault.lasts_s)
+                _signal(victims, signal.SIGCONT)
                 told.given.append(self.next_row(label, row, self.file.recounted()))
             case _:
                 end = time.monotonic() + fault.lasts_s
-                with suppress(psutil.NoSuchProcess):
-                    while time.monotonic() < end and self.launched.running:
-                        victim.suspend()
-                        self._never.wait(_PART_S)
-                        victim.resume()
+                while time.monotonic() < end and self.launched.running:
+                    for number in (signal.SIGSTOP, signal.SIGCONT):
+                        _signal(victims, number)
                         self._never.wait(_PART_S)
                 told.given.append(self.next_row(label, row, self.file.recounted()))
 
@@ -395,16 +325,15 @@ class Run:
         if code:
             told.problem = self.launched.story()
         elif told.found.other:
-            told.problem = _first_difference(expected, found)
+            told.problem = first_difference(expected, found)
 
-    def _kill(self, victim: psutil.Process, fault: Fault, label: str, row: int, told: Disturbed) -> None:
-        """Kill a process, and others while the run comes back."""
+    def _kill(self, victims: Sequence[psutil.Process], fault: Fault, label: str, row: int, told: Disturbed) -> None:
+        """Kill processes, and others while the run comes back."""
         again = list(fault.again)
         while True:
             attempt = self._processes()
             begun = time.monotonic()
-            with suppress(psutil.NoSuchProcess):
-                victim.kill()
+            _signal(victims, signal.SIGKILL)
             masters = [process for process, words in attempt if words[:1] == ["master"]]
             self.wait(lambda: not any(map(_is_there, masters)), "the end of the master")  # noqa: B023  called here
             kept = self.file.recounted()
@@ -415,10 +344,9 @@ class Run:
             old = [process.pid for process, _ in attempt]
             fault, row = again.pop(0), kept
             self.let_pass(fault.later_s)
-            found = self._found(fault, old, kept)
-            if found is None:
+            victims = self._found(fault, old, kept)
+            if not victims:
                 return
-            victim = found
             label = f"kill {fault.role}, {'coming back' if self.file.rows <= kept else 'again'}"
 
     def next_row(self, label: str, row: int, kept: int, begun: float | None = None) -> Given:
@@ -434,16 +362,20 @@ class Run:
         while time.monotonic() < end and self.launched.running:
             self._never.wait(_LOOK_S)
 
-    def _found(self, fault: Fault, old: Sequence[int], kept: int | None = None) -> psutil.Process | None:
-        """The process that gets a fault, as soon as it is there; None if the run has ended, or goes on again."""
+    def _found(self, fault: Fault, old: Sequence[int], kept: int | None = None) -> list[psutil.Process]:
+        """Those that get a fault, as soon as they are there; nobody if the run has ended, or goes on again."""
         there: list[psutil.Process] = []
 
         def look() -> bool:
-            there[:] = [one for one, words in self._processes() if words[:1] == [fault.role] and one.pid not in old]
+            there[:] = [
+                one
+                for one, words in self._processes()
+                if one.pid not in old and (fault.role == EVERYBODY or words[:1] == [fault.role])
+            ]
             return bool(there) or (kept is not None and self.file.rows > kept)
 
         self.wait(look, f"a process of the role {fault.role}")
-        return there[int(fault.which * len(there))] if there else None
+        return there if fault.role == EVERYBODY else there[int(fault.which * len(there)) :][:1]
 
     def _processes(self) -> list[tuple[psutil.Process, list[str]]]:
         """Those that it has started, with the words of their titles, in the order of these."""
@@ -455,6 +387,12 @@ class Run:
                     if words[:1] == ["fmu-mesh"] and _is_there(process):
                         found.append((process, words[1:]))
         return sorted(found, key=lambda one: one[1])
+
+
+def _signal(processes: Sequence[psutil.Process], number: signal.Signals) -> None:
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):
+            process.send_signal(number)
 
 
 def _is_there(process: psutil.Process) -> bool:

@@ -14,9 +14,10 @@ import pytest
 from benchmarks import far
 from benchmarks.commands import RunFailed
 from benchmarks.comparing import Reference, compare
-from benchmarks.disturbing import FAULTS, ROLES, Differences, GrowingFile, differences, drawn_faults
+from benchmarks.disturbing import FAULTS, ROLES, drawn_faults
 from benchmarks.first_step import Started
 from benchmarks.jobs import JOBS, OTHER, Entry, Job, with_checkout
+from benchmarks.kept_rows import Differences, GrowingFile, differences
 from benchmarks.live_data import Watched, misplaced
 from benchmarks.publishing import BLOCKS, PAGE, PATIENCE_S, Figures, Host, markers, publish
 from benchmarks.recording import main as measure_recording
