@@ -41,7 +41,16 @@ from ..system.placement import manual_hosts, placed
 from ..system.plan import MASTER, RECORDER, NodePlan
 from ..wire.journal import JOURNAL
 from ..wire.refused_links import RefusedLinks
-from ..wire.runtime import box_of, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
+from ..wire.runtime import (
+    box_of,
+    leave_shared,
+    remove_stale_folders,
+    run_folder,
+    run_name,
+    shared_file,
+    socket_endpoint,
+    write_note,
+)
 from .child import Child, Process
 from .events import Event, OutputLine, Reachable, WasReset, decode_event
 from .fork_server import ForkServer, executed, executed_command, fork_server
@@ -338,6 +347,8 @@ class Launcher:
             self._server.close()
         while not self._happened.empty():
             self._happened.get()()
+        if (group := self._run.loaded.config.runtime.share_with) is not None:  # a master that was killed leaves it
+            leave_shared(shared_file(self._folder, group))
 
     def _result(self, files: Sequence[tuple[str, int]]) -> Outcome:
         """The outcome of a run that went well.

@@ -319,7 +319,9 @@ class LaunchStates:
     def error(self) -> FmuMeshError | None:
         """Why the run ended early: as the master says, or as this process saw it; None if it did not."""
         outcome = self.outcome
-        if outcome is None or any(loss.name in (GATEWAY, SERVER) for loss in self._lost):  # the master knows neither
+        lost = [loss.name for loss in self._lost]
+        # The master knows neither of these. A server that is lost after a run that went well has taken nothing from it.
+        if outcome is None or GATEWAY in lost or (SERVER in lost and outcome.error is not None):
             status = self._status
             return self._loss().at(*((status.point, status.time) if status else (0, self._terms.start_time)))
         if outcome.error is None:

@@ -38,7 +38,7 @@ from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Noted
 from ..wire.router_link import RouterLink
-from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_endpoint, write_note
+from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_endpoint, shared_file, write_note
 from ..wire.session import Wiring, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
@@ -336,7 +336,7 @@ def _shared(run: RunPlan, process: RunProcess, own: Wiring) -> tuple[str, ...]:
         text = f"mesh '{run.mesh}' cannot be shared with the group '{group}': its master only connects to a router"
         raise ConfigurationError(text, hint="With `zenoh.mode: peer`, or started by `launch`, it has a socket.")
     endpoint = shared_endpoint(process.folder, group)
-    process.stack.callback(leave_shared, endpoint)
+    process.stack.callback(leave_shared, shared_file(process.folder, group))
     return (endpoint,)
 
 

@@ -43,6 +43,7 @@ __all__ = [
     "runtime_folder",
     "share",
     "shared_endpoint",
+    "shared_file",
     "socket_endpoint",
     "this_host",
     "tidy_run_folder",
@@ -148,27 +149,34 @@ def why_not_shared(group: str) -> str | None:
     return f"you are not a member of the group '{group}' of this host"
 
 
-def shared_endpoint(folder: Path, group: str) -> str:
-    """The Zenoh endpoint of a socket for the members of a group, beside that of the master in the folder of a run.
+def shared_file(folder: Path, group: str) -> Path:
+    """The socket for the members of a group, beside that of the master in the folder of a run.
 
     It is in a folder of its own, which they can enter: that of the run, with the plan and the FMUs, stays private.
+    """
+    shared = f"fmu_mesh-{os.getuid()}.{grp.getgrnam(group).gr_gid}"
+    return Path(tempfile.gettempdir()) / shared / f"{folder.name}{_SOCKET}"
+
+
+def shared_endpoint(folder: Path, group: str) -> str:
+    """The Zenoh endpoint of `shared_file`, whose folder is made.
 
     Raises:
         ConfigurationError: the folder cannot be used, or its path is too long.
     """
-    number = grp.getgrnam(group).gr_gid
-    shared = _private(Path(tempfile.gettempdir()) / f"fmu_mesh-{os.getuid()}.{number}", others=0o027)
-    os.chown(shared, -1, number)
+    file = shared_file(folder, group)
+    shared = _private(file.parent, others=0o027)
+    os.chown(shared, -1, grp.getgrnam(group).gr_gid)
     shared.chmod(0o750)
-    for other in shared.glob(f"*{_SOCKET}"):  # of a master that was killed
+    for other in shared.glob(f"*{_SOCKET}"):  # of a master that was killed with its launcher
         with socket.socket(socket.AF_UNIX) as probe:
             try:
                 probe.connect(str(other))
             except ConnectionRefusedError:
-                leave_shared(f"unixsock-stream/{other}")
+                leave_shared(other)
             except OSError:  # it is gone meanwhile, or has too many connections
                 continue
-    return _endpoint_at(shared / f"{folder.name}{_SOCKET}")
+    return _endpoint_at(file)
 
 
 def share(endpoint: str) -> None:
@@ -178,9 +186,8 @@ def share(endpoint: str) -> None:
     file.chmod(0o770)
 
 
-def leave_shared(endpoint: str) -> None:
+def leave_shared(file: Path) -> None:
     """Remove a socket for a group, and its folder if it was the last one."""
-    file = Path(endpoint.partition("/")[2])
     for own in (file, file.with_name(f"{file.name}.lock")):
         own.unlink(missing_ok=True)
     with suppress(OSError):  # others are there

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import grp
+import os
 import re
 import signal
 from collections.abc import Mapping
@@ -103,6 +105,20 @@ def test_killed_process_ends_run_within_two_seconds_and_rows_before_are_kept(
     # Its last rows stay in the memory; the other node may be a window behind.
     assert kept - 1 <= point_in(message) <= kept - 1 + AUTO_WINDOW_POINTS
     assert_is_what_one_process_calculates(place, result)
+
+
+def test_a_killed_master_leaves_no_socket_for_a_group(place: Place) -> None:
+    group = grp.getgrgid(os.getegid()).gr_name
+    config = write_config(
+        place.folder, stop_time=FAR_S, simulation={"real_time_factor": 1}, runtime={"share_with": group}
+    )
+    launched = place.start("launch", config)
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 10, "10 rows")
+
+    launched.child("master").kill()
+
+    assert launched.wait() == 4
+    place.assert_nothing_left()
 
 
 @pytest.mark.parametrize("victim", ["delay", "master"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import random
 import re
 import sys
 from pathlib import Path
@@ -13,13 +14,16 @@ import pytest
 from benchmarks import far
 from benchmarks.commands import RunFailed
 from benchmarks.comparing import Reference, compare
+from benchmarks.disturbing import FAULTS, ROLES, drawn_faults
 from benchmarks.first_step import Started
 from benchmarks.jobs import JOBS, OTHER, Entry, Job, with_checkout
+from benchmarks.kept_rows import Differences, GrowingFile, differences
 from benchmarks.live_data import Watched, misplaced
 from benchmarks.publishing import BLOCKS, PAGE, PATIENCE_S, Figures, Host, markers, publish
 from benchmarks.recording import main as measure_recording
 from benchmarks.report import Report
 from benchmarks.running import Measured
+from benchmarks.soak import Sample, has_grown
 from benchmarks.targets import TARGETS, Figure, Target
 from benchmarks.task import Member, Outcome, System
 
@@ -280,6 +284,56 @@ def test_growth_of_a_run_is_seen_from_a_part_of_it_on() -> None:
     seen = Watched([90.0, 100.0, 104.0, 101.0], [30, 40, 41, 40])
 
     assert seen.grown(0.25) == (100.0, 104.0, 40, 41)
+
+
+def test_faults_of_a_run_are_decided_by_its_seed() -> None:
+    first, again, other = (drawn_faults(random.Random(seed), 9, FAULTS, ROLES, 0.5) for seed in (1, 1, 2))  # noqa: S311  faults
+
+    assert first == again != other
+    assert [fault.after for fault in first] == sorted(fault.after for fault in first)
+    assert {len(fault.again) for fault in first} > {0}
+    assert all(not fault.again for fault in first if fault.kind != "kill")
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (b"time,y\n0,1\n1,2\n2,3\n", Differences()),
+        (b"time,y\n0,1\n2,3\n", Differences(lost=1, other=True)),
+        (b"time,y\n0,1\n1,2\n1,2\n2,3\n", Differences(doubled=1, other=True)),
+        (b"time,y\n0,1\n1,2\n2,4\n", Differences(other=True)),
+        (b"", Differences(lost=3, other=True)),
+    ],
+    ids=["equal", "lost", "doubled", "another value", "no file"],
+)
+def test_rows_that_are_lost_or_doubled_are_counted(found: bytes, expected: Differences) -> None:
+    assert differences(b"time,y\n0,1\n1,2\n2,3\n", found) == expected
+
+
+def test_rows_are_counted_after_a_cut_and_a_new_file(tmp_path: Path) -> None:
+    path = tmp_path / "result.csv"
+    growing = GrowingFile(path)
+    assert growing.rows == 0
+    path.write_text("time\n0\n1\n2")
+    assert growing.rows == 2
+    path.write_text("time\n0\n1\n2\n")
+    assert growing.rows == 3
+    path.write_text("time\n0\n")
+    assert growing.rows == 1
+    path.rename(tmp_path / "old.csv")
+    path.write_text("time\n0\n1\n2\n3\n")
+    assert growing.rows == 4
+
+
+def test_what_grows_in_a_long_run_is_told() -> None:
+    steady = [Sample(float(at), 100.0, 50.0, 1.0, 9.0) for at in range(40)]
+    leaking = [Sample(float(at), 100.0 + at, 50.0 + at, 1.0, 9.0) for at in range(40)]
+
+    assert has_grown(steady) == []
+    assert has_grown(leaking) == [
+        "memory_mb has grown from 114.5 to 134.5",
+        "open_files has grown from 64.5 to 84.5",
+    ]
 
 
 UNSEEN = re.compile(

@@ -392,6 +392,14 @@ def test_a_lost_server_is_the_reason_whatever_the_master_says(launch: Launch) ->
     assert launch.raised().message == "the fork server was lost: its process was ended by SIGKILL"
 
 
+def test_a_server_lost_after_the_last_point_takes_nothing_away(launch: Launch) -> None:
+    launch.reported(DONE)
+    launch.ended((SERVER, -signal.SIGKILL), ("pendulum", 4), ("both", 4), (THE_MASTER, 4))
+    launch.ends()
+
+    assert launch.states.error() is None
+
+
 def test_a_server_that_does_not_answer_is_killed(launch: Launch) -> None:
     for name in (THE_MASTER, "pendulum", "both"):
         launch.ends_silently(name)
@@ -436,7 +444,7 @@ def test_a_start_that_failed_is_ended_like_any_other() -> None:
 
 
 def test_an_end_that_comes_after_everything_is_still_told(launch: Launch) -> None:
-    launch.reported(DONE)
+    launch.fails(Interrupted("SIGTERM was received"))
     launch.ended(*((name, 0) for name in ("pendulum", "both", THE_MASTER)))
     launch.ends_silently(SERVER)
     launch.passes(1.0)
