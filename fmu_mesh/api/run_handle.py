@@ -455,7 +455,7 @@ class Run:
             0
 
         Args:
-            state: "starting", "initializing", "running", "paused", "stopping", "done" or "failed".
+            state: "starting", "initializing", "restarting", "running", "paused", "stopping", "done" or "failed".
             timeout: the longest time to wait in s.
 
         Raises:

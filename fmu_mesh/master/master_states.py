@@ -37,6 +37,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.deadlines import Deadlines
 from ..errors import (
@@ -59,7 +60,17 @@ from ..wire.ways import Ways
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "RaiseSent", "SendToAll"]
+__all__ = [
+    "Action",
+    "AnswerAll",
+    "Commanded",
+    "EndAll",
+    "FollowClock",
+    "MasterStates",
+    "RaiseGrant",
+    "RaiseSent",
+    "SendToAll",
+]
 
 
 class AnswerAll(msgspec.Struct, frozen=True):
@@ -103,13 +114,28 @@ class EndAll(msgspec.Struct, frozen=True):
 Action = AnswerAll | FollowClock | RaiseGrant | RaiseSent | SendToAll | EndAll
 
 
+class Commanded(msgspec.Struct, frozen=True):
+    """What a command has changed, for the journal: where the mesh pauses, or the point at which it is stopped."""
+
+    command: str
+    hold: int | None
+    stopped_at: int | None = None
+
+
+class _Course(msgspec.Struct, frozen=True):
+    """Where the mesh pauses; and after a restart, the last point that was seen before, and where it was stopped."""
+
+    hold: int | None
+    replays_to: int
+    stopped_at: int | None
+
+
 class MasterStates:
     """The state of one run, as its master sees it.
 
     Attributes:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
-        hold: the point at which all nodes pause.
         reports: how nodes have ended, by name.
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
@@ -119,7 +145,9 @@ class MasterStates:
     most as long as a heartbeat.
     """
 
-    def __init__(self, plan: Plan, *, paused: bool = False) -> None:
+    def __init__(
+        self, plan: Plan, *, paused: bool = False, replays_to: int = 0, commanded: Commanded | None = None
+    ) -> None:
         self.plan = plan
         self.state: MeshState = "starting"
         self.deadlines = Deadlines.of(
@@ -127,7 +155,8 @@ class MasterStates:
         )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
-        self.hold = 0 if paused else None
+        again = commanded or Commanded("", 0 if paused else None)
+        self._course = _Course(again.hold, replays_to, again.stopped_at)
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -137,6 +166,15 @@ class MasterStates:
         self._moved_at: float | None = None  # when any node has moved; None: since the last decision
         self._slowest_moved_at: float | None = None
         self._sent_at = 0.0
+
+    @property
+    def hold(self) -> int | None:
+        """The point at which all nodes pause."""
+        return self._course.hold
+
+    @hold.setter
+    def hold(self, point: int | None) -> None:
+        self._course = replace(self._course, hold=point)
 
     @property
     def is_over(self) -> bool:
@@ -162,7 +200,14 @@ class MasterStates:
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
         last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
+        if self.is_replaying and self.plan.system.config.simulation.real_time_factor > 0.0:
+            last_point = min(last_point, self._course.replays_to)
         return last_point if hold is None else min(hold, last_point)
+
+    @property
+    def is_replaying(self) -> bool:
+        """Whether the run has not yet come to where it was before a restart."""
+        return self._course.replays_to > 0 and self.granting.slowest < self._course.replays_to
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
@@ -249,7 +294,7 @@ class MasterStates:
                 text = f"reset by a command at point {slowest}"
                 self.fail(RunReset(text, point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
-            self._actions.append(FollowClock(granting.reached, command.paced))
+            self._actions.append(FollowClock(granting.reached, command.paced and not self.is_replaying))
         self._moved_at = self._slowest_moved_at = None
         if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
             self._sent_at = -math.inf
@@ -329,7 +374,9 @@ class MasterStates:
     def _wait_for_initialization(self, now: float) -> None:
         if self.granting.slowest >= 0:
             self._enter("running" if self.hold is None else "paused", now)
-            self._actions.append(FollowClock(0))
+            self._actions.append(FollowClock(0, paced=not self.is_replaying))
+            if self._course.stopped_at is not None and self.plan.grid.stop_time is None:
+                self._stop(self._course.stopped_at)
             self._moved_at = self._slowest_moved_at = now
             return
         missing = [node for node, point in self.granting.progress.items() if point < 0]
@@ -338,6 +385,13 @@ class MasterStates:
 
     def _go_on(self, now: float, paced: int, stopped: Sequence[str]) -> None:
         granting = self.granting
+        if self._course.replays_to and not self.is_replaying:
+            self._course = replace(self._course, replays_to=0)
+            self._actions.append(FollowClock(granting.reached))
+        stopped_at = self._course.stopped_at if self.plan.grid.stop_time is not None else None
+        if stopped_at is not None and not self.is_replaying:
+            self._stop(stopped_at)
+            return
         if granting.slowest >= granting.last_point:
             if isinstance(self.ended_by, NotFinite):
                 self.fail(self.ended_by)

@@ -35,7 +35,13 @@ StartValues = Annotated[Values, Option("start values by `instance.variable`", "-
 Processes = Annotated[bool, Option("False: run everything in this one process", "--local")]
 MemoryLimit = Annotated[int, Option("the most bytes of results in memory; a run ends there, or is refused", least=0)]
 Restarts = Annotated[
-    int, Option("restart from the first point when a process is lost, at most N times", "--restarts", "N", least=0)
+    int | None,
+    Option(
+        "start all processes again when one is lost, at most N times; None: as `recovery` says",
+        "--restarts",
+        "N",
+        least=0,
+    ),
 ]
 OnProgress = Annotated[Callable[["MeshStatus"], object] | None, Option("called about ten times per second")]
 OnEvent = Annotated[Callable[["Event"], object] | None, Option("called with every event of `fmu_mesh.run.events`")]
@@ -63,11 +69,13 @@ class OpenOptions(VariantOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
+    state: Annotated[File, Option("go on from this state, which `System.save` has written")] = None
 
 
-class BatchOptions(OpenOptions, frozen=True):
+class BatchOptions(VariantOptions, frozen=True):
     """What `Mesh.batch` takes."""
 
+    start_values: StartValues = None
     threads: Annotated[
         int, Option("step the copies on so many threads, each with a library of its own of each FMU", least=1)
     ] = 1
@@ -136,7 +144,7 @@ class StartOptions(CallOptions, frozen=True, kw_only=True):
 
     processes: Processes = True
     memory_limit: MemoryLimit = MEMORY_LIMIT
-    restarts: Restarts = 0
+    restarts: Restarts = None
     on_progress: OnProgress = None
     on_event: OnEvent = None
 
@@ -146,7 +154,7 @@ class RunOptions(PlanOptions, frozen=True, kw_only=True):
 
     processes: Processes = True
     memory_limit: MemoryLimit = MEMORY_LIMIT
-    restarts: Restarts = 0
+    restarts: Restarts = None
     on_progress: OnProgress = None
     on_event: OnEvent = None
 
