@@ -388,6 +388,7 @@ class MasterStates:
         if self._course.replays_to and not self.is_replaying:
             self._course = replace(self._course, replays_to=0)
             self._actions.append(FollowClock(granting.reached))
+            return  # ``paced`` is from before: nothing limited it
         stopped_at = self._course.stopped_at if self.plan.grid.stop_time is not None else None
         if stopped_at is not None and not self.is_replaying:
             self._stop(stopped_at)

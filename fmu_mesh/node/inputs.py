@@ -213,7 +213,9 @@ class TimedInputs(AroundNativeSteps):
     def _set_changes(self, step: int) -> None:
         """Set what changes in own step ``step``."""
         time = self._time(step)
-        self._take_arrived(step)
+        self.take_given(step)
+        for ask in self._asked:
+            ask()
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
         if self._last.sent:
             changes |= self._fall_back(step, time)
@@ -233,15 +235,13 @@ class TimedInputs(AroundNativeSteps):
             self._set_in_step(others)
         self._used.update((name, value) for name, value in changes.items() if name in self._trajectories)
 
-    def _take_arrived(self, step: int) -> None:
-        """Take what has come by keys: in an earlier run, or now."""
+    def take_given(self, step: int) -> None:
+        """Take what came from outside up to own step ``step``, in an earlier run or before a restart."""
         while self._next is not None and self._next[1] <= step * self._points:
             name, _, when, value = self._next
             self._step = step
             self.add(name, value, when, ENDLESS)  # when the first run took it, there was room
             self._next = next(self._recorded, None)
-        for ask in self._asked:
-            ask()
 
     def _fall_back(self, step: int, time: float) -> dict[str, Value]:
         """What inputs fall back to in own step ``step``, which begins at ``time`` (s)."""

@@ -268,7 +268,7 @@ class Node:
     def _meet(self) -> Welcome:
         """Join the mesh: afterwards all other nodes are ready."""
         try:
-            self.server.serve(self._runners)
+            self.server.serve(self._runners, self._journal.last_point)
             welcome = self._membership.join()
         except MeshLost as error:
             if not self._membership.given_up:

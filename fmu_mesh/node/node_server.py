@@ -28,6 +28,7 @@ from ..wire.values import json_encoding
 from ..wire.views import AuditEntry, LogLine
 from .activity import Activity
 from .answering import Answers, Job
+from .inputs import TimedInputs
 from .key_ends import KeyEnds
 from .stepping import Runner
 from .streams import InstanceStreams, WaitingRows
@@ -105,6 +106,7 @@ class NodeServer:
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._early_lines: list[LogLine] = []
         self._begun = self.is_live = False
+        self._live_from = 0
         self._visible = threading.Event()
         self._closing, self._hurries = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
@@ -121,8 +123,13 @@ class NodeServer:
 
     # --- called by the main thread
 
-    def serve(self, runners: Mapping[str, Runner]) -> None:
-        """From now on values can be read and set, and streams can be subscribed."""
+    def serve(self, runners: Mapping[str, Runner], given_to: int = 0) -> None:
+        """From now on values can be read and set, and streams can be subscribed.
+
+        After a restart, nothing is set before all values up to the point ``given_to`` were given again: the order of
+        the values of one point is theirs.
+        """
+        self._live_from = max(self._plan.attempt.replays_to, given_to)
         self.keys.serve(runners)
         self._activity.serve(runners, self.keys)
         for runner in runners.values():
@@ -145,7 +152,7 @@ class NodeServer:
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers, and to keys."""
         if not self.is_live:
-            if any(own.runner.point < self._plan.attempt.replays_to for own in self._streams):
+            if any(own.runner.point < self._live_from for own in self._streams):
                 return
             self._go_live()
         self.keys.publish_now()
@@ -176,6 +183,9 @@ class NodeServer:
     def _go_live(self) -> None:
         """Set the values that came before, and publish from here on."""
         self.is_live = True
+        for streams in self._streams:
+            if isinstance(inputs := streams.runner.instance, TimedInputs):
+                inputs.take_given(streams.runner.step)
         self._answers.begin()
         self.keys.begin()
         for streams in self._streams:

@@ -80,10 +80,15 @@ class Journal(Generic[Entry]):
 
 
 class NodeJournal(Journal[SetValue | list[KeyValue]]):
-    """What the instances of a node got from outside; ``path`` as for `Journal`."""
+    """What the instances of a node got from outside; ``path`` as for `Journal`.
+
+    Attributes:
+        last_point: after `given`, the last point with a value: a node may have been ahead of all rows that were seen.
+    """
 
     def __init__(self, path: str) -> None:
         super().__init__(path, SetValue | list[KeyValue])
+        self.last_point = 0
 
     def keep(self, news: object) -> None:
         """Append what a node tells the recorder, if an instance got a value; the errors are those of `add`."""
@@ -91,7 +96,7 @@ class NodeJournal(Journal[SetValue | list[KeyValue]]):
             self.add(news)
 
     def given(self) -> Mapping[str, Sequence[KeyValue]]:
-        """What each instance got before a restart, in its order; the errors are those of `entries`."""
+        """What each instance got before a restart, by point and in its order; the errors are those of `entries`."""
         given: dict[str, list[KeyValue]] = {}
         for entry in self.entries():
             own = entry
@@ -99,4 +104,7 @@ class NodeJournal(Journal[SetValue | list[KeyValue]]):
                 own = [(f"{own.instance}.{own.variable}", own.point, own.time, own.value)]
             for value in own:
                 given.setdefault(value[0].partition(".")[0], []).append(value)
+        for values in given.values():
+            values.sort(key=lambda value: value[1])
+            self.last_point = max(self.last_point, values[-1][1])
         return given
