@@ -42,6 +42,7 @@ from msgspec import to_builtins
 from msgspec.structs import astuple
 
 from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, RunReset
+from ..files import Kept
 from ..results.growth import GrowthWatch, ReadColumn
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
@@ -113,6 +114,8 @@ class Recorder:
         memory: that of the master's process, if others exchange rows through it or through its row streams.
         mirror_of: where the rows of a link come to that has a row stream.
         audit: how often something has come from outside, and what, for the metadata.
+        on_flush: called about five times a second, with what the operating system has of each file; its error ends the
+            run.
 
     Use it as a context manager: the thread runs inside; afterwards the files have all complete rows.
     """
@@ -131,6 +134,7 @@ class Recorder:
         memory: HostMemory | None = None,
         mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
         audit: Callable[[], tuple[int, object]] = lambda: (0, None),
+        on_flush: Callable[[Sequence[Kept]], None] = lambda _kept: None,
     ) -> None:
         self._plan = plan
         self._mirror_of, self._audit, self._audited, self._audit_at = mirror_of, audit, 0, -math.inf
@@ -141,7 +145,7 @@ class Recorder:
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
         self._files = RecordFiles(files, growth, notes)
-        self._wanted = wanted
+        self._wanted, self._on_flush = wanted, on_flush
         self._written = 0
         self._told = 0
         self._flushed = 0.0
@@ -264,6 +268,7 @@ class Recorder:
                     self._flushed = now
                     self._note_audit(now)
                     self._files.flush()
+                    self._on_flush(self._files.kept)
                     self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:
                     continue
