@@ -82,14 +82,6 @@ class RunThread:
         self._failure: BaseException | None = None
         self._warned = False
         self._changing = threading.RLock()  # a signal handler may interrupt the handler before it
-        self._memory = memory_of(plan)
-        if self._memory is not None:
-            check_memory(plan, settings.memory_limit)
-            try:
-                self._memory.parent.mkdir(mode=0o700)
-            except FileExistsError as error:
-                text = f"this plan of '{plan.mesh}' runs already"
-                raise CallRefused(text, hint="Make another one for another run.") from error
         self._directory: RunDirectory | None = None
         if settings.processes:
             for text in warnings_of(plan):  # a certificate that cannot be used raises
@@ -101,6 +93,14 @@ class RunThread:
         if settings.resume and self._directory is None:
             text = f"the run of '{plan.mesh}' cannot be resumed: it keeps nothing"
             raise ConfigurationError(text, hint="`recovery: {directory: DIR}` keeps what this needs, in processes.")
+        self._memory = memory_of(plan)
+        if self._memory is not None:
+            check_memory(plan, settings.memory_limit)
+            try:
+                self._memory.parent.mkdir(mode=0o700)
+            except FileExistsError as error:
+                text = f"this plan of '{plan.mesh}' runs already"
+                raise CallRefused(text, hint="Make another one for another run.") from error
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
         self._thread.start()

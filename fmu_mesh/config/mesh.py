@@ -281,7 +281,6 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
     directory: Annotated[
         str | None,
         Meta(
-            min_length=1,
             description="Folder, relative to this file, for what `launch --resume` needs to go on with the run after a "
             "power cut, or after `launch` was killed; null: none.",
         ),

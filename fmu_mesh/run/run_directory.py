@@ -118,10 +118,13 @@ class RunDirectory:
         """Give the result files, of which nobody writes one and which have so many rows, and the journals to the disk.
 
         Raises:
-            OSError: they cannot be written.
+            ConfigurationError: they cannot be written.
         """
         ends = zip(map(_growing, self._records), rows, strict=True)
-        _sync(self._folder, self._records, [Kept(own, file.stat().st_size if own else 0) for file, own in ends])
+        try:
+            _sync(self._folder, self._records, [Kept(own, file.stat().st_size if own else 0) for file, own in ends])
+        except OSError as error:
+            raise _unwritable(self._folder, error) from error
 
     def clear(self) -> None:
         """The run has ended, and has nothing to resume: give its results to the disk, and remove what is here of it."""
@@ -129,7 +132,8 @@ class RunDirectory:
             with suppress(OSError):
                 _give_to_disk(Path(file))
         for path in (self._folder / _RUN, self._folder / _ON_DISK, *_journals(self._folder).glob(f"*{JOURNAL}")):
-            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                path.unlink()
 
     def has_rows(self) -> bool:
         """Whether there is something to resume: rows that the disk has, or something that came from outside."""
