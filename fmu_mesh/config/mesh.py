@@ -281,8 +281,8 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
     directory: Annotated[
         str | None,
         Meta(
-            description="Folder, relative to this file, for what `launch --resume` needs to go on with the run after a "
-            "power cut, or after `launch` was killed; null: none.",
+            description="Folder, relative to this file, for what is needed to resume the run after a power cut, or "
+            "after its launcher was killed; null: none."
         ),
     ] = None
 

@@ -6,6 +6,7 @@ import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import zipfile
 from collections.abc import Iterator
@@ -222,7 +223,7 @@ def test_a_directory_has_one_run_at_a_time(place: Place) -> None:
 
     assert second.wait() == 2
     assert "another run uses `recovery.directory`" in second.message
-    launched.signal(psutil.signal.SIGINT)
+    launched.signal(signal.SIGINT)
     assert launched.wait() == 130
     assert "`--resume` goes on with it" in launched.errors
 
@@ -236,7 +237,8 @@ def test_a_full_disk_ends_the_run_in_words(place: Place) -> None:
     if subprocess.run([*mounting, mount], check=False, capture_output=True).returncode:
         pytest.skip("no file system can be mounted here")
 
-    launched = place.start("launch", config, "--no-progress", prefix=[*mounting, f'{mount} && exec "$@"', "sh"])
+    paced = "--no-progress", "--real-time-factor", "1"
+    launched = place.start("launch", config, *paced, prefix=[*mounting, f'{mount} && exec "$@"', "sh"])
 
     assert launched.wait() == 2, launched.story()
     assert f"`recovery.directory` ('{kept}') cannot be written: No space left on device" in launched.errors
