@@ -630,19 +630,22 @@ class Mesh:
 
         Raises:
             ConfigurationError: the configuration, a model or a start value is wrong; carries all findings. Or two
-                instances need a process of their own each.
+                instances need a process of their own each; or the state cannot be read, or is not one of this mesh.
             FmuError: an instance cannot be opened or initialized. Nothing is left behind.
         """
-        from .open_system import System  # noqa: PLC0415  only this needs it
+        from ..run.state_file import StateFile  # noqa: PLC0415  only this needs it
+        from .open_system import System  # noqa: PLC0415  as above
 
+        state = StateFile.read(Path(options.state)) if options.state is not None else None
         run, given = self._opened(options), options.given()
+        given.pop("state", None)
         values, known = deepcopy(self._plain._replace(file=self._shown_file)), KnownModels.of(run)
 
         def plan_again(start_values: Mapping[str, Any]) -> RunPlan:
             own = PlanOptions(**given | {"start_values": given.get("start_values", {}) | start_values})
             return without_keys(planned(values, own, own.on_notice or log.info, known))
 
-        return System(run, plan_again)
+        return System(run, plan_again, state)
 
     @takes(BatchOptions)
     def batch(self, copies: int, options: BatchOptions) -> Batch:
@@ -675,11 +678,11 @@ class Mesh:
         limit = options.memory_limit if options.record is not None else None
         return Batch(self._opened(options), copies, options.threads, options.processes, memory_limit=limit)
 
-    def _opened(self, options: OpenOptions) -> RunPlan:
+    def _opened(self, options: OpenOptions | BatchOptions) -> RunPlan:
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `set`.")
         given = options.given()
-        for own in ("threads", "processes", "memory_limit"):
+        for own in ("state", "threads", "processes", "memory_limit"):
             given.pop(own, None)
         return without_keys(self.plan(**given))
 

@@ -21,19 +21,22 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from msgspec.structs import replace
 
-from ..errors import CallRefused, ErrorReport, FmuError, TerminationRequested, UnknownName
+from ..errors import CallRefused, ErrorReport, FmuError, FmuMeshError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
 from ..instances.kept_models import KeptModels
+from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..run.local_system import LocalSystem, SavedSystem, forwarded, opening_of
 from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
 from ..run.preparing import OtherStartValues
 from ..run.run_plan import RunPlan
+from ..run.state_file import StateFile, write_state
 from ..simtime import ENDLESS
+from ..system.states import stateless
 from ..text import listed, option_text, shown
-from ..variables.value_conversion import ValueRefused, checker
-from ..variables.value_types import DTYPES
+from ..variables.value_conversion import ValueRefused, checker, to_value
+from ..variables.value_types import DTYPES, PlainValue
 from .system_state import SystemState
 
 __all__ = ["System"]
@@ -70,17 +73,26 @@ class System:
     Args:
         run: the plan of the run.
         plan_again: plans it again for a reset, with these start values besides; None: from its configuration.
+        state: where it begins; None: at point 0.
 
     Raises:
+        ConfigurationError: the state is not one of this mesh.
         NotInOneProcess: two instances cannot share a process.
         FmuError: an FMU cannot be opened or initialized. Nothing is left behind.
     """
 
-    def __init__(self, run: RunPlan, plan_again: Callable[[Mapping[str, Any]], RunPlan] | None = None) -> None:
+    def __init__(
+        self,
+        run: RunPlan,
+        plan_again: Callable[[Mapping[str, Any]], RunPlan] | None = None,
+        state: StateFile | None = None,
+    ) -> None:
+        set_again = state.check(run) if state is not None else {}
         self._resets = OtherStartValues(run, plan_again, loads=False)
         self._plan = plan = run.plan
         OneProcess().check(plan, run.contents)
         self._run = run
+        self._others: Mapping[str, Mapping[str, PlainValue]] = {}  # start values that are not as in the plan
         self._grid = plan.grid
         self._last = plan.grid.last_point
         self._thread = get_ident()
@@ -98,6 +110,12 @@ class System:
         self._release = weakref.finalize(self, _release, local, folder, self._thread)
         try:
             local.start(self._opened)
+            if state is not None:
+                with kept_state():
+                    local.load(state.head.point, state.states)
+                    for name, values in set_again.items():
+                        variables = {v.name: v for v in plan.system.instances[name].description.variables}
+                        local.set(name, {own: to_value(value, variables[own]) for own, value in values.items()})
         except BaseException:
             self.close()
             raise
@@ -280,8 +298,11 @@ class System:
             for instance, own in checked.items():
                 self._local.set(instance, own)
 
-    def save(self) -> SystemState:
+    def save(self, file: str | Path | None = None) -> SystemState:
         """Save the state of the whole system: every instance, and the values between them (FMI 2.0, 2.1.8).
+
+        With ``file``, the state is also written there, and `Mesh.open` goes on from it at any time in another process:
+        ``mesh.open(state="a.state")``. Every float is then that of this system, if it goes on from here.
 
         The steps that follow are those of a system that was not saved. One exception: where the FMU of a state is
         solved by CVode (model exchange), the solver starts anew, so later floats may differ in their last digits. They
@@ -298,23 +319,40 @@ class System:
             ...     ends[0] == ends[1]
             True
 
+        Args:
+            file: where the state is written; a file of this name is replaced. None: nowhere.
+
         Returns:
             The state. It is freed with the object, with its `close`, or with the system.
 
         Raises:
-            CallRefused: an FMU cannot get and set its state; or see `close`.
-            FmuError: an FMU failed. Only `reset` and `close` are allowed now.
+            CallRefused: an FMU cannot get and set its state, or write it; or see `close`.
+            ConfigurationError: the file cannot be written.
+            FmuError: an FMU failed: only `reset` and `close` are allowed now. Or the state of an instance cannot be
+                written, as that of a component with an attribute that is no plain value: nothing has changed.
         """
         self._demand("save")
+        if file is not None and not isinstance(file, str | Path):
+            raise CallRefused(f"{option_text('file', file)}: expected the name of a file")
         instances = self._plan.system.instances
         without = [name for name, own in instances.items() if not own.description.can_get_and_set_state]
         if without:
             why = "as the model description says (canGetAndSetFMUstate)"
             text = f"the state of {listed(without)} cannot be saved, {why}."
             raise CallRefused(text, instance=without[0], hint="Open the mesh again to start from its first point.")
+        lasting = stateless(self._plan.system, keys=False) if file is not None else {}
+        for name, why in lasting.items():
+            raise CallRefused(f"its state cannot be written to a file: {why}.", instance=name)
         self._free_lost()
         with self._changing():
             saved = self._local.save()
+        if file is not None:
+            try:
+                run = replace(self._run, plan=self._plan)
+                write_state(Path(file), run, self._others, saved.point, self._local.packed(saved))
+            except FmuMeshError:
+                self._local.free(saved)
+                raise
         state = SystemState(saved.point, partial(self._lost.append, saved))
         self._saved[state] = saved
         return state
@@ -394,14 +432,14 @@ class System:
     def _begin_again(self, start_values: Mapping[str, Any] | None) -> None:
         """Initialize all instances again."""
         values = dict(ResetOptions(start_values=start_values).start_values or {})
-        self._plan, others = self._resets.of_reset(values)
+        self._plan, self._others = self._resets.of_reset(values)
         self._getters.clear()
         self._setters.clear()
         self._first = None
         for state in self._saved:
             self._saved[state] = None
         with self._changing():
-            self._local.start(self._opened, self._plan, others)
+            self._local.start(self._opened, self._plan, self._others)
             instances = self._plan.system.instances.values()
             if not values and all(own.description.can_get_and_set_state for own in instances):
                 self._first = self._local.save()

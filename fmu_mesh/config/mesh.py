@@ -263,6 +263,14 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
         DeadlineSeconds,
         Meta(description="For terminating and freeing an FMU, in s."),
     ] = 30.0
+    router: Annotated[
+        DeadlineSeconds,
+        Meta(description="For a process that starts, until its router, or the socket of the master, is there, in s."),
+    ] = 20.0
+    write: Annotated[
+        DeadlineSeconds,
+        Meta(description="For each write to a result file, and for closing it, in s: a network disk may not answer."),
+    ] = 60.0
 
 
 class RecoveryConfig(Base, frozen=True, kw_only=True):

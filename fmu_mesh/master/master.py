@@ -46,6 +46,7 @@ from .. import __version__
 from ..awake import AwakeClock
 from ..errors import (
     ConfigurationError,
+    DeadlineExceeded,
     FmuMeshError,
     Interrupted,
     MeshLost,
@@ -226,8 +227,11 @@ class Master:
         server.serve(keys.report("*"), self._take_report, of_run=True)
         server.watch(keys.node("*"), self._members.token_changed, of_run=True)
 
-    def run(self) -> None:
+    def run(self, check: Callable[[], None] = lambda: None) -> None:
         """Run the mesh to its last point.
+
+        Args:
+            check: called several times a second; an error that it raises ends the run.
 
         Raises:
             FmuMeshError: why the run ended early; all nodes have been informed.
@@ -236,6 +240,10 @@ class Master:
         self._awake = awake
         try:
             while not states.is_over:
+                try:
+                    check()
+                except FmuMeshError as error:
+                    states.fail(error)
                 pause_s = self._decide(awake())
                 if not states.is_over:
                     self._turn(min(pause_s, STATUS_S, states.deadlines.heartbeat))
@@ -250,6 +258,8 @@ class Master:
                     limit_s = states.deadlines.finish if asked else _LAST_WORDS_S
                     self._inbox.wait_until(lambda: self._members.have_left, limit_s)
                 undeclare_all([own for own in (self._run_token, self._token) if own is not None])
+        if isinstance(states.failure, DeadlineExceeded):
+            states.failure.with_hint(self._server.waits(states.failure.point or 0))
         if states.failure is not None:
             raise states.failure
 

@@ -190,6 +190,11 @@ class Engine(ABC):
             runner.flush()
 
     @property
+    def granted(self) -> int:
+        """The point up to which the master lets nodes step; from any thread."""
+        return int(self._memory.grant.value)
+
+    @property
     def covered(self) -> int:
         """The last point for which all outputs of this node are known."""
         return min(runner.covered for runner in self.runners)
@@ -305,7 +310,7 @@ class PlainEngine(Engine):
             member.stage = Stage.IN_PYTHON
             runner.instance.do_step(step)
             if not runner.is_finite.check(step + 1):
-                raise runner.is_finite.error(step + 1, runner.grid)
+                runner.not_finite(step)
         except FmuMeshError as error:
             place.stopped = 1
             runner.is_finite.explain(error)

@@ -56,8 +56,8 @@ from ..wire.messages import (
     RESET,
     NewStart,
     NodeReport,
+    Noted,
     SetValue,
-    Stiff,
     decode_json,
     encode_news,
 )
@@ -221,7 +221,7 @@ class Node:
 
         self._inbox.post(end, first=True)
 
-    def tell_recorder(self, news: SetValue | AuditEntry | Stiff | Sequence[KeyValue]) -> None:
+    def tell_recorder(self, news: SetValue | AuditEntry | Noted | Sequence[KeyValue]) -> None:
         """What the metadata of results and the audit get, such as a value that another program has set."""
         self._journal.keep(news)
         self._put_set(encode_news(news))

@@ -229,6 +229,8 @@ class NodeServer:
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._activity.status(name)))
+        for line in self._activity.look_at_waits():
+            self._publish_log(line)
         if (hang := self._activity.look_at_steps()) is not None:
             self._on_hang(hang)
 

@@ -15,6 +15,7 @@ from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
 from ..system.schedule import Course, Schedule
 from ..system.series_files import course_of
+from ..system.states import stateless
 from ..system.system import Connection, SystemInstance
 from ..system.value_map import map_text
 from ..text import listed, short_number, short_path, shown
@@ -42,6 +43,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Inputs that are not connected", _free_inputs(plan)),
         ("Timeouts", _timeouts(plan)),
         ("Initialization", _initialization(plan)),
+        ("State files", _states(plan)),
         ("Recorded", _recorded(plan)),
         ("Topics in ROS", table([own.cells for own in plan.system.topics], indent=2)),
         ("Warnings", _warnings(plan)),
@@ -250,6 +252,15 @@ def _initialization(plan: Plan) -> list[str]:
             )
             lines[-1:-1] = [f"  {until} iterated, beginning with {', '.join(assumed)}"]
     return lines
+
+
+def _states(plan: Plan) -> list[str]:
+    """Which instances have a state that outlives their process, and why others have none; nothing if all have one."""
+    if not (without := stateless(plan.system)):
+        return []
+    able = [name for name in plan.system.instances if name not in without]
+    lines = [f"  {', '.join(able)}: can be written"] if able else []
+    return [*lines, *(f"  {name}: cannot be written: {why}" for name, why in without.items())]
 
 
 def _recorded(plan: Plan) -> list[str]:

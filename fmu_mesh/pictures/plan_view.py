@@ -13,6 +13,7 @@ from ..rings.library import why_no_library
 from ..system.input_timeouts import InputTimeout
 from ..system.placement import two_trips
 from ..system.plan import Plan
+from ..system.states import stateless
 from ..system.value_map import map_words
 from ..text import counted
 from ..variables.value_conversion import to_plain
@@ -35,6 +36,7 @@ class PlannedInstance(msgspec.Struct, frozen=True):
 
     Attributes:
         host: the host of `deploy.hosts` on which it runs; None: that of `launch`.
+        stateless: why its state cannot be written to a file; None if it can.
     """
 
     name: str
@@ -45,6 +47,7 @@ class PlannedInstance(msgspec.Struct, frozen=True):
     origins: dict[str, PlannedOrigin]
     timeouts: tuple[InputTimeout, ...] = ()
     host: str | None = None
+    stateless: str | None = None
 
 
 class PlannedConnection(msgspec.Struct, frozen=True):
@@ -139,6 +142,7 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
     closing = {str(connection) for connection in plan.closing}
     connected = {(c.target_instance, c.target.name) for c in plan.connections}
     connected |= {(own.instance, own.variable) for own in system.keys if own.direction == "in"}
+    without = stateless(system)
     instances = [
         PlannedInstance(
             own.name,
@@ -153,6 +157,7 @@ def plan_view(plan: Plan, loaded: LoadedConfig) -> PlanView:
             },
             own.timeouts,
             plan.nodes[own.node].host,
+            without.get(own.name),
         )
         for own in system.instances.values()
     ]

@@ -5,12 +5,15 @@ Looks everything up once, before the first step. Knows no other instance but thr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ..errors import InitializationFailed, NotFinite
+import msgspec
+from numpy.typing import NDArray
+
+from ..errors import FmuError, InitializationFailed, NotFinite
 from ..instances.call_guard import Guarded
 from ..instances.process_state import floating_point_changed, restore_floating_point
 from ..rings.array_elements import element_of, scaled
@@ -109,6 +112,7 @@ class LocalMember:
 
     def bind(self, grid: TimeGrid, members: Mapping[str, LocalMember]) -> None:
         """Prepare `step_from`: what it needs at every point is looked up here, once."""
+        self._grid = grid
         self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
         self._last = LastValues(self.plan.timeouts, self._courses, self.instance.description)
         names = [column.name for column in self._inputs.layout.columns if column.shape or column.name in self._courses]
@@ -155,7 +159,11 @@ class LocalMember:
         if floating_point_changed():
             restore_floating_point()
         if self._looks_at_rows and not self.is_finite.check(step + 1):
-            raise NotFinite("an output is not finite", instance=self.plan.name)
+            if self.plan.section.on_failure == "stop":
+                raise NotFinite("an output is not finite", instance=self.plan.name)
+            error = self.is_finite.error(step + 1, self._grid)
+            self.is_finite.explain(error)
+            self.instance.hold(step, error)
         self.step = step + 1
 
     def getter(self, name: str) -> Callable[[int], Value]:
@@ -239,6 +247,66 @@ class LocalMember:
             part[...] = kept
         for part, kept in zip(self._inputs.parts, saved.inputs, strict=True):
             part[...] = kept
+
+    def packed(self, saved: SavedMember) -> bytes:
+        """A state of `save` as bytes, for `load` in any process.
+
+        Raises:
+            FmuError: the instance cannot write its state.
+        """
+        outputs, inputs = (
+            {name: part[:, columns].tolist() for name, part, columns in _by_column(ring.layout, parts)}
+            for ring, parts in ((self._outputs, saved.outputs), (self._inputs, saved.inputs))
+        )
+        state = self.instance.serialize_state(saved.state)
+        sent = {name: [*steps] for name, steps in saved.sent.items()}
+        return msgspec.msgpack.encode(_Packed(state, saved.step, saved.set_at, outputs, inputs, sent))
+
+    def load(self, data: bytes) -> None:
+        """Restore a state from the bytes of `packed`.
+
+        An output that was in no row there, because nobody recorded it, has its present value in all of them.
+
+        Raises:
+            FmuError: the instance cannot use its state.
+        """
+        try:
+            own, rows = msgspec.msgpack.decode(data, type=_Packed), list[Rows]()
+            for ring, given in ((self._outputs, own.outputs), (self._inputs, own.inputs)):
+                parts = tuple(part.copy() for part in ring.parts)
+                for name, part, columns in _by_column(ring.layout, parts):
+                    if name in given:
+                        part[:, columns] = given[name]
+                rows.append(parts)
+        except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
+            raise FmuError(f"these rows are not its own: {error}", instance=self.plan.name) from error
+        state = self.instance.deserialize_state(own.state)
+        try:
+            self.restore(SavedMember(state, own.step, own.set_at, rows[0], rows[1], own.sent))
+        finally:
+            self.instance.free_state(state)
+        if others := [name for name in self._outputs.layout.names if name not in own.outputs]:
+            for name, value in zip(others, self.instance.get_values(others), strict=True):
+                for row in range(self._outputs.rows):
+                    self._outputs.put(row, name, value)
+
+
+def _by_column(layout: Layout, parts: Rows) -> Iterator[tuple[str, NDArray[Any], slice]]:
+    """Each column of rows: its name, the array of its part, and its place there."""
+    for name in layout.names:
+        place = layout.place(name)
+        yield name, parts[place.part], slice(place.first, place.first + place.size)
+
+
+class _Packed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, array_like=True):
+    """A `SavedMember` as it is in a file: rows by column, each a list of rows of elements."""
+
+    state: bytes
+    step: int
+    set_at: int
+    outputs: dict[str, list[list[Any]]]
+    inputs: dict[str, list[list[Any]]]
+    sent: dict[str, list[int]]
 
 
 class _Feed(NamedTuple):

@@ -189,6 +189,25 @@ class LocalSystem:
         self.point = saved.point
         self.stepping = ""
 
+    def packed(self, saved: SavedSystem) -> dict[str, bytes]:
+        """A state as bytes by instance, for `load` in any process.
+
+        Raises:
+            FmuError: an instance cannot write its state.
+        """
+        return {name: self._members[name].packed(own) for name, own in saved.members.items()}
+
+    def load(self, point: int, states: Mapping[str, bytes]) -> None:
+        """Go to a state of `packed`, which a system of an equal plan has written at this point.
+
+        Raises:
+            FmuError: an instance cannot use its state.
+        """
+        members = self._members
+        for self.stepping, member in members.items():
+            member.load(states[self.stepping])
+        self.point, self.stepping = point, ""
+
     def free(self, saved: SavedSystem) -> None:
         """Free a state; nothing happens if it is freed already."""
         if self._kept.pop(id(saved), None) is not None:

@@ -72,11 +72,13 @@ class OpenOptions(VariantOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
+    state: Annotated[File, Option("go on from this state, which `System.save` has written")] = None
 
 
-class BatchOptions(OpenOptions, frozen=True):
+class BatchOptions(VariantOptions, frozen=True):
     """What `Mesh.batch` takes."""
 
+    start_values: StartValues = None
     threads: Annotated[
         int, Option("step the copies on so many threads, each with a library of its own of each FMU", least=1)
     ] = 1

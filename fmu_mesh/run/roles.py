@@ -10,7 +10,7 @@ import logging
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ from ..variables.value_types import PlainValue
 from ..wire.host_processes import ask_outside
 from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
-from ..wire.messages import NewStart, Stiff
+from ..wire.messages import NewStart, Noted
 from ..wire.router_link import RouterLink
 from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_endpoint, write_note
 from ..wire.session import Wiring, close_session, open_session, own_endpoints
@@ -227,8 +227,8 @@ class _NodeProcess:
         if self._node is not None:
             line = log_line(message, self._run.plan.instance(message.instance).step_points)
             self._node.server.log_message(line)
-            if message.is_stiff:
-                self._node.tell_recorder(Stiff(line.instance, line.point, line.message))
+            if message.noted:
+                self._node.tell_recorder(Noted(message.noted, line.instance, line.point, line.message))
             if message.status in ("error", "fatal"):  # the FMU may end the process next
                 self._node.server.say_everything(heard=True)
 
@@ -306,7 +306,9 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             try:
                 if RECORDER in run.plan.nodes:
                     recorder = runs.recorder(master)
-                with recorder or nullcontext():
+                    with recorder:
+                        master.run(recorder.check_writing)
+                else:
                     master.run()
             except FmuMeshError as error:
                 failure = error

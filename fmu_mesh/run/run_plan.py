@@ -300,6 +300,7 @@ def opening_in(
         description=description,
         folder=folder,
         limits=node.limits,
+        timeouts=node.timeouts,
         linear_inputs=item.linear_inputs,
         log=log,
     )

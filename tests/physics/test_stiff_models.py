@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 import fmu_mesh
-from fmu_mesh.errors import StepFailed
+from fmu_mesh.errors import FmuError, StepFailed
 from fmu_mesh.instances.contract import LogMessage
 from fmu_mesh.instances.fmi.archive.reading import read_description
 from fmu_mesh.instances.fmi.fmu_instance import FmuInstance
@@ -219,20 +219,20 @@ def test_a_state_knows_which_solver_goes_on_from_it(
         own.instance.set_state(after)
         late_again = own.steps(40, STEPS)
         told = own.told()
-        early_data, late_data = (own.instance.serialize_state(state) for state in (before, after))
+        data = own.instance.serialize_state(before)
+        with pytest.raises(FmuError, match="CVode solves it, whose history is no state"):
+            own.instance.serialize_state(after)
         for state in (before, after):
             own.instance.free_state(state)
-    found = []
-    for data, first, last in ((early_data, 0, 40), (late_data, 40, STEPS)):
-        with model(fmu, tmp_path / f"{first}", STIFF[case], step_size=step_size) as own:
-            state = own.instance.deserialize_state(data)
-            own.instance.set_state(state)
-            own.instance.free_state(state)
-            found.append((own.steps(first, last), own.told()))
+    with model(fmu, tmp_path / "b", STIFF[case], step_size=step_size) as own:
+        state = own.instance.deserialize_state(data)
+        own.instance.set_state(state)
+        own.instance.free_state(state)
+        found = own.steps(0, 40), own.told()
 
     assert again == early
     assert late_again == late
-    assert found == [(early, told[:1]), (late, [])]
+    assert found == (early, told[:1])
     assert told == [told[0]] * 2
 
 

@@ -35,7 +35,7 @@ from .fmu_values import FATAL, OK, WARNING, PartCall, SolverFailed, Verb, status
 from .loaded_fmu import FmuFunctions, FmuToLoad, LoadedFmu
 from .step_options import StepOptions, Terms
 
-__all__ = ["Bookkeeping", "FmuInstance", "LogSink"]
+__all__ = ["Bookkeeping", "FmuInstance", "FmuState", "LogSink"]
 
 LogSink = Callable[[LogMessage], None]
 T = TypeVar("T")

@@ -22,6 +22,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    OnFailure,
     Process,
     StartValues,
     StepSize,
@@ -32,7 +33,7 @@ from ...rings.library import why_no_library
 from ...system.process_sharing import Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
-from .step_options import SolverName, SolverSettings, StepOptions, Terms
+from .step_options import NO_STATE_OF_CVODE, SolverName, SolverSettings, StepOptions, Terms
 
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
@@ -107,6 +108,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
     process: Process = None
     interpolation: Annotated[
         Literal["hold", "linear"] | None,
@@ -171,6 +173,17 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
         return f"FMI {description.fmi_version}{solver}"
+
+    def stateless(self, description: ModelDescription) -> str | None:
+        """See `InstanceSection`: what the FMU says of itself, and whether the solver has a history."""
+        if description.fmi_version.startswith("1."):
+            return "FMI 1.0 has no states"
+        if not description.can_serialize_state:
+            able = "canSerialize" if description.can_get_and_set_state else "canGetAndSet"
+            return f"its model description says so ({able}FMU{'s' if description.fmi_version[0] == '2' else 'S'}tate)"
+        if description.kind == "model_exchange" and self.solver_settings(description).name == "cvode":
+            return NO_STATE_OF_CVODE
+        return None
 
     def solver_settings(self, description: ModelDescription) -> SolverSettings:
         """How the continuous states of a model-exchange FMU are solved; without the library of C, `auto` is `cvode`."""

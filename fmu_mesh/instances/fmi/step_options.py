@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 
 from ...config.mesh import LimitsConfig
 from ...system.linear_inputs import LinearInput
 
-__all__ = ["SolverName", "SolverSettings", "StepOptions", "Terms"]
+__all__ = ["NO_STATE_OF_CVODE", "SolverName", "SolverSettings", "StepOptions", "Terms"]
 
 SolverName = Literal["auto", "dopri5", "cvode", "euler"]
+
+NO_STATE_OF_CVODE: Final = "CVode solves it, whose history is no state; use `solver: {name: dopri5}`"
+"""Why a state cannot outlive its process, as the end of a sentence."""
 
 
 class Terms(msgspec.Struct, frozen=True):

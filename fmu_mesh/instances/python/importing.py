@@ -196,6 +196,7 @@ def description_of(cls: type[Component], content: str) -> ModelDescription:
         generation_tool="Python",
         can_handle_variable_step_size=True,
         can_get_and_set_state=True,
+        can_serialize_state=True,
     )
 
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from ..call_guard import lines_shown_of
 from ..contract import LogMessage, Opening
 from .component import Component, declared_variables
 from .importing import ImportedComponent
+from .plain_state import NotPlain, check_memory, encoded, plain
 from .python_section import PythonConfig, class_place_of
 
 __all__ = ["PythonInstance"]
@@ -177,12 +179,28 @@ class PythonInstance:
         """Nothing to free: a state is Python objects."""
 
     def serialize_state(self, state: object) -> bytes:
-        """Refused with an `FmuError`: a state has Python objects of any kind, which only this process can use."""
-        raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
+        """The state as bytes; only plain values have such (`fmu_mesh.instances.python.plain_state`).
+
+        Raises:
+            FmuError: the state has another value; names its attribute.
+        """
+        assert isinstance(state, _State)
+        component = self._live()
+        hint = "Leave it out of what `get_state` of the component returns, and make it again in `set_state`."
+        try:
+            if type(component).get_state is Component.get_state:
+                check_memory(vars(component))
+            return msgspec.msgpack.encode((encoded(state.own), encoded(state.values)))
+        except NotPlain as refused:
+            raise FmuError(f"its state cannot be written: it {refused}", instance=self.name, hint=hint) from refused
 
     def deserialize_state(self, data: bytes) -> object:
         """See `serialize_state`."""
-        raise FmuError("the state of a component in Python cannot be serialized", instance=self.name)
+        try:
+            own, values = msgspec.msgpack.decode(data, type=tuple[bytes, bytes])
+            return _State(plain(own), plain(values))
+        except ValueError as error:  # `msgspec.DecodeError` is one
+            raise FmuError(f"this is no state of a component: {error}", instance=self.name) from error
 
     def close(self) -> None:
         """Call `close` of the component; what it raises is logged, because the run has ended."""

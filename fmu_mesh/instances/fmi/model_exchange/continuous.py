@@ -19,18 +19,21 @@ from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from numpy.typing import NDArray
 
+from ....errors import FmuError
 from ....rings.native import NativeStep, StepKind
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
 from ....variables.value_types import Value
 from ...contract import LogMessage
+from ...instance_wrapper import of_kind
 from ..clocks import NO_CLOCKS, Clocks
 from ..fmi_versions import Fmi1, Fmi2, Fmi3
-from ..fmu_instance import Bookkeeping
+from ..fmu_instance import Bookkeeping, FmuState
 from ..fmu_values import Verb
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
-from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
+from ..step_options import NO_STATE_OF_CVODE
+from .dormand_prince import NOT_SET, AutoSolver, DormandPrinceSolver, HeldRow, RowBytes, Solved
 from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
 
@@ -107,6 +110,13 @@ class ContinuousInstance(NativeInstance):
         self._inputs = inputs
         linear = [inputs.layout.place(item.name).first for item in self._options.linear_inputs]
         self._linear_columns = np.array(linear, dtype=np.intp)
+
+    def serialize_state(self, state: object) -> bytes:
+        """See `KeepsState`; refused where the solver `auto` has turned to CVode."""
+        solver, place = self._event_loop().solver, of_kind(FmuState, state).kept.solver
+        if isinstance(solver, AutoSolver) and solver.goes_on_with_cvode(place):
+            raise FmuError(f"its state cannot be written: {NO_STATE_OF_CVODE}", instance=self.name)
+        return super().serialize_state(state)
 
     def close(self) -> None:
         """See `Instance`."""
@@ -214,7 +224,7 @@ class ContinuousInstance(NativeInstance):
     def _tell_doubt(self) -> None:
         """Tell once that another solver would be better."""
         if (doubt := self._event_loop().solver.doubt()) is not None:
-            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, is_stiff=True))
+            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, noted="stiff"))
 
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.

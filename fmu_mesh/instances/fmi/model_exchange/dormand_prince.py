@@ -199,6 +199,10 @@ class AutoSolver(DormandPrinceSolver):
         self._cvode: CVodeSolver | None = None
         self._by_cvode = False  # whether CVode has taken the last step, or takes the next one
 
+    def goes_on_with_cvode(self, place: tuple[float, ...]) -> bool:
+        """Whether CVode takes the steps from a `place` on."""
+        return bool(place) and place[3] >= _IS_STIFF
+
     def restart(self) -> None:
         """See `Solver.restart`."""
         self._by_cvode = self.is_stiff

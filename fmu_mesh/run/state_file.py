@@ -1,0 +1,137 @@
+"""A state of a system as a file: a head that says of which mesh it is, and the state of each instance.
+
+The file begins with eight letters, the version of this format, the length of the head and its SHA-256; the head has the
+size and the SHA-256 of each block that follows. So a file that was cut or changed anywhere is refused before any of it
+reaches a model. It is no signature: who can write the file chooses what the models get (ADR 88).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import msgspec
+
+from .. import __version__, files
+from ..errors import ConfigurationError, Finding
+from ..system.states import SavedInstance, differences, saved_instances
+from ..text import short_number
+from ..variables.value_types import PlainValue
+from .run_plan import RunPlan
+
+__all__ = ["StateFile", "write_state"]
+
+_LETTERS = b"FMUSTATE"
+_VERSION = 1
+_START = struct.Struct("<8sIQ32s")  # letters, version, length of the head, its SHA-256
+
+
+class _Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The head: times in s; of each block, in their order, its instance, and its size in bytes and its SHA-256."""
+
+    fmu_mesh: str
+    mesh: str
+    point: int
+    start_time: float
+    step_size: float
+    instances: dict[str, SavedInstance]
+    blocks: dict[str, tuple[int, bytes]]
+
+
+class StateFile(NamedTuple):
+    """A state that was read from a file; ``states`` has that of each instance, as `LocalMember.packed` makes it."""
+
+    file: Path
+    head: _Head
+    states: Mapping[str, bytes]
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Read a file, and check that it is complete and unchanged.
+
+        Raises:
+            ConfigurationError: it cannot be read, is no state, has another version of the format, or was changed.
+        """
+        try:
+            with files.opened(file) as source:
+                data = memoryview(source.read())
+        except OSError as error:
+            raise ConfigurationError(f"the state '{file}' cannot be read: {error.strerror}") from error
+        if data[: len(_LETTERS)] != _LETTERS:
+            raise ConfigurationError(f"'{file}' is no state: `System.save` writes such files")
+        damaged = ConfigurationError(
+            f"the state '{file}' is damaged: it was cut or changed after it was written", hint="Use another state."
+        )
+        if len(data) < _START.size:
+            raise damaged
+        _, version, length, sha256 = _START.unpack(data[: _START.size])
+        if version != _VERSION:
+            text = f"the state '{file}' has version {version} of its format, and this fmu_mesh reads {_VERSION}"
+            raise ConfigurationError(text, hint="Write it again with this version of fmu_mesh.")
+        head, rest = data[_START.size :][:length], data[_START.size :][length:]
+        if hashlib.sha256(head).digest() != sha256:
+            raise damaged
+        try:
+            known = msgspec.msgpack.decode(head, type=_Head)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise damaged from error
+        states = {}
+        for name, (size, expected) in known.blocks.items():
+            states[name], rest = bytes(rest[:size]), rest[size:]
+            if hashlib.sha256(states[name]).digest() != expected:
+                raise damaged
+        if rest or states.keys() != known.instances.keys():
+            raise damaged
+        return cls(file, known, states)
+
+    def check(self, run: RunPlan) -> dict[str, dict[str, PlainValue]]:
+        """Check that a run can go on from here; returns the start values to set, by instance and variable.
+
+        Raises:
+            ConfigurationError: what must agree does not; carries all differences.
+        """
+        grid, head, findings = run.plan.grid, self.head, []
+        for what in ("start_time", "step_size"):
+            if (was := getattr(head, what)) != (now := getattr(grid, what)):
+                text = f"was {short_number(was)} s where the state was written, and is {short_number(now)} s"
+                findings.append(Finding(str(self.file), f"simulation.{what}", text, ""))
+        if (stop := grid.stop_time) is not None and grid.last_point < head.point:
+            text = f"{short_number(stop)} s, and the state is of {short_number(grid.time(head.point))} s"
+            findings.append(Finding(str(self.file), "simulation.stop_time", text, "a later time"))
+        refused, values = differences(head.instances, run.plan, run.contents)
+        findings += [Finding(str(self.file), f"instances.{name}", why, "") for name, why in refused]
+        if findings:
+            text = f"the state '{self.file}' is not one of this mesh"
+            hint = "Open the mesh as it was when the state was written; tunable parameters and free inputs may differ."
+            raise ConfigurationError(text, findings=tuple(findings), hint=hint)
+        return values
+
+
+def write_state(
+    file: Path, run: RunPlan, others: Mapping[str, Mapping[str, PlainValue]], point: int, states: Mapping[str, bytes]
+) -> None:
+    """Write a state of a run at a point into a file, in the place of an older one; see `StateFile`.
+
+    ``others`` are the start values that are not as in the plan, by instance and variable.
+
+    Raises:
+        ConfigurationError: the file cannot be written; an older one is as it was.
+    """
+    grid = run.plan.grid
+    blocks = {name: (len(own), hashlib.sha256(own).digest()) for name, own in states.items()}
+    instances = saved_instances(run.plan, run.contents, others)
+    own = _Head(__version__, run.mesh, point, grid.start_time, grid.step_size, instances, blocks)
+    head = msgspec.msgpack.encode(own)
+    try:
+        with files.replaced(file) as draft, draft.open("wb") as target:
+            target.write(_START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest()))
+            for part in (head, *states.values()):
+                target.write(part)
+            target.flush()
+            os.fsync(target.fileno())  # else its name could survive a power cut, and its content not
+    except OSError as error:
+        raise ConfigurationError(f"the state '{file}' cannot be written: {error.strerror}") from error

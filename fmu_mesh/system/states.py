@@ -1,0 +1,131 @@
+"""States of a system that outlive its process: which instances have one, and what must agree where one is restored.
+
+Owns no file and no state; those are `fmu_mesh.run.state_file` and the instances.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+
+import msgspec
+
+from ..config.instance_sections import placed
+from ..text import counted, listed, shown
+from ..variables.value_conversion import to_plain
+from ..variables.value_types import PlainValue
+from .plan import Plan
+from .start_values import why_not_settable
+from .system import ResolvedSystem
+
+__all__ = ["SavedInstance", "differences", "saved_instances", "stateless"]
+
+_DIGITS = 16
+
+
+class SavedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a state says about the instance that it is of.
+
+    Attributes:
+        agreed: what must be equal where it is restored, by its name: in words, or a hash.
+        start_values: those that were given, by variable.
+    """
+
+    agreed: dict[str, str]
+    start_values: dict[str, PlainValue]
+
+
+def stateless(system: ResolvedSystem, *, keys: bool = True) -> dict[str, str]:
+    """The instances whose state cannot outlive their process, and why, as the end of a sentence.
+
+    With ``keys``, inputs get the values of their Zenoh keys, as in processes.
+    """
+    found = {}
+    for name, own in system.instances.items():
+        why = system.config.instances[name].stateless(own.description)
+        if why is None and keys and own.keys_in:
+            why = (
+                f"keys of Zenoh give values to {listed([key.variable for key in own.keys_in])}, and these have no past"
+            )
+        if why is not None:
+            found[name] = why
+    return found
+
+
+def saved_instances(
+    plan: Plan, contents: Mapping[str, str], others: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({})
+) -> dict[str, SavedInstance]:
+    """What a state of this plan says, by instance.
+
+    ``contents`` is the SHA-256 of each model, and ``others`` are the start values that are not as in the plan.
+    """
+    found = {}
+    for name, own in plan.system.instances.items():
+        described = own.description
+        fed = [
+            (c.source_instance, c.source_name, c.target_name, c.delay, c.factor, c.offset, repr(c.map), c.extrapolation)
+            for c in plan.connections
+            if c.target_instance == name
+        ]
+        agreed = {
+            "kind": f"{described.kind} {described.fmi_version}".strip(),
+            "step": counted(own.step_points, "point"),
+            "model": _hash((contents.get(name, ""), described.guid)),
+            "variables": _hash([(v.name, v.type, v.shape, v.causality, v.variability) for v in described.variables]),
+            "options": _hash(placed(plan.system.config.instances[name]).agreed()),
+            "connections": _hash(fed),
+            "values over time": _hash([schedule.agreed() for schedule in own.scenario]),
+            "timeouts": _hash(own.timeouts),
+        }
+        given = {variable: to_plain(value) for variable, value in own.start_values.items()}
+        found[name] = SavedInstance(agreed, given | dict(others.get(name, {})))
+    return found
+
+
+def differences(
+    saved: Mapping[str, SavedInstance], plan: Plan, contents: Mapping[str, str]
+) -> tuple[list[tuple[str, str]], dict[str, dict[str, PlainValue]]]:
+    """What differs between the mesh of a state and that of a plan.
+
+    Returns:
+        Why the state cannot be restored: instances, and what differs, in words. And the start values that differ and
+        can be set between two steps, by instance and variable: of tunable parameters, and of inputs that are free.
+    """
+    own, set_again = saved_instances(plan, contents), dict[str, dict[str, PlainValue]]()
+    refused = [(name, "the mesh has no such instance") for name in saved if name not in own]
+    for name, there in own.items():
+        if name not in saved:
+            refused.append((name, "the state has no such instance"))
+            continue
+        for what, now in there.agreed.items():
+            if (was := saved[name].agreed.get(what, "not known")) != now:
+                refused.append((name, f"{what}: {now} here, and {was} in the state"))
+        for variable, value, why in _start_values(plan, name, saved[name].start_values, there.start_values):
+            if why:
+                refused.append((name, why))
+            else:
+                set_again.setdefault(name, {})[variable] = value
+    return refused, set_again
+
+
+def _start_values(
+    plan: Plan, name: str, saved: Mapping[str, PlainValue], own: Mapping[str, PlainValue]
+) -> Iterator[tuple[str, PlainValue, str]]:
+    """The variables with another start value: the new value, and why it cannot be set later, empty if it can."""
+    instance, sources = plan.system.instances[name], plan.nodes[plan.node_of(name)].instance(name).sources
+    prescribed = {schedule.variable for schedule in instance.scenario}
+    for variable in instance.description.variables:
+        if variable.name not in own and variable.name not in saved:
+            continue
+        default = to_plain(variable.start) if variable.start is not None else ""
+        was, now = saved.get(variable.name, default), own.get(variable.name, default)
+        if repr(was) == repr(now):
+            continue
+        why = why_not_settable(variable, sources.get(variable.name))
+        why = "has values over time" if variable.name in prescribed else why
+        yield variable.name, now, f"'{variable.name}' is {shown(now)}, was {shown(was)}, and {why}" if why else ""
+
+
+def _hash(value: object) -> str:
+    return hashlib.sha256(msgspec.json.encode(value, order="deterministic")).hexdigest()[:_DIGITS]
