@@ -28,6 +28,7 @@ from ..errors import (
     CallRefused,
     ConfigurationError,
     DeadlineExceeded,
+    FmuError,
     FmuMeshError,
     Interrupted,
     KeyboardInterrupted,
@@ -200,7 +201,7 @@ class RunThread:
         if self._directory is not None:
             if result is not None or not self._directory.has_rows():
                 self._directory.clear()
-            elif isinstance(error, FmuMeshError):
+            elif isinstance(error, FmuMeshError) and not isinstance(error, FmuError):  # which would come again
                 error.with_hint("`resume=True` goes on with it.")
             self._directory.close()
         if result is not None:

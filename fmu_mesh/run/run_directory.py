@@ -61,13 +61,11 @@ class _KeptRun(msgspec.Struct, frozen=True):
         mesh: name of the mesh.
         digest: that of the plan: version, configuration and models.
         files: the result files, in their order.
-        resumed: how often it was resumed.
     """
 
     mesh: str
     digest: str
-    files: tuple[str, ...]
-    resumed: int = 0
+    files: list[str]
 
 
 class _OnDisk(msgspec.Struct, frozen=True):
@@ -148,59 +146,44 @@ class RunDirectory:
         os.close(self._lock)
 
     def _begun(self, plan: RunPlan) -> RunPlan:
-        if (self._folder / _RUN).exists():
-            text = f"'{self._folder}' has a run of mesh '{self._kept_run().mesh}' that has not ended"
+        if (kept := self._read(_RUN, _KeptRun)) is not None:
+            text = f"'{self._folder}' has a run of mesh '{kept.mesh}' that has not ended"
             raise ConfigurationError(text, hint="Go on with it with `resume=True`, or remove the folder to begin anew.")
         self.clear()
-        self._write(_RUN, _KeptRun(plan.mesh, plan.plan.digest, tuple(self._records)))
+        _replace(self._folder / _RUN, line_of(_KeptRun(plan.mesh, plan.plan.digest, self._records)))
         return plan
 
     def _resumed(self, plan: RunPlan) -> RunPlan:
-        if not (self._folder / _RUN).exists():
+        if (kept := self._read(_RUN, _KeptRun)) is None:
             text = f"there is no run to resume in '{self._folder}'"
             raise ConfigurationError(text, hint="It has ended, or never begun: start it without `resume=True`.")
-        kept, digest = self._kept_run(), plan.plan.digest
         if kept.mesh != plan.mesh:
             raise self._refused(f"it is of mesh '{kept.mesh}', and this is '{plan.mesh}'")
-        if kept.digest != digest:
-            raise self._refused(f"it had {difference(digest, kept.digest, plan.plan.system.instances)}")
-        if list(kept.files) != self._records:
-            files = [f"'{file}'" for file in kept.files]
-            raise self._refused(f"it has written {listed(files)}")
+        if kept.digest != plan.plan.digest:
+            raise self._refused(f"it had {difference(plan.plan.digest, kept.digest, plan.plan.system.instances)}")
+        if kept.files != self._records:
+            raise self._refused(f"it has written {listed([repr(file) for file in kept.files])}")
         self._wait_for_others()
-        on_disk = self._read(_ON_DISK, _OnDisk) or _OnDisk((), {})
-        seen = 0
-        for path in {
-            *_journals(self._folder).glob(f"*{JOURNAL}"),
-            *map(_journals(self._folder).joinpath, on_disk.journals),
-        }:
+        on_disk, journals, seen = self._read(_ON_DISK, _OnDisk) or _OnDisk((), {}), _journals(self._folder), 0
+        for path in {*journals.glob(f"*{JOURNAL}"), *map(journals.joinpath, on_disk.journals)}:
             whole = whole_lines(path)
             if whole.size < on_disk.journals.get(path.name, 0):
                 raise self._refused(f"'{path}' has lost something that was set, on which rows depend")
             if whole.torn:
-                self.told.append(
-                    f"{counted(whole.torn, 'byte')} at the end of '{path}' were not whole, and are cut off"
-                )
+                self.told.append(f"the end of '{path}' was not whole: {counted(whole.torn, 'byte')} cut off")
             seen = max(seen, *map(_point_of, whole.lines), 0)
-        found = [(file, rows_after(Path(file), own)) for file, own in zip(self._records, on_disk.files, strict=False)]
-        for (file, rows), own in zip(found, on_disk.files, strict=False):
+        found = list[tuple[str, int]]()
+        for file, own in zip(self._records, on_disk.files, strict=False):
+            found.append((file, rows := rows_after(Path(file), own)))
             if rows < own.rows:
-                self.told.append(
-                    f"'{file}' has lost rows: {rows} of {own.rows} are there, and the others are made again"
-                )
+                self.told.append(f"'{file}' had {own.rows} rows and has {rows}: the others are made again")
         seen = min(max(seen, last_recorded(plan.plan, found)), plan.plan.grid.last_point)
-        self._write(_RUN, replace(kept, resumed=kept.resumed + 1))
         self.told.append(f"the run is resumed, and goes on from point {seen}")
         return replace(plan, rows=tuple(rows for _, rows in found), replays_to=seen)
 
     def _refused(self, why: str) -> ConfigurationError:
         hint = "Give it the same configuration, models and options as before, or remove the folder to begin anew."
         return ConfigurationError(f"the run in '{self._folder}' cannot be resumed: {why}", hint=hint)
-
-    def _kept_run(self) -> _KeptRun:
-        kept = self._read(_RUN, _KeptRun)
-        assert kept is not None  # the caller has looked
-        return kept
 
     def _read(self, name: str, type_: type[T]) -> T | None:
         """What a file here says; None if there is none. Raises `ConfigurationError` if it is damaged."""
@@ -213,9 +196,6 @@ class RunDirectory:
         except (ValueError, msgspec.MsgspecError) as error:
             text = f"'{path}' is damaged, and its run cannot be resumed"
             raise ConfigurationError(text, hint=f"Remove '{self._folder}' to begin anew.") from error
-
-    def _write(self, name: str, value: msgspec.Struct) -> None:
-        _replace(self._folder / name, line_of(value))
 
     def _locked(self) -> int:
         lock = os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -274,6 +254,7 @@ class Syncing:
 
 def _sync(folder: Path, results: Sequence[str], kept: Sequence[Kept]) -> None:
     journals = {path.name: _give_to_disk(path) for path in _journals(folder).glob(f"*{JOURNAL}")}
+    _give_to_disk(_journals(folder))
     for file, own in zip(results, kept, strict=True):
         if own.rows:
             _give_to_disk(_growing(file))

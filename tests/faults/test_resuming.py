@@ -226,6 +226,9 @@ def test_a_directory_has_one_run_at_a_time(place: Place) -> None:
     launched.signal(signal.SIGINT)
     assert launched.wait() == 130
     assert "`--resume` goes on with it" in launched.errors
+    resumed = place.run("launch", config, "--resume", "--no-progress")
+    assert resumed.wait() == 0, resumed.story()
+    assert row_count(config.with_suffix(".csv")) == 60001
 
 
 def test_a_full_disk_ends_the_run_in_words(place: Place) -> None:
@@ -254,3 +257,13 @@ def test_resuming_needs_a_directory_and_files(place: Place) -> None:
     mesh = fmu_mesh.load(written(place))
     with pytest.raises(fmu_mesh.ConfigurationError, match="without a result file"):
         mesh.run(record="memory")
+
+
+def test_a_node_in_a_sandbox_keeps_no_journal(place: Place) -> None:
+    config = written(place, process={"sandbox": "enforce"})
+
+    checked = place.run("check", config)
+
+    assert checked.wait() == 2, checked.story()
+    assert "recovery.directory" in checked.message
+    assert "runs in a sandbox, from where nothing can be written there" in checked.message
