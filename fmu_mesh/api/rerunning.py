@@ -39,6 +39,7 @@ ALONE: Mapping[str, Any] = {
     "ros": None,
     "security": None,
     "runtime": {},
+    "recovery": {},
 }
 """What a rerun has of its own: nobody else reaches it or sends anything to it."""
 

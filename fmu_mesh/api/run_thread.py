@@ -28,6 +28,7 @@ from ..errors import (
     CallRefused,
     ConfigurationError,
     DeadlineExceeded,
+    FmuError,
     FmuMeshError,
     Interrupted,
     KeyboardInterrupted,
@@ -41,6 +42,7 @@ from ..run.launcher import Launcher
 from ..run.options import StartOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
+from ..run.run_directory import RunDirectory
 from ..run.run_plan import RunPlan, numbered
 from ..run.wiring import certified, name_of, warnings_of
 from ..simtime import ENDLESS
@@ -81,6 +83,17 @@ class RunThread:
         self._failure: BaseException | None = None
         self._warned = False
         self._changing = threading.RLock()  # a signal handler may interrupt the handler before it
+        self._directory: RunDirectory | None = None
+        if settings.processes:
+            for text in warnings_of(plan):  # a certificate that cannot be used raises
+                if settings.on_event is None:
+                    log.warning("%s", text)
+            if plan.loaded.config.recovery.directory is not None:
+                self._directory = RunDirectory(plan, resume=settings.resume)
+                self.plan = self._directory.plan
+        if settings.resume and self._directory is None:
+            text = f"the run of '{plan.mesh}' cannot be resumed: it keeps nothing"
+            raise ConfigurationError(text, hint="`recovery: {directory: DIR}` keeps what this needs, in processes.")
         self._memory = memory_of(plan)
         if self._memory is not None:
             check_memory(plan, settings.memory_limit)
@@ -89,10 +102,6 @@ class RunThread:
             except FileExistsError as error:
                 text = f"this plan of '{plan.mesh}' runs already"
                 raise CallRefused(text, hint="Make another one for another run.") from error
-        if settings.processes:
-            for text in warnings_of(plan):  # a certificate that cannot be used raises
-                if settings.on_event is None:
-                    log.warning("%s", text)
         _active.add(self)
         self._thread = threading.Thread(target=self._work, name=f"run of {plan.mesh}", daemon=True)
         self._thread.start()
@@ -189,6 +198,12 @@ class RunThread:
             error = caught
         if self._memory is not None:  # before anybody can start the plan again
             rmtree(self._memory.parent, ignore_errors=True)
+        if self._directory is not None:
+            if result is not None or not self._directory.has_rows():
+                self._directory.clear()
+            elif isinstance(error, FmuMeshError) and not isinstance(error, FmuError):  # which would come again
+                error.with_hint("`resume=True` goes on with it.")
+            self._directory.close()
         if result is not None:
             self.future.set_result(result)
         else:
@@ -198,6 +213,8 @@ class RunThread:
 
     def _run(self) -> Result:
         plan = self.plan
+        for text in self._directory.told if self._directory is not None else ():
+            self._take(OutputLine("recovery", text))
         while True:
             try:
                 return self._result(self._run_once(plan))
@@ -210,6 +227,8 @@ class RunThread:
                         error.with_hint(f"This was attempt {plan.restarts + 1} of {plan.max_restarts + 1}.")
                     return self._ended_early(error)
                 plan = following
+                if self._directory is not None:
+                    self._directory.sync(plan.rows)
                 self._take(Restarted(error.report(), plan.restarts, plan.max_restarts, plan.replays_to))
 
     def _run_once(self, plan: RunPlan) -> Outcome:
@@ -250,6 +269,8 @@ class RunThread:
                 self._watch_memory()
             case WasReset(outcome):
                 self.results.append(self._read(outcome))
+                if self._directory is not None:  # it could not go on after the reset
+                    self._directory.clear()
         on_event, on_progress = self._settings.on_event, self._settings.on_progress
         if on_event is None:
             _log(event)

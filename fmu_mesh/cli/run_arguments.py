@@ -119,7 +119,7 @@ def _add_nodes(parser: argparse._ActionsContainer) -> None:
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
-        options("paused", "view", "video", "profile", "processes", "restarts"),
+        options("paused", "view", "video", "profile", "processes", "restarts", "resume"),
         _PLOT,
         *_OUTPUT,
         _OUTCOME,

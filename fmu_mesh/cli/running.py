@@ -72,7 +72,9 @@ def _how(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
     if arguments.restarts and local:
         raise ConfigurationError("--restarts and --local do not go together", hint="Leave one of them out.")
-    return {"processes": not local, "restarts": arguments.restarts}
+    if arguments.resume and local:
+        raise ConfigurationError("--resume and --local do not go together", hint="Leave one of them out.")
+    return {"processes": not local, "restarts": arguments.restarts, "resume": arguments.resume is True}
 
 
 def run_mesh(
@@ -80,9 +82,11 @@ def run_mesh(
 ) -> None:
     """Run a mesh, show its events, and at the end what the arguments ask for."""
     plan = planned_run(mesh, options, arguments)
-    if plan.loaded.config.recovery.restarts and not how.get("processes", True):
-        text = "`recovery.mode: restart` and --local do not go together: all of it runs in one process"
-        raise ConfigurationError(text, hint="Leave --local out, or add `--set-config recovery.mode=stop`.")
+    own = plan.loaded.config.recovery
+    for given, value, none in ("mode", own.restarts and "restart", "stop"), ("directory", own.directory, "null"):
+        if value and not how.get("processes", True):
+            text = f"`recovery.{given}: {value}` and --local do not go together: all of it runs in one process"
+            raise ConfigurationError(text, hint=f"Leave --local out, or add `--set-config recovery.{given}={none}`.")
     with (
         plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),

@@ -286,6 +286,13 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
     max_restarts: Annotated[
         int, Meta(ge=1, le=1000, description="How often at most; then the run ends as with stop.")
     ] = 3
+    directory: Annotated[
+        str | None,
+        Meta(
+            description="Folder, relative to this file, for what is needed to resume the run after a power cut, or "
+            "after its launcher was killed; null: none."
+        ),
+    ] = None
 
     @property
     def restarts(self) -> int:
@@ -352,6 +359,18 @@ class Config(Base, frozen=True, kw_only=True):
         if isinstance(self.record, RecordConfig):
             return {"record": self.record}
         return {f"record[{index}]": section for index, section in enumerate(self.record)}
+
+    @property
+    def recovery_problem(self) -> tuple[str, str, str] | None:
+        """Why `recovery` cannot be as it says: the key, what was found, and what was expected; None if it can."""
+        own, why = self.recovery, self.why_not_restarted
+        boxed = [name for name, section in self.instances.items() if self.process_of(section).is_sandboxed]
+        if own.restarts and why is not None:
+            return "recovery.mode", f"restart, and {why}", "stop"
+        if own.directory is not None and (why is not None or boxed):
+            found = why or f"'{boxed[0]}' runs in a sandbox, from where nothing can be written there"
+            return "recovery.directory", f"'{own.directory}', and {found}", "null"
+        return None
 
     @property
     def why_not_restarted(self) -> str | None:

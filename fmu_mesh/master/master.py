@@ -553,7 +553,7 @@ class Master:
         rate = point / elapsed if elapsed > 0 else 0.0
         attempt, failure = self._settings.attempt, states.failure
         goes_on = type(failure) is MeshLost and attempt.number < attempt.most and not self._resets
-        is_again = attempt.number > 1 and not self._resets and (states.state == "starting" or states.is_replaying)
+        is_again = bool(str(attempt)) and not self._resets and (states.state == "starting" or states.is_replaying)
         state: MeshState = states.state
         if goes_on or (is_again and states.takes_commands):
             state = "restarting"

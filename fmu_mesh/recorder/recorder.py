@@ -53,6 +53,7 @@ from ..errors import (
     MessageRefused,
     RunReset,
 )
+from ..files import Kept
 from ..results.growth import GrowthWatch
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
@@ -127,6 +128,8 @@ class Recorder:
         memory: that of the master's process, if others exchange rows through it or through its row streams.
         mirror_of: where the rows of a link come to that has a row stream.
         audit: how often something has come from outside, and what, for the metadata.
+        on_flush: called about five times a second, with what the operating system has of each file; its error ends the
+            run.
 
     Use it as a context manager: the thread runs inside; afterwards the files have all complete rows.
     """
@@ -145,6 +148,7 @@ class Recorder:
         memory: HostMemory | None = None,
         mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
         audit: Callable[[], tuple[int, object]] = lambda: (0, None),
+        on_flush: Callable[[Sequence[Kept]], None] = lambda _kept: None,
     ) -> None:
         self._plan = plan
         self._mirror_of, self._audit, self._audited, self._audit_at = mirror_of, audit, 0, -math.inf
@@ -155,7 +159,7 @@ class Recorder:
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
         self._files = RecordFiles(files, growth, notes)
-        self._wanted = wanted
+        self._wanted, self._on_flush = wanted, on_flush
         self._written = 0
         self._told = 0
         self._flushed = 0.0
@@ -307,6 +311,7 @@ class Recorder:
                     self._flushed = now
                     self._note_audit(now)
                     self._files.flush()
+                    self._on_flush(self._files.kept)
                     self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:
                     continue

@@ -23,7 +23,7 @@ from msgspec.structs import replace
 
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
-from ..files import Kept, open_alone, unwritable
+from ..files import Kept, is_file, open_alone, unwritable
 from ..simtime import TimeGrid
 from ..system.live_keys import KeyValue
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
@@ -35,7 +35,7 @@ from .keys_file import KeysFile, keys_beside
 from .recording import Recording, ResultFile
 from .resumed_file import opened_again
 
-__all__ = ["ReadColumn", "RecordFiles", "open_result", "open_results", "rows_left", "what_is_kept"]
+__all__ = ["ReadColumn", "RecordFiles", "open_result", "open_results", "rows_after", "rows_left", "what_is_kept"]
 
 _NOTE = struct.Struct("<qq")
 
@@ -137,6 +137,11 @@ class RecordFiles:
     def counted(self) -> tuple[tuple[str, int], ...]:
         """The path and the number of rows of each file; after `close`, of those in the file."""
         return tuple((str(own.file.path), own.file.rows) for own in self._files)
+
+    @property
+    def kept(self) -> tuple[Kept, ...]:
+        """Of each file, what the operating system has (`ResultFile.kept`)."""
+        return tuple(own.file.kept for own in self._files)
 
     def begin(self, grid: TimeGrid, records: Sequence[RecordPlan], column_of: Callable[[str, str], ReadColumn]) -> None:
         """Choose what the files get; ``column_of`` says how the values of a variable of an instance are read."""
@@ -314,6 +319,25 @@ def rows_left(result_files: Sequence[str], folder: Path) -> tuple[tuple[str, int
     ``folder`` is that of the run, with the notes.
     """
     return tuple((file, _rows_left(Path(file), folder / _note_of(number))) for number, file in enumerate(result_files))
+
+
+def rows_after(path: Path, kept: Kept) -> int:
+    """Cut a result file back to what the disk had (``kept``), or to what it has of it; returns the number of its rows.
+
+    A file of a format that cannot go on begins again, and has 0.
+
+    Raises:
+        ConfigurationError: it is damaged, another run writes it, or it cannot be written.
+    """
+    format_ = required_format(path)
+    if not kept.rows or not hasattr(format_, "resume"):
+        return 0
+    growing = format_.growing_file(path)
+    with reading(path), open_alone(growing, path):
+        if growing.is_file() and growing.stat().st_size >= kept.size > 0:
+            os.truncate(growing, kept.size)
+            return format_.keep_whole_rows(path, kept)
+        return format_.keep_whole_rows(path, Kept()) if is_file(growing) or is_file(path) else 0
 
 
 def what_is_kept(files: Sequence[tuple[str, int]]) -> str | None:

@@ -43,6 +43,9 @@ Restarts = Annotated[
         least=0,
     ),
 ]
+Resume = Annotated[
+    bool, Option("go on with the run in `recovery.directory`, which was cut off by a power cut or killed", "--resume")
+]
 OnProgress = Annotated[Callable[["MeshStatus"], object] | None, Option("called about ten times per second")]
 OnEvent = Annotated[Callable[["Event"], object] | None, Option("called with every event of `fmu_mesh.run.events`")]
 MEMORY_LIMIT = 2**30
@@ -145,6 +148,7 @@ class StartOptions(CallOptions, frozen=True, kw_only=True):
     processes: Processes = True
     memory_limit: MemoryLimit = MEMORY_LIMIT
     restarts: Restarts = None
+    resume: Resume = False
     on_progress: OnProgress = None
     on_event: OnEvent = None
 
@@ -155,6 +159,7 @@ class RunOptions(PlanOptions, frozen=True, kw_only=True):
     processes: Processes = True
     memory_limit: MemoryLimit = MEMORY_LIMIT
     restarts: Restarts = None
+    resume: Resume = False
     on_progress: OnProgress = None
     on_event: OnEvent = None
 

@@ -46,6 +46,7 @@ from .limits import limit_process, strain
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
+from .run_directory import Syncing
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
 from .wiring import certified, patient, table_of, wiring
 
@@ -411,6 +412,7 @@ class _MasterRuns:
             memory=master.memory_for(RECORDER),
             mirror_of=streams.mirror if streams is not None else lambda _link: None,
             audit=lambda: (master.audit.changes, master.audit.view()),
+            **({"on_flush": Syncing(self.run).flushed} if self.run.directory and not self.resets else {}),
         )
         if streams is not None:
             streams.tell_last(recorder.note_last)

@@ -115,6 +115,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_restarts: how often it may be started again.
         rows: of each result file, how many rows it has from before.
         replays_to: the last point that was seen before: up to it, the run is as it was.
+        directory: the folder for what `--resume` needs, absolute; empty: there is none.
     """
 
     loaded: LoadedConfig
@@ -129,6 +130,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_restarts: int = 0
     rows: tuple[int, ...] = ()
     replays_to: int = 0
+    directory: str = ""
 
     @property
     def config_file(self) -> Path:
@@ -204,11 +206,19 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def attempt_of(self, participant: str) -> Attempt:
         """Which attempt this is, for a node or the master."""
         number, most, journal = self.restarts + 1, self.max_restarts + 1, ""
-        if self.max_restarts:
-            folder = run_folder(self.mesh, self.run)
+        if self.max_restarts or self.directory:
+            folder = self.kept_in / "journals" if self.directory else self.kept_in
             box = box_of(folder, participant)
             journal = str((box if box.is_dir() else folder) / f"{box.name}{JOURNAL}")
         return Attempt(number, most, self.replays_to, journal)
+
+    @property
+    def kept_in(self) -> Path:
+        """Where the processes of this run keep what it needs to come back: `directory`, or else the folder of the run.
+
+        The errors are those of `run_folder`.
+        """
+        return Path(self.directory) if self.directory else run_folder(self.mesh, self.run)
 
     def variable(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
         """The instance and the variable ``instance.variable``; with ``elements``, it may be an element of the variable.

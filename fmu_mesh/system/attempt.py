@@ -13,7 +13,8 @@ class Attempt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         number: 1 for the first one.
         most: how many there may be; 1: the run never starts again.
-        replays_to: the last point that was seen in those before; up to it, the run is as it was.
+        replays_to: the last point that was seen in those before, or of the run that is resumed; up to it, the run is
+            as it was.
         journal: the file with what this process was given from outside; empty: there is none.
     """
 
@@ -23,4 +24,6 @@ class Attempt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     journal: str = ""
 
     def __str__(self) -> str:
-        return f"attempt {self.number} of {self.most}, from point {self.replays_to}" if self.number > 1 else ""
+        if self.number > 1:
+            return f"attempt {self.number} of {self.most}, from point {self.replays_to}"
+        return f"resumed, from point {self.replays_to}" if self.replays_to else ""
