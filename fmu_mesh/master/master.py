@@ -137,8 +137,11 @@ class Master:
         self._first_keys = self._run_keys
 
     def _made_memory(self) -> HostMemory:
+        nodes = [*self._states.plan.nodes.values()]
         memory_of = HostMemory.create if self._shares else HostMemory.private
-        return memory_of(next(iter(self._states.plan.nodes.values())).memory, MASTER)
+        memory = memory_of(nodes[0].memory, MASTER)
+        memory.begin_at(self._states.plan.grid.first_point, (place for node in nodes for place in node.rings))
+        return memory
 
     def _prepare(self, meeting: Meeting | None) -> None:
         """Make all that belongs to one run, but its states and its memory."""
@@ -461,7 +464,7 @@ class Master:
     @property
     def wanted(self) -> int:
         """As that of the states; negative until all nodes have reached the first point. From any thread."""
-        return self._states.wanted if self._states.granting.slowest >= 0 else -1
+        return self._states.wanted if self._states.granting.has_begun else -1
 
     @property
     def ended_by(self) -> TerminationRequested | NotFinite | None:
@@ -516,9 +519,10 @@ class Master:
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
         states, grid = self._states, self._states.plan.grid
-        point = min(max(states.granting.slowest, 0), states.granting.last_point)
+        first = grid.first_point
+        point = min(max(states.granting.slowest, first), states.granting.last_point)
         elapsed = self._clock.elapsed()
-        rate = point / elapsed if elapsed > 0 else 0.0
+        rate = (point - first) / elapsed if elapsed > 0 else 0.0
         return MeshStatus(
             mesh=self._keys.mesh,
             state=states.state,
@@ -527,7 +531,7 @@ class Master:
             time=grid.time(point),
             points_per_second=rate,
             real_time_factor=rate * grid.step_size,
-            progress={node: max(point, 0) for node, point in states.granting.progress.items()},
+            progress={node: max(point, first) for node, point in states.granting.progress.items()},
             error=states.failure.report() if states.failure is not None else None,
             overruns=self._pacer.overruns,
             refused=self._inbox.refusals.count,

@@ -127,7 +127,7 @@ class MasterStates:
         )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
-        self.hold = 0 if paused else None
+        self.hold = plan.grid.first_point if paused else None
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -327,12 +327,13 @@ class MasterStates:
             self.fail(registrations.absence(self.deadlines.start))
 
     def _wait_for_initialization(self, now: float) -> None:
-        if self.granting.slowest >= 0:
+        if self.granting.has_begun:
             self._enter("running" if self.hold is None else "paused", now)
-            self._actions.append(FollowClock(0))
+            self._actions.append(FollowClock(self.granting.first_point))
             self._moved_at = self._slowest_moved_at = now
             return
-        missing = [node for node, point in self.granting.progress.items() if point < 0]
+        first = self.granting.first_point
+        missing = [node for node, point in self.granting.progress.items() if point < first]
         self._check_deadline(now, self.deadlines.initialize, "Initialization Mode is not over in", missing)
         self._send_grant(now)
 

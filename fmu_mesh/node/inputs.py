@@ -21,6 +21,7 @@ from ..instances.input_trajectory import SavedTrajectory, Trajectory
 from ..instances.instance_wrapper import AroundNativeSteps, of_kind, packed, unpacked
 from ..results.keys_file import recorded_values
 from ..rings.native import CopyCall
+from ..rings.packed_member import PackedMember
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.input_timeouts import InputTimeout, LastValues
@@ -339,6 +340,29 @@ class TimedInputs(AroundNativeSteps):
         """See `KeepsState`."""
         own, rest = unpacked(data, _OverTime, getattr(self._instance, "name", None))
         return _TimedState(super().deserialize_state(rest), own)
+
+    def apart(self, data: bytes) -> tuple[PackedMember, bytes]:
+        """What `serialize_state` returned as what each engine knows of inputs over time, and that of the model."""
+        own, inner = unpacked(data, _OverTime, getattr(self._instance, "name", None))
+        time = self._time(own.step)
+        rounding = self._grid.rounding(time)
+        waits = tuple(
+            name
+            for name, one in self._trajectories.items()
+            if one.after(time + rounding) is not None or one.value(time, rounding) != own.used.get(name)
+        )
+        known = PackedMember(b"", own.step, -1, {}, {}, own.sent, msgspec.msgpack.encode(own), waits)
+        return known, inner
+
+    def together(self, packed_member: PackedMember) -> bytes:
+        """The other way round: what `deserialize_state` takes. Another engine may have known less."""
+        known = packed_member
+        if known.over_time:
+            return msgspec.msgpack.encode((msgspec.Raw(known.over_time), known.state))
+        self._last.sent.update((name, [*steps]) for name, steps in known.sent.items())
+        late = self._last.late(known.step - 1)
+        unwarned = tuple(sorted(self._timeouts.keys() - late.keys()))
+        return packed(_OverTime(known.step, {}, {}, known.sent, late, unwarned), known.state)
 
     def state_access(self, state: object) -> CopyCall | None:  # noqa: ARG002  as in `AccessedNatively`
         """See `AccessedNatively`; None, because there is more to do."""

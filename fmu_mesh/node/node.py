@@ -40,6 +40,7 @@ from ..rings.host_memory import ONE_CORE, HostMemory
 from ..rings.row_streams import RowStreams
 from ..system.live_keys import KeyValue
 from ..system.plan import MASTER, RECORDER, Link, NodePlan
+from ..system.states import BeginsWith
 from ..wire.frames import FrameReceiver, SourceRows, of_text
 from ..wire.inbox import Inbox, Message
 from ..wire.meeting import Meeting
@@ -72,6 +73,7 @@ from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
+from .runner_states import load_states, set_again
 from .stepping import Runner, connect
 from .stream_ends import streams_of
 from .streams import PRIORITY
@@ -117,6 +119,7 @@ class Node:
         launch: the launcher that started this process; None if it was started manually.
         meeting: where it meets others for row streams; the caller closes it.
         strain: which limit of this process a failure of an FMU may come from, as a sentence; None: none.
+        begins_with: the states of its instances at the first point; None: it is that after Initialization Mode.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -138,6 +141,7 @@ class Node:
         engine: Callable[..., Engine] = make_engine,
         strain: Callable[[], str | None] = lambda: None,
         table: int = 0,
+        begins_with: BeginsWith | None = None,
     ) -> None:
         self._plan = plan
         self._session = session
@@ -149,12 +153,14 @@ class Node:
         self.new_start: NewStart | None = None
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
-        self._progress_sent = self._lazy_covered = -1
+        self._progress_sent = self._lazy_covered = plan.grid.first_point - 1
+        self._begins_with = begins_with
         self._router = router or RouterLink(session)
         self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
         self._receivers: dict[int, FrameReceiver | Link] = {}
         self._memory = self._own_memory = HostMemory.private(plan.memory, plan.node)
+        self._own_memory.begin_at(plan.grid.first_point, plan.rings)
         self._engine: Engine | None = None
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
@@ -299,6 +305,10 @@ class Node:
         self._activity.enter("initializing")
         plan = self._plan
         self._initialization.run(self._runners.values())
+        if self._begins_with is not None:
+            load_states(self._begins_with, self._runners)
+            for link in (link for runner in self._runners.values() for link in runner.out_links):
+                link.sent = self._runners[link.link.source].step
         units = [[self._runners[name] for name in names] for names in plan.units]
         self._engine = engine = self._make_engine(
             plan,
@@ -313,6 +323,8 @@ class Node:
         for runner in self._runners.values():
             runner.begin()
             runner.flush()
+        if self._begins_with is not None:
+            set_again(self._begins_with, self._runners)
         self.server.started()
         self._memory.progress[plan.node].raise_to(engine.covered + 1)
         self._tell_progress(engine)
@@ -438,7 +450,7 @@ class Node:
         if self._router.endpoints and self._router.is_back:
             for runner in self._runners.values():
                 runner.send_again()
-            if self._progress_sent >= 0:
+            if self._progress_sent >= self._plan.grid.first_point:
                 self._put_progress(HEADER.pack(PROGRESS, 0, 0, self._progress_sent))
 
     def _wait_for_message(self, left_s: float) -> None:

@@ -20,6 +20,7 @@ from ..node.burst_engine import make_engine
 from ..node.engine import Engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
+from ..node.runner_states import load_states, set_again
 from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -27,6 +28,7 @@ from ..rings.ring import Ring
 from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace
 from ..system.plan import Plan, make_plan
+from ..system.states import BeginsWith
 from ..variables.value_types import PlainValue
 
 __all__ = ["IN_ONE_NODE", "HostedSystem", "in_one_node"]
@@ -114,17 +116,24 @@ class HostedSystem:
             self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
         connect(node, self.runners, self.memory, self.memory)
 
-    def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:
-        """Initialization Mode, as `Node` does it; then the outputs are those of point 0.
+    def begin(
+        self, start_values: Mapping[str, Mapping[str, PlainValue]], begins_with: BeginsWith | None = None
+    ) -> Engine:
+        """Initialization Mode, as `Node` does it; then the outputs are those of the first point.
 
         Args:
             start_values: by instance and variable, those that are not as in the plan.
+            begins_with: the states of the first point; None: it is that after Initialization Mode. A system with them
+                has one run only.
 
         Raises:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
         self._initialization.run(self.runners.values(), start_values, again=engine is not None)
+        if begins_with is not None:
+            load_states(begins_with, self.runners)
+            self._begins_again = False
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
@@ -132,6 +141,8 @@ class HostedSystem:
             engine.begin_again(self._state)
         for runner in self.runners.values():
             runner.begin()
+        if begins_with is not None:
+            set_again(begins_with, self.runners)
         self.memory.grant.raise_to(self.plan.grid.last_point)
         return engine
 

@@ -19,6 +19,7 @@ __all__ = [
     "RunOptions",
     "SimulateOptions",
     "StartOptions",
+    "State",
     "VariantOptions",
 ]
 
@@ -36,6 +37,9 @@ Processes = Annotated[bool, Option("False: run everything in this one process", 
 MemoryLimit = Annotated[int, Option("the most bytes of results in memory; a run ends there, or is refused", least=0)]
 Restarts = Annotated[
     int, Option("restart from the first point when a process is lost, at most N times", "--restarts", "N", least=0)
+]
+State = Annotated[
+    File, Option("begin with this state, which `System.save` or `Run.checkpoint` has written", "--from", "FILE")
 ]
 OnProgress = Annotated[Callable[["MeshStatus"], object] | None, Option("called about ten times per second")]
 OnEvent = Annotated[Callable[["Event"], object] | None, Option("called with every event of `fmu_mesh.run.events`")]
@@ -63,7 +67,7 @@ class OpenOptions(VariantOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
-    state: Annotated[File, Option("go on from this state, which `System.save` has written")] = None
+    state: State = None
 
 
 class BatchOptions(VariantOptions, frozen=True):
@@ -105,6 +109,7 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
     scenario: Annotated[
         File | Mapping[str, Any], Option("values over time: a file, or what such a file has", "--scenario", "FILE")
     ] = None
+    state: State = None
     listen: Annotated[Sequence[str] | None, Option(None, "--listen", "ENDPOINT", "zenoh.listen")] = None
     connect: Annotated[Sequence[str] | None, Option(None, "--connect", "ENDPOINT", "zenoh.connect")] = None
     security: Annotated[

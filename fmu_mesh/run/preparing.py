@@ -203,6 +203,10 @@ def planned(
         connect=tuple(options.connect or ()),
     )
     obstacles.raise_any(run)
+    if options.state is not None:
+        from .state_file import StateFile  # noqa: PLC0415  most runs begin at point 0
+
+        return StateFile.read(Path(options.state)).begin(run)
     return run
 
 
@@ -224,7 +228,7 @@ class OtherStartValues:
 
     That is so if each is a value of a variable that is no structural parameter and has another start value in the plan,
     and if the plan uses start values for nothing else: no loop is iterated in Initialization Mode, there is no
-    scenario, and the instance has no input with a timeout or a key. The files of the models have to be as they were
+    scenario or state to begin with, and the instance has no input with a timeout or a key. The files of the models have to be as they were
     when the run was planned, unless nothing is loaded again.
 
     Args:
@@ -247,7 +251,7 @@ class OtherStartValues:
         self._resets: dict[frozenset[str], OtherStartValues] = {}
         items = [item for node in run.plan.nodes.values() for item in node.instances]
         system = run.plan.system
-        is_fixed = run.plan.initialization.loops or system.config.scenario is not None
+        is_fixed = run.plan.initialization.loops or system.config.scenario is not None or run.begins_with is not None
         self._variables: dict[str, tuple[str, Variable, bool]] = {}
         for item in items if not (is_fixed or any(item.scenario for item in items)) else ():
             description, finite = system.instances[item.name].description, item.not_finite == "stop"
@@ -325,6 +329,9 @@ def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: 
     Raises:
         ConfigurationError: a start value is wrong, or more would change than values; carries all findings.
     """
+    if run.begins_with is not None:
+        text = f"mesh '{run.mesh}' cannot be reset, because it has begun with a state"
+        raise ConfigurationError(text, hint="Start it again.")
     plain = PlainConfig(configuration_of(run.loaded), run.loaded.file)
     again = planned(plain, PlanOptions(start_values=dict(start_values), allow_code=True), known=known)
     check_reset(run, again)

@@ -37,6 +37,7 @@ from ..node.engine import Engine
 from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..system.plan import Plan
+from ..system.states import BeginsWith
 from ..variables.value_types import PlainValue
 from .hosted_system import HostedSystem, in_one_node
 from .local_system import opening_of
@@ -143,7 +144,7 @@ class RepeatedRuns:
             with closing(writer):
                 system = system or self._new_system(*made_for)
                 self._around.stopping.clear()
-                self._run = current = _Run(system, writer, self._around, self._slices)
+                self._run = current = _Run(system, writer, self._around, self._slices, run.begins_with)
                 if self._stop is not None:
                     current.interrupt(self._stop)
                 return current.run(start_values, watch, self._threads)
@@ -290,8 +291,16 @@ class _Run:
         writer: writes its rows.
     """
 
-    def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings, slices: _Slices) -> None:
-        self.point = 0
+    def __init__(
+        self,
+        system: HostedSystem,
+        writer: RowWriter,
+        surroundings: _Surroundings,
+        slices: _Slices,
+        begins_with: BeginsWith | None,
+    ) -> None:
+        self.point = system.plan.grid.first_point
+        self._begins_with = begins_with
         self._slices = slices
         self._system, self._plan = system, system.plan
         self._last = self._plan.grid.last_point
@@ -337,7 +346,7 @@ class _Run:
     def _write_steps(self, start_values: Mapping[str, Mapping[str, PlainValue]], watch: CallWatch) -> None:
         """From Initialization Mode to the last point; then the files are closed, and the instances are not."""
         try:
-            self._engine = engine = self._system.begin(start_values)
+            self._engine = engine = self._system.begin(start_values, self._begins_with)
             self.writer.begin(self._plan, self._system.runners)
             started = time.perf_counter()
             try:
@@ -390,7 +399,7 @@ class _Run:
         """Take steps and write rows; rows that are not written yet are never overwritten."""
         writer, window, slices = self.writer, self._plan.window, self._slices
         pacer = Pacer(self._plan, self._plan.system.config.simulation.real_time_factor)
-        pacer.start(0)
+        pacer.start(self.point)
         many = max(1, min(_WRITE_ROWS, window // 2))
         while True:
             self.point = point = engine.point

@@ -168,6 +168,7 @@ class _NodeProcess:
                 meeting=self._meeting,
                 strain=partial(strain, plan.process),
                 table=table_of(own),
+                begins_with=run.begins_with,
             )
             gc.collect()  # the memory of the run before a reset is in circles of objects
             if process.interruption.reason is not None:

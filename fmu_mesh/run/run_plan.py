@@ -24,6 +24,7 @@ from ..simtime import ENDLESS
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
 from ..system.start_values import why_not_settable
+from ..system.states import BeginsWith
 from ..text import counted, did_you_mean, listed, meant, nearest, shown
 from ..variables.model_description import ModelDescription, Variable
 from ..wire.runtime import MeshNote
@@ -78,6 +79,7 @@ class NodeRun(msgspec.Struct, frozen=True):
         security: the certificate of this host.
         launch: identifies the launch, on another host than that of the launcher; None: this is known.
         helper: the process id of the helper of the launcher there.
+        begins_with: the states of its instances at the first point.
     """
 
     config_file: Path
@@ -89,6 +91,7 @@ class NodeRun(msgspec.Struct, frozen=True):
     security: SecurityConfig | None = None
     launch: str | None = None
     helper: int | None = None
+    begins_with: BeginsWith | None = None
 
 
 class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -110,6 +113,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         connect: Zenoh endpoints that an option gives.
         run: name of the run: that of the launcher (`run_name`), or `MANUAL`.
         restarts: how often the run was started before.
+        begins_with: the states of its first point; None: it is that after Initialization Mode.
     """
 
     loaded: LoadedConfig
@@ -121,6 +125,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     connect: tuple[str, ...] = ()
     run: str = MANUAL
     restarts: int = 0
+    begins_with: BeginsWith | None = None
 
     @property
     def config_file(self) -> Path:
@@ -191,6 +196,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 for item in plan.nodes[name].instances
             },
             security=self.loaded.config.security,
+            begins_with=self.begins_with and self.begins_with.only(item.name for item in plan.nodes[name].instances),
         )
 
     def variable(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
@@ -236,7 +242,8 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
         file = folder / _FILE_NAME
         try:
-            file.write_bytes(in_parts({**nodes, _RUN: encoded(self)}))
+            lean = replace(self, begins_with=self.begins_with and self.begins_with.only(()))
+            file.write_bytes(in_parts({**nodes, _RUN: encoded(lean)}))
         except OSError as error:
             text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 import msgspec
+from msgspec.structs import replace
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
 from ..simtime import ENDLESS
-from ..system.states import AgreedInstance, agreed_of, differences
+from ..system.plan import RECORDER
+from ..system.states import AgreedInstance, BeginsWith, agreed_of, differences, stateless
 from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
@@ -130,6 +132,33 @@ class StateFile(NamedTuple):
             hint = "Open the mesh as it was when the state was written; tunable parameters and free inputs may differ."
             raise ConfigurationError(text, findings=tuple(findings), hint=hint)
         return values
+
+
+    def begin(self, run: RunPlan) -> RunPlan:
+        """The plan of a run that begins here: this point is its first one, and times are as they are.
+
+        Raises:
+            ConfigurationError: it cannot begin here; carries all differences.
+        """
+        values, plan, point, findings = self.check(run), run.plan, self.point, []
+        for name, own in plan.system.instances.items():
+            if point % own.step_points:
+                text = f"its step is {own.step_points} points, and the state is of point {point}, within one"
+                findings.append(Finding(str(self.file), f"instances.{name}", text, ""))
+        for name, why in stateless(plan.system).items():
+            findings.append(Finding(str(self.file), f"instances.{name}", f"its state cannot be restored: {why}", ""))
+        if findings:
+            text = f"a run cannot begin with the state '{self.file}'"
+            raise ConfigurationError(text, findings=tuple(findings))
+        grid = replace(plan.grid, first_point=point)
+        records = tuple(replace(own, first=own.point_of(own.rows_before(point))) for own in plan.system.records)
+        system = replace(plan.system, grid=grid, records=records, begins_with=str(self.file.absolute()))
+        nodes = {
+            name: replace(node, grid=grid, records=records if name == RECORDER else ())
+            for name, node in plan.nodes.items()
+        }
+        begins_with = BeginsWith(dict(self.states), values)
+        return replace(run, plan=replace(plan, system=system, nodes=nodes), begins_with=begins_with)
 
 
 def write_state(file: Path, run: RunPlan, point: int, states: Mapping[str, bytes]) -> None:

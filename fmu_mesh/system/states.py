@@ -6,7 +6,7 @@ Owns no file and no state; those are `fmu_mesh.run.state_file` and the instances
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import msgspec
@@ -19,7 +19,7 @@ from .plan import Plan
 from .start_values import why_not_settable
 from .system import ResolvedSystem
 
-__all__ = ["AgreedInstance", "Differences", "agreed_of", "differences", "stateless"]
+__all__ = ["AgreedInstance", "BeginsWith", "Differences", "agreed_of", "differences", "stateless"]
 
 _HASHES = {
     "variables": "variables",
@@ -50,6 +50,24 @@ class AgreedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scenario: str
     timeouts: str
     start_values: dict[str, PlainValue]
+
+
+class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The states with which a run begins, at the first point of its grid.
+
+    Attributes:
+        states: that of each instance.
+        set_again: the start values that are others now, by instance and variable.
+    """
+
+    states: dict[str, bytes] = {}
+    set_again: dict[str, dict[str, PlainValue]] = {}
+
+    def only(self, names: Iterable[str]) -> BeginsWith:
+        """What these instances need."""
+        names = [*names]
+        states, values = ({name: own[name] for name in names if name in own} for own in (self.states, self.set_again))
+        return BeginsWith(states, values)
 
 
 class Differences(NamedTuple):

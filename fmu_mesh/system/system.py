@@ -84,6 +84,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
         topics: those in ROS.
         recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
+        begins_with: the state file with which the run begins, absolute; empty: it begins at point 0.
     """
 
     config: Config
@@ -95,6 +96,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     scenario_files: dict[str, str] = {}
     topics: tuple[MeshTopic, ...] = ()
     recorded_keys: RecordedKeys | None = None
+    begins_with: str = ""
 
     @property
     def keys(self) -> tuple[KeyView, ...]:

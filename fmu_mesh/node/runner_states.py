@@ -1,0 +1,90 @@
+"""The state of an instance in a node, as bytes that outlive its process, and a run that begins with one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+from msgspec.structs import replace
+
+from ..errors import FmuError
+from ..instances.contract import KeepsState
+from ..rings.packed_member import PackedMember, columns_of, put_columns
+from ..system.states import BeginsWith
+from ..variables.value_conversion import to_value
+from .inputs import TimedInputs, set_input
+from .stepping import Runner
+
+__all__ = ["load_states", "packed_state", "set_again"]
+
+
+def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
+    """After Initialization Mode, and before an engine is made: bring the runners to their states.
+
+    Raises:
+        FmuError: an instance cannot use its state.
+    """
+    for name, data in begins_with.states.items():
+        _load(runners[name], data)
+
+
+def set_again(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
+    """When there is an engine, and before the first step: set what is another start value now.
+
+    Raises:
+        FmuError: an instance refused it.
+    """
+    for name, values in begins_with.set_again.items():
+        description = runners[name].instance.description
+        variables = {variable.name: variable for variable in description.variables}
+        for own, value in values.items():
+            set_input(runners[name], own, to_value(value, variables[own]), None)
+
+
+def packed_state(runner: Runner) -> bytes:
+    """The state of a runner between two steps, at a point at which all instances have an own one.
+
+    So its newest row is the only one that a step may still read.
+
+    Raises:
+        FmuError: the instance cannot write its state.
+    """
+    step, instance = runner.step, cast("KeepsState", runner.instance)
+    if isinstance(runner.instance, TimedInputs):
+        runner.instance.reached(step)
+    state = instance.get_state()
+    try:
+        data = instance.serialize_state(state)
+    finally:
+        instance.free_state(state)
+    known = PackedMember(data, step, -1, {}, {}, {})
+    if isinstance(runner.instance, TimedInputs):
+        own, data = runner.instance.apart(data)
+        known = replace(own, state=data)
+    outputs = columns_of(runner.outputs, runner.outputs.parts, [step])
+    inputs = columns_of(runner.inputs, runner.inputs.parts, [0])
+    return replace(known, outputs=outputs, inputs=inputs).encoded()
+
+
+def _load(runner: Runner, data: bytes) -> None:
+    own, grid, name = PackedMember.decoded(data, runner.name), runner.grid, runner.name
+    if (at := own.step * runner.plan.step_points) != grid.first_point:
+        raise FmuError(f"its state is of point {at}, and the run begins at point {grid.first_point}", instance=name)
+    runner.table.note(step=own.step)
+    runner.bind()
+    if own.over_time and not isinstance(runner.instance, TimedInputs):
+        timed = TimedInputs(runner.instance, "hold")
+        timed.start(grid, runner.plan.step_points, own.step)
+        runner.wrap(timed)
+    instance = cast("KeepsState", runner.instance)
+    together = runner.instance.together(own) if isinstance(runner.instance, TimedInputs) else own.state
+    state = instance.deserialize_state(together)
+    try:
+        instance.set_state(state)
+    finally:
+        instance.free_state(state)
+    outputs = runner.outputs
+    others = put_columns(outputs, outputs.parts, [own.step], own.outputs, name)
+    put_columns(runner.inputs, runner.inputs.parts, [0], own.inputs, name)
+    for other, value in zip(others, runner.instance.get_values(others) if others else [], strict=True):
+        outputs.put(own.step, other, value)
