@@ -31,7 +31,7 @@ from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
 from ..run.preparing import OtherStartValues
 from ..run.run_plan import RunPlan
-from ..run.state_file import StateFile, write_state
+from ..run.state_file import StateFile, state_bytes, write_state
 from ..simtime import ENDLESS
 from ..system.states import stateless
 from ..text import listed, option_text, shown
@@ -346,7 +346,7 @@ class System:
             saved = self._local.save()
         if file is not None:
             try:
-                write_state(Path(file), self._run, saved.point, self._local.packed(saved))
+                write_state(Path(file), state_bytes(self._run, saved.point, self._local.packed(saved)))
             except FmuMeshError:
                 self._local.free(saved)
                 raise

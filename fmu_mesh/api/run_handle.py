@@ -377,6 +377,39 @@ class Run:
         """Run some points and pause again; returns when the mesh has paused. For ``timeout`` and errors see `pause`."""
         return self._steered().rest(Command("step", points), timeout)
 
+    @checked
+    def checkpoint(self, file: str | Path, *, timeout: float | None = None) -> int:
+        """Write the states of all instances at one point into a file, while the mesh goes on.
+
+        `Mesh.run(state=...)`, `Mesh.open(state=...)`, sweeps and `fmu-mesh launch --from` begin with it. The nodes wait
+        while they save their states, which no status shows. A mesh that is paused can be saved, too.
+
+        Example:
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
+            ...     answer = run.step(10)
+            ...     run.checkpoint("results/ten.state")
+            10
+            >>> len(mesh.run(record="memory", stop_time=0.1, state="results/ten.state").times)
+            41
+
+        Args:
+            file: where it is written; a file of this name is replaced.
+            timeout: the longest time to wait in s; None: that of every question.
+
+        Returns:
+            The point of the states, at which all instances have a communication point of their own.
+
+        Raises:
+            ConfigurationError: an instance has no state that can be written, or there is no checkpoint for another
+                reason, or not in time; or the file cannot be written.
+        """
+        from ..run.state_file import StateFile, write_state  # noqa: PLC0415  only this needs it
+
+        data = self._steered().checkpoint(timeout)
+        write_state(Path(file), data)
+        return StateFile.read(Path(file)).point
+
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""
         return self._steered().command(Command("resume"))

@@ -62,7 +62,7 @@ from ..variables.value_types import PlainValue
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys, RunKeys, sender_in
 from ..wire.meeting import Meeting
-from ..wire.messages import FINISH, PROGRESS, NewStart, NodeReport, decode_json, sealed
+from ..wire.messages import FINISH, PROGRESS, STATE, NewStart, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
 from ..wire.router_link import RouterLink
 from ..wire.runtime import this_host
@@ -72,6 +72,7 @@ from ..wire.values import json_encoding, who_sent
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from ..wire.ways import Ways
 from .audit import Audit
+from .checkpoints import Checkpoints
 from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
 from .master_streams import MasterStreams
 from .members import Followers, Members
@@ -160,6 +161,9 @@ class Master:
         own = settings.launch, meeting, settings.table
         self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
+        self._checkpoints = Checkpoints(
+            self._keys.mesh, self._states, self._withdrawn_grant, self._settings.as_file, self._answer_with_file
+        )
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)
 
@@ -289,6 +293,7 @@ class Master:
         """Do what there is to do; return for how long there is nothing more if nothing arrives, in s."""
         states, pause_s = self._states, math.inf
         self._look_at_streams(now)
+        self._checkpoints.settle(now)
         while True:
             paced = states.wanted
             if states.takes_commands:
@@ -304,6 +309,7 @@ class Master:
             if not actions:
                 break
         self._resting.settle(now)
+        self._checkpoints.answer()
         # After what there is to do: to publish takes as long as thousands of points.
         (state, rested), self._published = self._published, (states.state, states.rests)
         if (states.state != state or (states.rests and not rested)) and not states.is_over:
@@ -371,7 +377,10 @@ class Master:
         message = self._inbox.wait(timeout_s, wishes)
         while message is not None:
             node, kind, _, _, point, _ = message
-            if kind != PROGRESS:
+            if kind == STATE:
+                with self._inbox.refusals.guard(node):
+                    self._checkpoints.take(node, point, message[5])
+            elif kind != PROGRESS:
                 self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             elif node not in seen:
                 reported.append((node, point))
@@ -412,10 +421,16 @@ class Master:
             query.reply_err(str(error))
             query.drop()
             return
-        if states.takes_commands:
+        if states.takes_commands and command.command == "checkpoint":
             self.audit.note("commanded", who, key, command.command)
-            claimed = self._memory.withdraw_grant() if states.granting.sharing else 0
-            answer = replace(states.command(command, claimed), resets=resets)
+            try:
+                self._checkpoints.ask(query, command.wait, self._awake())
+            except FmuMeshError as refused:
+                self._answer_with_file(query, refused)
+        elif states.takes_commands:
+            self.audit.note("commanded", who, key, command.command)
+            self._checkpoints.give_up(MeshLost(f"another program gave the command '{command.command}' meanwhile"))
+            answer = replace(states.command(command, self._withdrawn_grant()), resets=resets)
             if command.wait and answer.hold is not None and command.command != "reset":
                 self._resting.add(query, answer, self._awake() + command.wait)
             else:
@@ -445,6 +460,18 @@ class Master:
         with self._inbox.refusals.guard(str(key)):  # the client may be gone
             query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
             query.drop()
+
+    def _answer_with_file(self, query: zenoh.Query, answer: bytes | FmuMeshError) -> None:
+        with self._inbox.refusals.guard(str(query.key_expr)):  # the client may be gone
+            if isinstance(answer, bytes):
+                query.reply(query.key_expr, answer, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
+            else:
+                query.reply_err(str(answer))
+            query.drop()
+
+    def _withdrawn_grant(self) -> int:
+        """Take the grant back: what a node may have claimed."""
+        return self._memory.withdraw_grant() if self._states.granting.sharing else 0
 
     def _new_start(self, command: Command) -> NewStart:
         """What the nodes need for a reset.

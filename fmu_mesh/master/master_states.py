@@ -40,6 +40,7 @@ import msgspec
 
 from ..config.deadlines import Deadlines
 from ..errors import (
+    CallRefused,
     DeadlineExceeded,
     FmuMeshError,
     Interrupted,
@@ -53,7 +54,7 @@ from ..errors import (
 from ..system.placement import placed
 from ..system.plan import RECORDER, Plan
 from ..wire.host_processes import OR_CUT
-from ..wire.messages import FINISH, GRANT, NodeReport
+from ..wire.messages import FINISH, GRANT, SAVE, NodeReport
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
 from ..wire.ways import Ways
 from .granting import Granting
@@ -110,6 +111,7 @@ class MasterStates:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
         hold: the point at which all nodes pause.
+        saves_at: the point at which all nodes save their states, and beyond which nothing is granted until then.
         reports: how nodes have ended, by name.
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
@@ -128,6 +130,8 @@ class MasterStates:
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
         self.hold = plan.grid.first_point if paused else None
+        self.saves_at: int | None = None
+        self._every = math.lcm(*(own.step_points for own in plan.system.instances.values()))
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -161,8 +165,9 @@ class MasterStates:
     @property
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
-        last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
-        return last_point if hold is None else min(hold, last_point)
+        # Each once: the recorder asks on its own thread.
+        limits = self.granting.last_point, self.hold, self.saves_at
+        return min(limit for limit in limits if limit is not None)
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
@@ -256,6 +261,31 @@ class MasterStates:
         where = (granting.slowest, self.hold) if command.command != "reset" else (0, None if before is None else 0)
         return CommandAnswer(command.command, self.state, *where)
 
+    def save(self, claimed: int) -> int:
+        """Hold all nodes at a point at which all instances have an own one, until `saved`; returns that point.
+
+        Only while it `takes_commands`. ``claimed`` is as in `command`.
+
+        Raises:
+            CallRefused: the mesh pauses, or ends, before the next such point.
+        """
+        granting, every = self.granting, self._every
+        at = -(-granting.halt(claimed) // every) * every
+        self._actions.append(RaiseGrant(granting.grant))
+        self._moved_at = self._slowest_moved_at = None
+        if at > self.wanted:
+            rests = f"pauses at point {self.hold}" if self.hold is not None else f"ends at point {granting.last_point}"
+            text = f"the mesh {rests}, and all instances are at a point of their own only at every {every}th point"
+            hint = f"`step` it by {at - self.hold}." if self.hold is not None else None
+            raise CallRefused(text, hint=hint)
+        self.saves_at = at
+        self._actions.append(SendToAll(SAVE, at))
+        return at
+
+    def saved(self) -> None:
+        """The nodes have saved their states, or need not: they go on."""
+        self.saves_at = self._moved_at = self._slowest_moved_at = None
+
     def fail(self, error: FmuMeshError) -> None:
         """The run has to end; the first reason counts."""
         if self.failure is None:
@@ -339,7 +369,7 @@ class MasterStates:
 
     def _go_on(self, now: float, paced: int, stopped: Sequence[str]) -> None:
         granting = self.granting
-        if granting.slowest >= granting.last_point:
+        if granting.slowest >= granting.last_point and self.saves_at is None:
             if isinstance(self.ended_by, NotFinite):
                 self.fail(self.ended_by)
             else:

@@ -52,14 +52,18 @@ from ..wire.messages import (
     GRANT,
     HEADER,
     INITIAL,
+    MAX_STATE_SIZE,
     PROGRESS,
     RESET,
+    SAVE,
+    InstanceState,
     NewStart,
     NodeReport,
     SetValue,
     Stiff,
     decode_json,
     encode_news,
+    encode_state,
 )
 from ..wire.router_link import RouterLink
 from ..wire.stream_keeper import StreamKeeper
@@ -68,12 +72,12 @@ from ..wire.views import AuditEntry, LogLine
 from ..wire.ways import Ways
 from .activity import Activity
 from .burst_engine import make_engine
-from .engine import Engine, Windows
+from .engine import SLICE_S, Engine, Windows
 from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
-from .runner_states import load_states, set_again
+from .runner_states import load_states, packed_state, set_again
 from .stepping import Runner, connect
 from .stream_ends import streams_of
 from .streams import PRIORITY
@@ -154,7 +158,7 @@ class Node:
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
         self._progress_sent = self._lazy_covered = plan.grid.first_point - 1
-        self._begins_with = begins_with
+        self._begins_with, self._saves_at = begins_with, -1
         self._router = router or RouterLink(session)
         self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
@@ -388,8 +392,7 @@ class Node:
         left_s = 0.0
         while not self.finished:
             try:
-                has_more = self._inbox.is_direct or self._inbox.has_posted
-                wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
+                wait_s = self._wait_s(left_s if eager else _LONGEST_SLEEP_S)
                 stepped = engine.run(wait_s, eager=eager, quiet=quiet and not self.server.is_followed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
@@ -430,6 +433,12 @@ class Node:
             member.flush()
         self._memory.progress[self._plan.node].raise_to(engine.covered + 1)
 
+    def _wait_s(self, longest_s: float) -> float:
+        """For how long in s the engine may wait: not where a message is to be read, or a checkpoint is near."""
+        if self._inbox.is_direct or self._inbox.has_posted:
+            return 0.0
+        return longest_s if self._saves_at < 0 else min(longest_s, SLICE_S)
+
     def _send_rows(self, engine: Engine) -> float:
         """Send the rows that a step may wait for; return how long in s this node may wait until the next call.
 
@@ -442,6 +451,7 @@ class Node:
             self._lazy_sent, self._lazy_covered = now, covered
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
+        self._send_states()
         return _LONGEST_SLEEP_S if lazy else self._lazy_sent + _LAZY_S - now
 
     def _look_at_router(self) -> None:
@@ -485,6 +495,9 @@ class Node:
             self._memory.grant.raise_to(min(point, self._plan.grid.last_point))
         elif kind == FINISH:
             self._finish_at = point
+        elif kind == SAVE:
+            self._saves_at = point
+            self._send_states()
         elif kind == ABORT:
             raise _Aborted(from_report(decode_json(data[HEADER.size :], ErrorReport)))
         elif kind == RESET:
@@ -507,6 +520,25 @@ class Node:
             self._progress_sent = covered
             self._progress_told_at = now
             self._put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
+
+    def _send_states(self) -> None:
+        """If all instances are at the point of a checkpoint, beyond which the master grants nothing: send their states.
+
+        The master cannot go on without an answer; so it gets one also where an instance has no state to send.
+        """
+        at, points = self._saves_at, [runner.point for runner in self._runners.values()]
+        if at < 0 or min(points) < at:
+            return
+        self._saves_at = -1
+        for runner in self._runners.values() if max(points) == at else ():  # else it was given up
+            try:
+                own = InstanceState(runner.name, packed_state(runner))
+            except FmuError as error:
+                own = InstanceState(runner.name, error=self._located(error).report())
+            if (size := len(own.state)) > MAX_STATE_SIZE:
+                large = FmuError(f"its state takes {size} bytes; the limit is {MAX_STATE_SIZE}", instance=runner.name)
+                own = InstanceState(runner.name, error=large.report())
+            self._put_progress(encode_state(own, at))
 
     # --- the end
 

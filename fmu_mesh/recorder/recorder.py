@@ -67,6 +67,7 @@ from ..wire.messages import (
     PROGRESS,
     REFUSED,
     RESET,
+    SAVE,
     SET,
     STIFF,
     NodeReport,
@@ -322,6 +323,7 @@ class Recorder:
             GRANT,
             ABORT,
             RESET,
+            SAVE,
         ):  # why the run ends early comes from the master of this process: `__exit__`
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 

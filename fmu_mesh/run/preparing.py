@@ -227,9 +227,9 @@ class OtherStartValues:
     """Decides whether start values of a further run, or of a reset, change nothing else of its plan.
 
     That is so if each is a value of a variable that is no structural parameter and has another start value in the plan,
-    and if the plan uses start values for nothing else: no loop is iterated in Initialization Mode, there is no
-    scenario or state to begin with, and the instance has no input with a timeout or a key. The files of the models have to be as they were
-    when the run was planned, unless nothing is loaded again.
+    and if the plan uses start values for nothing else: no loop is iterated in Initialization Mode, there is no scenario
+    and no state to begin with, and the instance has no input with a timeout or a key. The files of the models have to
+    be as they were when the run was planned, unless nothing is loaded again.
 
     Args:
         run: the run.

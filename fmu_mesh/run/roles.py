@@ -46,6 +46,7 @@ from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
+from .state_file import state_bytes
 from .wiring import certified, patient, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
@@ -285,6 +286,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 profile=run.profile,
                 paused=run.paused,
                 table=table_of(own),
+                as_file=lambda point, states: state_bytes(runs.run, point, states),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())

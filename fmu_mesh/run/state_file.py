@@ -26,7 +26,7 @@ from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
 
-__all__ = ["StateFile", "write_state"]
+__all__ = ["StateFile", "state_bytes", "write_state"]
 
 _LETTERS = b"FMUSTATE"
 _VERSION = 1
@@ -133,7 +133,6 @@ class StateFile(NamedTuple):
             raise ConfigurationError(text, findings=tuple(findings), hint=hint)
         return values
 
-
     def begin(self, run: RunPlan) -> RunPlan:
         """The plan of a run that begins here: this point is its first one, and times are as they are.
 
@@ -161,22 +160,26 @@ class StateFile(NamedTuple):
         return replace(run, plan=replace(plan, system=system, nodes=nodes), begins_with=begins_with)
 
 
-def write_state(file: Path, run: RunPlan, point: int, states: Mapping[str, bytes]) -> None:
-    """Write a state of a run at a point into a file, in the place of an older one; see `StateFile`.
-
-    Raises:
-        ConfigurationError: the file cannot be written; an older one is as it was.
-    """
+def state_bytes(run: RunPlan, point: int, states: Mapping[str, bytes]) -> bytes:
+    """The content of a state file: the states of a run at a point; see `StateFile`."""
     grid = run.plan.grid
     blocks = tuple(_Block(name, len(own), hashlib.sha256(own).digest()) for name, own in states.items())
     instances = agreed_of(run.plan, run.contents)
     times = grid.time(point), grid.start_time, grid.step_size
     head = msgspec.msgpack.encode(_Head(__version__, run.mesh, point, *times, instances, blocks))
+    start = _START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest())
+    return b"".join((start, head, *states.values()))
+
+
+def write_state(file: Path, data: bytes) -> None:
+    """Write the content of a state file, in the place of an older one.
+
+    Raises:
+        ConfigurationError: the file cannot be written; an older one is as it was.
+    """
     try:
         with files.replaced(file) as draft, draft.open("wb") as target:
-            target.write(_START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest()))
-            for part in (head, *states.values()):
-                target.write(part)
+            target.write(data)
             target.flush()
             os.fsync(target.fileno())  # else its name could survive a power cut, and its content not
     except OSError as error:

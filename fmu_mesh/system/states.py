@@ -65,9 +65,11 @@ class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def only(self, names: Iterable[str]) -> BeginsWith:
         """What these instances need."""
-        names = [*names]
-        states, values = ({name: own[name] for name in names if name in own} for own in (self.states, self.set_again))
-        return BeginsWith(states, values)
+        known = {*names}
+        return BeginsWith(
+            {name: state for name, state in self.states.items() if name in known},
+            {name: values for name, values in self.set_again.items() if name in known},
+        )
 
 
 class Differences(NamedTuple):

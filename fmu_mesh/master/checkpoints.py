@@ -1,0 +1,134 @@
+"""Checkpoints: the nodes stand at one point while they save their states, and who has asked for them gets the file.
+
+Owns the states that have come so far and the commands that wait for them. `MasterStates` holds the grant meanwhile.
+"""
+
+# All of it runs on the main thread of the master. What may go wrong: a node does not answer (its process is gone, and
+# the run ends; or a message is lost, and after the deadline the run goes on without a checkpoint), an instance cannot
+# write its state, or another command comes meanwhile. In each case the grant goes on, and who has asked is told why.
+# A state that comes too late has another point than the present checkpoint, and is dropped (ADR 90).
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+
+import zenoh
+
+from ..errors import CallRefused, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..system.states import stateless
+from ..wire.messages import InstanceState, decode_state
+from .master_states import MasterStates
+from .registrations import spoken
+
+__all__ = ["Checkpoints"]
+
+_WAIT_S = 5.0
+"""How long a command waits that does not say how long."""
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Args:
+        mesh: its name.
+        withdraw: takes the grant back; see `MasterStates.command`.
+        reply: answers a query with a file, or with the reason why there is none.
+    """
+
+    def __init__(
+        self,
+        mesh: str,
+        states: MasterStates,
+        withdraw: Callable[[], int],
+        as_file: Callable[[int, Mapping[str, bytes]], bytes],
+        reply: Callable[[zenoh.Query, bytes | FmuMeshError], None],
+    ) -> None:
+        self._mesh = f"mesh '{mesh}'"
+        self._states = states
+        self._withdraw, self._as_file, self._reply = withdraw, as_file, reply
+        self._waiting: list[tuple[zenoh.Query, float]] = []
+        self._found: dict[str, InstanceState] = {}
+        self._stands_since: float | None = None
+        self._complete: tuple[int, Mapping[str, bytes]] | None = None
+
+    def ask(self, query: zenoh.Query, wait_s: float, now: float) -> None:
+        """Answer a query with the file of a checkpoint, in ``wait_s`` seconds; 0: in the usual time.
+
+        Raises:
+            CallRefused: there can be none.
+        """
+        if self._states.saves_at is None:
+            self._begin()
+        self._waiting.append((query, now + (wait_s or _WAIT_S)))
+
+    def _begin(self) -> None:
+        for name, why in stateless(self._states.plan.system).items():
+            raise CallRefused(f"its state cannot be written to a file: {why}.", instance=name)
+        self._found.clear()
+        self._stands_since = None
+        self._states.save(self._withdraw())
+
+    def take(self, node: str, point: int, data: bytes) -> None:
+        """A node has sent the state of an instance.
+
+        Raises:
+            MessageRefused: it is none of its instances.
+        """
+        own = decode_state(data)
+        if own.instance not in [item.name for item in self._states.plan.nodes[node].instances]:
+            raise MessageRefused(f"'{own.instance}' is no instance of it")
+        if point == self._states.saves_at:
+            self._found[own.instance] = own
+
+    def settle(self, now: float) -> None:
+        """Go on if all states are there, or if there will be no checkpoint."""
+        states, at, found = self._states, self._states.saves_at, self._found
+        if at is None:
+            return
+        if self._stands_since is None and states.granting.reached >= at:
+            self._stands_since = now
+        missing = states.plan.system.instances.keys() - found.keys()
+        failed = [own.error for own in found.values() if own.error is not None]
+        limit_s = states.deadlines.silence
+        if not states.takes_commands:
+            self.give_up(MeshLost(f"{self._mesh} is {states.state}, and there is no checkpoint any more"))
+        elif failed:
+            self.give_up(from_report(failed[0]))
+        elif not missing:
+            states.saved()
+            self._complete = at, {name: found[name].state for name in states.plan.system.instances}
+        elif now - (self._stands_since if self._stands_since is not None else math.inf) > limit_s:
+            nodes = sorted({states.plan.node_of(name) for name in missing})
+            text = f"the states of {spoken(*nodes)} at point {at} have not come within {limit_s:g} s"
+            self.give_up(DeadlineExceeded(f"{text}; the run goes on without a checkpoint"))
+        else:
+            self._refuse_late(at, now)
+
+    def answer(self) -> None:
+        """When the nodes go on: answer those who have waited for a checkpoint that is complete."""
+        if self._complete is not None:
+            data, self._complete = self._as_file(*self._complete), None
+            self._answer(data, [query for query, _ in self._waiting])
+            self._waiting.clear()
+
+    def give_up(self, error: FmuMeshError) -> None:
+        """There is no checkpoint, and why; nothing happens if none is under way."""
+        if self._states.saves_at is not None:
+            self._states.saved()
+        self._answer(error, [query for query, _ in self._waiting])
+        self._waiting.clear()
+
+    def _refuse_late(self, at: int, now: float) -> None:
+        late = [query for query, until in self._waiting if now >= until]
+        if late:
+            where = f"{self._mesh} is at point {self._states.granting.reached}, on its way to point {at}"
+            text = f"{where}, where it saves its states"
+            self._answer(DeadlineExceeded(f"{text}.", hint="A larger `timeout=...` waits longer."), late)
+            self._waiting = [own for own in self._waiting if own[0] not in late]
+            if not self._waiting:
+                self._states.saved()
+
+    def _answer(self, what: bytes | FmuMeshError, queries: Iterable[zenoh.Query]) -> None:
+        for query in queries:
+            self._reply(query, what)
