@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +22,9 @@ from msgspec import NODEFAULT, inspect
 
 from fmu_mesh.cli.main import COMMANDS, command_parser
 from fmu_mesh.config.call_options import CallOptions, Option, option_fields
+from fmu_mesh.config.deadlines import Deadlines
 from fmu_mesh.config.instance_sections import KIND, InstanceSection
-from fmu_mesh.config.mesh import config_type
+from fmu_mesh.config.mesh import TimeoutsConfig, config_type
 from fmu_mesh.config.structure import describe
 from fmu_mesh.instances.registry import KINDS
 from fmu_mesh.run.options import RunOptions, SimulateOptions
@@ -35,6 +37,7 @@ __all__ = [
     "call_options",
     "command_options",
     "configuration_page",
+    "deadlines_page",
     "keys_of",
     "known",
     "options_page",
@@ -45,7 +48,7 @@ __all__ = [
 ]
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
-_COMMON = ("start_values", "inputs", "step_size", "group", "host", "not_finite", "process")
+_COMMON = ("start_values", "inputs", "step_size", "group", "host", "not_finite", "on_failure", "process")
 _INTERPOLATION = "interpolation"
 _WRITTEN = "<!-- written by `python docs/reference_pages.py` -->"
 
@@ -87,6 +90,30 @@ _SWEEP = """\
 ## Options of a sweep
 
 `fmu_mesh.sweep` and the command take these beside those of a run that any variant has ([sweeps](../sweeps.md)).
+"""
+
+_DEADLINES = f"""\
+# Deadlines
+{_WRITTEN}
+
+No wait of a run is without an end. This page has the deadlines that a user may meet. The first table has those that you
+can change, in the section `timeouts` of the [configuration](configuration.md), in s. A deadline counts only time in
+which the process that waits can run: a suspended host, or a debugger, misses none. [Failures](../failures.md) says what
+is shown.
+
+## `timeouts`
+"""
+
+_LAUNCHER = """\
+## The launcher and the master
+
+What follows from `timeouts` has its formula. The others are fixed.
+"""
+
+_FIXED = """\
+## Fixed
+
+These have no key: what they wait for takes far less time, or nothing depends on it.
 """
 
 _FORMS: Mapping[object, str] = {"key_input": "with `key` and `to`", "key_output": "with `from` and `key`"}
@@ -173,6 +200,37 @@ def options_page() -> str:
     return "\n".join(parts).rstrip() + "\n"
 
 
+def deadlines_page() -> str:
+    """The page of all deadlines: those of `timeouts`, those of the launcher and the master, and fixed ones."""
+    told = known()["deadlines"]
+    kind = inspect.type_info(TimeoutsConfig)
+    assert isinstance(kind, inspect.StructType)
+    keys = [(f"`{key.name}`", f"{key.default:g}", key.text, told["timeouts"][key.name]) for key in keys_of(kind)]
+    meanings = re.findall(r"^        (\w+): (.+(?:\n            .+)*)", Deadlines.__doc__ or "", re.MULTILINE)
+    formulas = {name: told["launcher"].get(name) for name in Deadlines.__struct_fields__}
+    fixed = dict(zip(Deadlines.__struct_fields__[::-1], (Deadlines.__struct_defaults__ or ())[::-1], strict=False))
+    launcher = [
+        (f"`{name}`", formulas[name] or f"{fixed[name]:g}", f"{text[0].upper()}{' '.join(text.split())[1:]}")
+        for name, text in meanings
+    ]
+    constants = []
+    for place, (what, then) in told["fixed"].items():
+        module, _, name = place.rpartition(".")
+        value = getattr(import_module(f"fmu_mesh.{module}"), name)
+        constants.append((f"`{module}`", f"`{name}`", f"{value:g}", what, then))
+    parts = [
+        _DEADLINES,
+        _table(("key", "default", "for what", "then"), keys),
+        "",
+        _LAUNCHER,
+        _table(("name", "s", "for what"), launcher),
+        "",
+        _FIXED,
+        _table(("where", "name", "s", "for what", "then"), constants),
+    ]
+    return "\n".join(parts).rstrip() + "\n"
+
+
 def call_options(options: type[CallOptions]) -> dict[str, Option]:
     """The options of a Struct; of any but `RunOptions` those that are not the same there."""
     of_run = {} if options is RunOptions else option_fields(RunOptions)
@@ -225,7 +283,7 @@ def since(command: str, option: str) -> str:
 
 def reference_pages() -> dict[str, str]:
     """The text of each page by its name."""
-    return {"configuration.md": configuration_page(), "options.md": options_page()}
+    return {"configuration.md": configuration_page(), "options.md": options_page(), "deadlines.md": deadlines_page()}
 
 
 def _sections(kind: inspect.StructType, path: str, seen: dict[type, str]) -> Iterator[Section]:

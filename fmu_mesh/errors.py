@@ -12,7 +12,8 @@ FmuMeshError                     1   an internal error
 │   ├── InitializationFailed         a call in or around Initialization Mode failed
 │   │   └── LoopNotConverged         an algebraic loop has no consistent values at the start
 │   ├── StepFailed                   fmi2DoStep, or a get or set at a point, failed
-│   └── NotFinite                    an output is NaN or infinite
+│   ├── NotFinite                    an output is NaN or infinite
+│   └── NotDeterministic             after a restart, a recorded value is another than before
 ├── MeshLost                     4   a node, the master or the recorder has ended or does not answer
 │   ├── DeadlineExceeded             what a process waited for did not come in time
 │   ├── FrameGap                     a point is missing, or came twice with other values
@@ -54,6 +55,7 @@ __all__ = [
     "LoopNotConverged",
     "MeshLost",
     "MessageRefused",
+    "NotDeterministic",
     "NotFinite",
     "NotInOneProcess",
     "ProtocolBroken",
@@ -317,6 +319,12 @@ class NotFinite(FmuError):
         return self.point - 1 if self.point else None
 
 
+class NotDeterministic(FmuError):
+    """After a restart, a recorded value is another than before at the same `point`; the file stays as it was."""
+
+    _message_has_variable = True
+
+
 class MeshLost(FmuMeshError):
     """A node, the master or the recorder has ended or does not answer."""
 
@@ -375,6 +383,7 @@ _BY_KIND: dict[str, type[FmuMeshError]] = {
         InitializationFailed,
         LoopNotConverged,
         StepFailed,
+        NotDeterministic,
         NotFinite,
         MeshLost,
         DeadlineExceeded,

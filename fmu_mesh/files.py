@@ -333,6 +333,12 @@ class OwnFile(FileIO):
         self.size += written
         return written
 
+    def append_after(self, size: int) -> None:
+        """The next write goes after the first ``size`` bytes, which stay; what follows them is cut off."""
+        self._untouched, self.size = False, size
+        self.truncate(size)
+        self.seek(size)
+
     def close(self) -> None:
         """Close the file; if nothing was written, an older file is unchanged and no new one appears."""
         if not self.closed and self._untouched and self._draft is not None:

@@ -36,7 +36,7 @@ from ..simtime import ENDLESS
 from ..system.states import stateless
 from ..text import listed, option_text, shown
 from ..variables.value_conversion import ValueRefused, checker, to_value
-from ..variables.value_types import DTYPES
+from ..variables.value_types import DTYPES, PlainValue
 from .system_state import SystemState
 
 __all__ = ["System"]
@@ -92,6 +92,7 @@ class System:
         self._plan = plan = run.plan
         OneProcess().check(plan, run.contents)
         self._run = run
+        self._others: Mapping[str, Mapping[str, PlainValue]] = {}  # start values that are not as in the plan
         self._grid = plan.grid
         self._last = plan.grid.last_point
         self._thread = get_ident()
@@ -111,7 +112,7 @@ class System:
             local.start(self._opened)
             if state is not None:
                 with kept_state():
-                    local.load(state.point, state.states)
+                    local.load(state.head.point, state.states)
                     for name, values in set_again.items():
                         variables = {v.name: v for v in plan.system.instances[name].description.variables}
                         local.set(name, {own: to_value(value, variables[own]) for own, value in values.items()})
@@ -327,7 +328,8 @@ class System:
         Raises:
             CallRefused: an FMU cannot get and set its state, or write it; or see `close`.
             ConfigurationError: the file cannot be written.
-            FmuError: an FMU failed. Only `reset` and `close` are allowed now.
+            FmuError: an FMU failed: only `reset` and `close` are allowed now. Or the state of an instance cannot be
+                written, as that of a component with an attribute that is no plain value: nothing has changed.
         """
         self._demand("save")
         if file is not None and not isinstance(file, str | Path):
@@ -346,7 +348,9 @@ class System:
             saved = self._local.save()
         if file is not None:
             try:
-                write_state(Path(file), state_bytes(self._run, saved.point, self._local.packed(saved)))
+                run = replace(self._run, plan=self._plan)
+                packed = self._local.packed(saved)
+                write_state(Path(file), state_bytes(run, saved.point, packed, self._others))
             except FmuMeshError:
                 self._local.free(saved)
                 raise
@@ -429,14 +433,14 @@ class System:
     def _begin_again(self, start_values: Mapping[str, Any] | None) -> None:
         """Initialize all instances again."""
         values = dict(ResetOptions(start_values=start_values).start_values or {})
-        self._plan, others = self._resets.of_reset(values)
+        self._plan, self._others = self._resets.of_reset(values)
         self._getters.clear()
         self._setters.clear()
         self._first = None
         for state in self._saved:
             self._saved[state] = None
         with self._changing():
-            self._local.start(self._opened, self._plan, others)
+            self._local.start(self._opened, self._plan, self._others)
             instances = self._plan.system.instances.values()
             if not values and all(own.description.can_get_and_set_state for own in instances):
                 self._first = self._local.save()

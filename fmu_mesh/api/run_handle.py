@@ -408,7 +408,7 @@ class Run:
 
         data = self._steered().checkpoint(timeout)
         write_state(Path(file), data)
-        return StateFile.read(Path(file)).point
+        return StateFile.read(Path(file)).head.point
 
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""
@@ -488,7 +488,7 @@ class Run:
             0
 
         Args:
-            state: "starting", "initializing", "running", "paused", "stopping", "done" or "failed".
+            state: "starting", "initializing", "restarting", "running", "paused", "stopping", "done" or "failed".
             timeout: the longest time to wait in s.
 
         Raises:

@@ -69,7 +69,7 @@ class RunThread:
     def __init__(self, plan: RunPlan, settings: StartOptions) -> None:
         if not sys.platform.startswith("linux"):
             raise ConfigurationError(f"a mesh runs on Linux, and this system is '{sys.platform}'")
-        self.plan = plan
+        self.plan = plan = _recovering(plan, settings)
         self.future: Future[Result] = Future()  # gets the result, or the error with which the run ended
         self.status: MeshStatus | None = None  # the last one
         self.results: list[Result] = []  # of the runs that a reset has ended
@@ -197,15 +197,20 @@ class RunThread:
         _active.discard(self)
 
     def _run(self) -> Result:
-        plan, most = self.plan, self._settings.restarts
+        plan = self.plan
         while True:
             try:
                 return self._result(self._run_once(plan))
             except FmuMeshError as error:
-                if type(error) is not MeshLost or plan.restarts == most or self._failure is not None or self.results:
+                following = self._runner.next if isinstance(self._runner, Launcher) else None
+                if following is None or self._failure is not None:
+                    if following is not None and isinstance(self._runner, Launcher):
+                        self._runner.clear()
+                    if plan.restarts:
+                        error.with_hint(f"This was attempt {plan.restarts + 1} of {plan.max_restarts + 1}.")
                     return self._ended_early(error)
-                plan = replace(plan, restarts=plan.restarts + 1)
-                self._take(Restarted(error.report(), plan.restarts, most))
+                plan = following
+                self._take(Restarted(error.report(), plan.restarts, plan.max_restarts, plan.replays_to))
 
     def _run_once(self, plan: RunPlan) -> Outcome:
         kind: Callable[..., Launcher | InProcessRun] = Launcher
@@ -294,6 +299,21 @@ class RunThread:
         )
 
 
+def _recovering(plan: RunPlan, settings: StartOptions) -> RunPlan:
+    """The plan with what follows when a process is lost; all of a run in this process is lost with it.
+
+    Raises:
+        ConfigurationError: the mesh cannot start again.
+    """
+    config, restarts = plan.loaded.config, settings.restarts
+    most = config.recovery.restarts if restarts is None else restarts
+    if not most or not settings.processes:
+        return plan
+    if (why := config.why_not_restarted) is not None:
+        raise ConfigurationError(f"the run of '{plan.mesh}' cannot be started again: {why}")
+    return replace(plan, max_restarts=most)
+
+
 _active: set[RunThread] = set()
 """The runs of this process that have not ended."""
 
@@ -339,5 +359,5 @@ def _log(event: Event) -> None:
             log.log(level, "%s at point %d: %s", line.instance, line.point, paragraph(line.message))
         case OutputLine(process, text):
             log.info("%s: %s", process, paragraph(text))
-        case Restarted(error, number, _):
+        case Restarted(error, number):
             log.warning("restart %d: %s", number, paragraph(error.message))

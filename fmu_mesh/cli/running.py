@@ -70,10 +70,9 @@ def _how(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ConfigurationError("--paused is for a mesh that others can reach, and --local has none of it.")
     if local and arguments.profile:
         raise ConfigurationError("--profile measures nodes, and --local has none", hint="Leave one of them out.")
-    if arguments.restarts and (local or arguments.paused):
-        other = "--local" if local else "--paused"
-        raise ConfigurationError(f"--restarts and {other} do not go together", hint="Leave one of them out.")
-    return {"processes": not local, "restarts": arguments.restarts or 0}
+    if arguments.restarts and local:
+        raise ConfigurationError("--restarts and --local do not go together", hint="Leave one of them out.")
+    return {"processes": not local, "restarts": arguments.restarts}
 
 
 def run_mesh(
@@ -81,6 +80,9 @@ def run_mesh(
 ) -> None:
     """Run a mesh, show its events, and at the end what the arguments ask for."""
     plan = planned_run(mesh, options, arguments)
+    if plan.loaded.config.recovery.restarts and not how.get("processes", True):
+        text = "`recovery.mode: restart` and --local do not go together: all of it runs in one process"
+        raise ConfigurationError(text, hint="Leave --local out, or add `--set-config recovery.mode=stop`.")
     with (
         plotted_where_it_ends(plan.plan, getattr(arguments, "plot", None)),
         nullcontext() if how.get("processes", True) else stdout_as_stderr(),

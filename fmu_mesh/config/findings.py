@@ -22,7 +22,7 @@ __all__ = ["CONTAINERS", "Findings", "ValueOrigin", "Written", "located"]
 C = TypeVar("C")
 
 CONTAINERS = re.compile(
-    r"|simulation|connections|initialization|record|zenoh|security|runtime|timeouts|limits|(scenario\.)?(values|events)|scenario"
+    r"|simulation|connections|initialization|record|zenoh|security|runtime|timeouts|recovery|limits|(scenario\.)?(values|events)|scenario"
     r"|ros(\.topics)?|instances(\.[^.]+(\.start_values)?)?"
 )
 """The paths of mappings and lists whose parts are checked even if something is wrong with the whole, as its key."""

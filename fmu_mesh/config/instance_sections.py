@@ -38,11 +38,13 @@ __all__ = [
     "InstanceSection",
     "Kinds",
     "NotFinitePolicy",
+    "OnFailure",
     "PhysicsSection",
     "Process",
     "ProcessConfig",
     "StartValues",
     "StepSize",
+    "SubstitutesConfig",
     "key_of",
     "keys_of",
     "placed",
@@ -73,6 +75,24 @@ NotFinitePolicy = Annotated[
     Meta(
         description="stop: an output that is NaN or infinite ends the run at its point; record: it is recorded as it "
         "is, and may be set; null: as `simulation` says."
+    ),
+]
+
+
+class SubstitutesConfig(Base, frozen=True, kw_only=True):
+    """What the outputs of an instance are after it has failed."""
+
+    disable: Annotated[
+        dict[str, PlainValue],
+        Meta(min_length=1, description="The value of each of these outputs from then on; all others hold their last."),
+    ]
+
+
+OnFailure = Annotated[
+    Literal["stop", "hold"] | SubstitutesConfig,
+    Meta(
+        description="What follows if the instance itself fails in a step (an error, or an output that is not finite). "
+        "stop: the run ends; hold: the run goes on with its last outputs; or `disable` with other values of outputs."
     ),
 ]
 Host = Annotated[
@@ -172,7 +192,7 @@ class InstanceSection:
     """Base class of the sections of instances.
 
     A kind derives its section from `Base` and from this class. The field that has the same name as the kind is the path
-    of the model, unless the section overrides `path` and `agreed`. The section has those of the seven common keys that
+    of the model, unless the section overrides `path` and `agreed`. The section has those of the eight common keys that
     make sense for its kind::
 
         class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="table"):
@@ -182,6 +202,7 @@ class InstanceSection:
             group: Group = None
             host: Host = None
             not_finite: NotFinitePolicy = None
+            on_failure: OnFailure = "stop"
             process: Process = None
 
     Attributes:
@@ -191,6 +212,7 @@ class InstanceSection:
         group: the group that shares one node; None: none.
         host: the host on which the node runs, by its name in `deploy.hosts`; None: the one of `launch`.
         not_finite: what an output that is NaN or infinite means; None: what the simulation says.
+        on_failure: what follows if the instance itself fails in a step.
         process: what the process of its node may take; None: what the mesh says.
         interpolation: how a timed value for an unconnected input is used; None: its time is ignored.
         strict: whether what FMI forbids is an error for this instance; None: as the whole configuration says.
@@ -208,6 +230,7 @@ class InstanceSection:
     group: str | None = None
     host: str | None = None
     not_finite: Literal["stop", "record"] | None = None
+    on_failure: Literal["stop", "hold"] | SubstitutesConfig = "stop"
     process: ProcessConfig | None = None
     interpolation: Literal["hold", "linear"] | None = None
     strict: bool | None = None
@@ -278,7 +301,7 @@ def placed(
     not_finite: Literal["stop", "record"] | None = None,
     process: ProcessConfig | None = None,
 ) -> InstanceSection:
-    """A section without the common keys, which a plan has in fields of its own, but with what those given here mean."""
+    """A section without the common keys, which a plan has in fields of its own, but with `on_failure` and these."""
     common: dict[str, Any] = {
         "start_values": {},
         "inputs": {},

@@ -47,6 +47,9 @@ _ARROW = "->"
 _OTHER_ARROW = re.compile(r"\s*(?:-+>|=+>|→|⟶|~>|>)\s*")
 _SHORT_FORM = "'instance.output -> instance.input', or {from: instance.output, to: instance.input}"
 
+_SHARED: Final = ("inputs", "step_size", "group", "host", "not_finite", "on_failure")
+"""The keys of an instance that are checked although its kind is not known."""
+
 _NO_CONNECTION: Final[dict[str, Plain]] = {KIND: "connection", "from": "", "to": ""}
 _FILLING: Final[dict[Plain, dict[str, Plain]]] = {
     "connection": _NO_CONNECTION,
@@ -433,6 +436,6 @@ def _with_model(instance: Plain, sections: Mapping[str, type[InstanceSection]]) 
     try:
         msgspec.convert(with_path, sections[key])
     except msgspec.ValidationError:  # a kind without a file, or one that misses something else
-        shared = {key: given[key] for key in ("inputs", "step_size", "group", "host", "not_finite") if key in given}
+        shared = {key: given[key] for key in _SHARED if key in given}
         return {KIND: usual, usual: "", **shared}
     return with_path

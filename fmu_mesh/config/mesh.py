@@ -263,6 +263,34 @@ class TimeoutsConfig(Base, frozen=True, kw_only=True):
         DeadlineSeconds,
         Meta(description="For terminating and freeing an FMU, in s."),
     ] = 30.0
+    router: Annotated[
+        DeadlineSeconds,
+        Meta(description="For a process that starts, until its router, or the socket of the master, is there, in s."),
+    ] = 20.0
+    write: Annotated[
+        DeadlineSeconds,
+        Meta(description="For each write to a result file, and for closing it, in s: a network disk may not answer."),
+    ] = 60.0
+
+
+class RecoveryConfig(Base, frozen=True, kw_only=True):
+    """What happens when a process of a run is lost. `--restarts N` is `mode: restart` with `max_restarts: N`."""
+
+    mode: Annotated[
+        Literal["stop", "restart"],
+        Meta(
+            description="stop: the run ends; restart: all processes start again, and the result goes on with the rows "
+            "that it has."
+        ),
+    ] = "stop"
+    max_restarts: Annotated[
+        int, Meta(ge=1, le=1000, description="How often at most; then the run ends as with stop.")
+    ] = 3
+
+    @property
+    def restarts(self) -> int:
+        """How often the run may start again."""
+        return self.max_restarts if self.mode == "restart" else 0
 
 
 _INSTANCES = Meta(min_length=1, description="The instances by name; `mesh` is reserved.")
@@ -305,6 +333,7 @@ class Config(Base, frozen=True, kw_only=True):
     runtime: RuntimeConfig = RuntimeConfig()
     deploy: DeployConfig = DeployConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
     limits: LimitsConfig = LimitsConfig()
     process: ProcessConfig = ProcessConfig()
     strict: Annotated[
@@ -323,6 +352,18 @@ class Config(Base, frozen=True, kw_only=True):
         if isinstance(self.record, RecordConfig):
             return {"record": self.record}
         return {f"record[{index}]": section for index, section in enumerate(self.record)}
+
+    @property
+    def why_not_restarted(self) -> str | None:
+        """Why `recovery` cannot start this mesh again when a process is lost; None if it can."""
+        if on_hosts := [name for name, own in self.instances.items() if own.host is not None and self.deploy.hosts]:
+            return f"'{on_hosts[0]}' runs on another host, and `recovery` knows one host only"
+        for own in self.connections:
+            if isinstance(own, KeyInputConfig) and own.wait:
+                return f"the publisher of '{own.key}', for which the run waits (`wait: true`), does not start again"
+            if isinstance(own, KeyOutputConfig) and own.congestion == "block":
+                return f"who reads '{own.key}', for whom the run waits (`congestion: block`), does not start again"
+        return None
 
     @property
     def row_streams(self) -> bool:

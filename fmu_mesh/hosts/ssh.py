@@ -149,8 +149,7 @@ class RemoteProcess:
     def __init__(self, send: Callable[[int], None]) -> None:
         self._send = send
         self._code: int | None = None
-        self._ended = threading.Event()
-        self._ending = threading.Lock()
+        self._ended, self._ending = threading.Event(), threading.Lock()
         (output, self._output), (errors, self._errors) = os.pipe(), os.pipe()
         self.stdout, self.stderr = os.fdopen(output, "rb"), os.fdopen(errors, "rb")
 
@@ -253,15 +252,17 @@ class _Host:
         """Wait for the end, and close what is open."""
         with suppress(subprocess.TimeoutExpired):
             self._relay.wait(_LEAVE_S if self.is_ready and self.lost is None else 0.0)
-        with self._relay:  # closes its pipes
-            self._kill()
-            for thread in self._threads:
-                thread.join(1.0)
+        self._kill()
+        for thread in self._threads:
+            thread.join(1.0)
+        for pipe in filter(None, (self._relay.stdin, self._relay.stdout, self._relay.stderr)):
+            pipe.close()
 
-    def _kill(self) -> None:
-        with suppress(ProcessLookupError):
+    def _kill(self) -> int:  # the exit code; in state D it ends later
+        with suppress(ProcessLookupError, subprocess.TimeoutExpired):
             os.killpg(self._relay.pid, signal.SIGKILL)
-        self._relay.wait()
+            self._relay.wait(_LEAVE_S)
+        return -signal.SIGKILL if (code := self._relay.poll()) is None else code
 
     # --- the thread of the host
 
@@ -304,8 +305,7 @@ class _Host:
             self.leave()
             with suppress(subprocess.TimeoutExpired):
                 self._relay.wait(_LEAVE_S)
-        self._kill()
-        code = self._relay.wait()  # that of ssh, and 128 more than the number of a signal; below 0: its own
+        code = self._kill()  # that of ssh, and 128 more than the number of a signal; below 0: its own
         self._threads[1].join(1.0)
         who = "the relay to ssh" if code < 0 else "ssh"
         how = f"{who} {how_it_ended(code if not 128 < code < 255 else 128 - code)}"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar, runtime_c
 import msgspec
 
 from ..config.instance_sections import InstanceSection
-from ..config.mesh import LimitsConfig
+from ..config.mesh import LimitsConfig, TimeoutsConfig
 from ..files import below
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
@@ -51,7 +51,8 @@ class LogMessage(msgspec.Struct, frozen=True):
         instance: instance name.
         status: `OK`, `Warning`, `Error`, ... in the words of FMI.
         step: the own step of the instance in which the message came; -1 before the first step.
-        is_stiff: whether our solver says with it, once, that the model is stiff; the category may be one of an FMU.
+        noted: what we say with it, once, and note in results, whatever the category: that the model is stiff, or that
+            the instance has failed and its outputs are held, or have substitutes.
     """
 
     instance: str
@@ -59,7 +60,7 @@ class LogMessage(msgspec.Struct, frozen=True):
     category: str
     message: str
     step: int
-    is_stiff: bool = False
+    noted: Literal["", "stiff", "held", "disabled"] = ""
 
 
 class Showing(msgspec.Struct, frozen=True):
@@ -88,6 +89,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
         content: what `Kind.content` returned when the run was planned; None if that is not known.
         folder: an existing private folder for files. What the instance leaves there is removed after the run.
         limits: how large an FMU may be.
+        timeouts: how long its calls may take.
         linear_inputs: the inputs that change linearly within a step; only where the description allows it.
         log: call it with every message of the model, on the thread that calls the instance.
         showing: only given to a kind with `can_be_shown`.
@@ -102,6 +104,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
     folder: Path
     content: str | None = None
     limits: LimitsConfig = LimitsConfig()
+    timeouts: TimeoutsConfig = TimeoutsConfig()
     linear_inputs: tuple[LinearInput, ...] = ()
     log: Callable[[LogMessage], None] = lambda _message: None
     showing: Showing = Showing()

@@ -92,6 +92,16 @@ class AroundInstance(Generic[Within]):
         """See `ChangesProcess`."""
         return isinstance(self._instance, ChangesProcess) and self._instance.changes_process
 
+    def hold(self, step: int, error: FmuError) -> bool:
+        """Whether the instance goes on with held outputs, although own step ``step`` has failed; see `HeldInstance`."""
+        return isinstance(self._instance, AroundInstance) and self._instance.hold(step, error)
+
+    @property
+    def failed(self) -> str:
+        """In words since when and why the outputs of the instance are held; empty: they are not."""
+        inner: object = self._instance
+        return inner.failed if isinstance(inner, AroundInstance) else ""
+
     def take_care(self) -> None:
         """From the next step on, undo after each step what it does to the state of the process."""
         if isinstance(self._instance, AroundInstance):

@@ -23,6 +23,7 @@ from ..config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    OnFailure,
     StartValues,
     StepSize,
 )
@@ -62,6 +63,7 @@ class PidConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
 
     @property
     def path(self) -> str:

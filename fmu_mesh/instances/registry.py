@@ -24,6 +24,7 @@ from ..system.process_sharing import Claims
 from ..text import listed
 from ..variables.model_description import ModelDescription
 from .contract import Instance, Kind, Opening, Showing
+from .held_instance import HeldInstance
 
 __all__ = [
     "GROUP",
@@ -149,11 +150,12 @@ def prepare(opening: Opening[Any]) -> None:
 
 
 def open_instance(opening: Opening[Any]) -> Instance:
-    """Open an instance of whatever kind; the caller closes it."""
+    """Open an instance of whatever kind, with what `on_failure` says of it; the caller closes it."""
     kind = _kind_of(opening.section)
     if opening.showing and not kind.can_be_shown:
         opening = replace(opening, showing=Showing())
-    return kind.open(opening)
+    instance = kind.open(opening)
+    return instance if opening.section.on_failure == "stop" else HeldInstance(instance, opening)
 
 
 def check_engines(

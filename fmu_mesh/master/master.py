@@ -46,6 +46,7 @@ from .. import __version__
 from ..awake import AwakeClock
 from ..errors import (
     ConfigurationError,
+    DeadlineExceeded,
     FmuMeshError,
     Interrupted,
     MeshLost,
@@ -60,6 +61,7 @@ from ..system.plan import MASTER, RECORDER, Plan
 from ..system.round_trip import round_trip_cost
 from ..variables.value_types import PlainValue
 from ..wire.inbox import Inbox
+from ..wire.journal import Journal
 from ..wire.keys import Keys, RunKeys, sender_in
 from ..wire.meeting import Meeting
 from ..wire.messages import FINISH, PROGRESS, STATE, NewStart, NodeReport, decode_json, sealed
@@ -73,7 +75,17 @@ from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from ..wire.ways import Ways
 from .audit import Audit
 from .checkpoints import Checkpoints
-from .master_states import Action, AnswerAll, EndAll, FollowClock, MasterStates, RaiseGrant, RaiseSent, SendToAll
+from .master_states import (
+    Action,
+    AnswerAll,
+    Commanded,
+    EndAll,
+    FollowClock,
+    MasterStates,
+    RaiseGrant,
+    RaiseSent,
+    SendToAll,
+)
 from .master_streams import MasterStreams
 from .members import Followers, Members
 from .mesh_server import STATUS_S, Events, MasterServer, MasterSettings
@@ -125,7 +137,14 @@ class Master:
         self._first_plan = plan
         self._replan = replan
         self._resets, self._start = 0, NewStart(0, plan.digest, {})
-        self._states = MasterStates(plan, paused=settings.paused)
+        attempt = settings.attempt
+        self._journal: Journal[Commanded] = Journal(attempt.journal, Commanded)
+        self._states = MasterStates(
+            plan,
+            paused=settings.paused,
+            replays_to=attempt.replays_to,
+            commanded=next(reversed([*self._journal.entries()]), None),
+        )
         self._memory = self._made_memory()
         self._inbox = Inbox(self._memory)
         self._followers = Followers(self._inbox, lambda: self._states.takes_commands)
@@ -215,8 +234,11 @@ class Master:
         server.serve(keys.report("*"), self._take_report, of_run=True)
         server.watch(keys.node("*"), self._members.token_changed, of_run=True)
 
-    def run(self) -> None:
+    def run(self, check: Callable[[], None] = lambda: None) -> None:
         """Run the mesh to its last point.
+
+        Args:
+            check: called several times a second; an error that it raises ends the run.
 
         Raises:
             FmuMeshError: why the run ended early; all nodes have been informed.
@@ -225,6 +247,10 @@ class Master:
         self._awake = awake
         try:
             while not states.is_over:
+                try:
+                    check()
+                except FmuMeshError as error:
+                    states.fail(error)
                 pause_s = self._decide(awake())
                 if not states.is_over:
                     self._turn(min(pause_s, STATUS_S, states.deadlines.heartbeat))
@@ -239,6 +265,8 @@ class Master:
                     limit_s = states.deadlines.finish if asked else _LAST_WORDS_S
                     self._inbox.wait_until(lambda: self._members.have_left, limit_s)
                 undeclare_all([own for own in (self._run_token, self._token) if own is not None])
+        if isinstance(states.failure, DeadlineExceeded):
+            states.failure.with_hint(self._server.waits(states.failure.point or 0))
         if states.failure is not None:
             raise states.failure
 
@@ -269,6 +297,7 @@ class Master:
     def close(self) -> None:
         """Undeclare everything."""
         self._server.close()
+        self._journal.close()
         self.audit.close()
         self._close_run()
 
@@ -431,6 +460,9 @@ class Master:
             self.audit.note("commanded", who, key, command.command)
             self._checkpoints.give_up(MeshLost(f"another program gave the command '{command.command}' meanwhile"))
             answer = replace(states.command(command, self._withdrawn_grant()), resets=resets)
+            if command.command != "reset":  # a mesh that was reset does not start again
+                stopped_at = states.granting.last_point if command.command == "stop" else None
+                self._journal.add(Commanded(command.command, answer.hold, stopped_at))
             if command.wait and answer.hold is not None and command.command != "reset":
                 self._resting.add(query, answer, self._awake() + command.wait)
             else:
@@ -550,16 +582,25 @@ class Master:
         point = min(max(states.granting.slowest, first), states.granting.last_point)
         elapsed = self._clock.elapsed()
         rate = (point - first) / elapsed if elapsed > 0 else 0.0
+        attempt, failure = self._settings.attempt, states.failure
+        goes_on = type(failure) is MeshLost and attempt.number < attempt.most and not self._resets
+        is_again = attempt.number > 1 and not self._resets and (states.state == "starting" or states.is_replaying)
+        state: MeshState = states.state
+        if goes_on or (is_again and states.takes_commands):
+            state = "restarting"
         return MeshStatus(
             mesh=self._keys.mesh,
-            state=states.state,
+            state=state,
+            restarting=str(attempt) if is_again else "",
+            restarts=attempt.number - 1,
+            may_restart=attempt.number < attempt.most and not self._resets,
             point=point,
             last_point=grid.last_point,
             time=grid.time(point),
             points_per_second=rate,
             real_time_factor=rate * grid.step_size,
             progress={node: max(point, first) for node, point in states.granting.progress.items()},
-            error=states.failure.report() if states.failure is not None else None,
+            error=failure.report() if failure is not None else None,
             overruns=self._pacer.overruns,
             refused=self._inbox.refusals.count,
             cut=self.streams.cut if self.streams is not None else {},

@@ -37,6 +37,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.deadlines import Deadlines
 from ..errors import (
@@ -60,7 +61,17 @@ from ..wire.ways import Ways
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = ["Action", "AnswerAll", "EndAll", "FollowClock", "MasterStates", "RaiseGrant", "RaiseSent", "SendToAll"]
+__all__ = [
+    "Action",
+    "AnswerAll",
+    "Commanded",
+    "EndAll",
+    "FollowClock",
+    "MasterStates",
+    "RaiseGrant",
+    "RaiseSent",
+    "SendToAll",
+]
 
 
 class AnswerAll(msgspec.Struct, frozen=True):
@@ -104,14 +115,32 @@ class EndAll(msgspec.Struct, frozen=True):
 Action = AnswerAll | FollowClock | RaiseGrant | RaiseSent | SendToAll | EndAll
 
 
+class Commanded(msgspec.Struct, frozen=True):
+    """What a command has changed, for the journal: where the mesh pauses, or the point at which it is stopped."""
+
+    command: str
+    hold: int | None
+    stopped_at: int | None = None
+
+
+class _Course(msgspec.Struct, frozen=True):
+    """Where the mesh pauses; after a restart, the last point that was seen before, and where it was stopped.
+
+    And the point at which all nodes save their states: beyond it, nothing is granted until then.
+    """
+
+    hold: int | None
+    replays_to: int
+    stopped_at: int | None
+    saves_at: int | None = None
+
+
 class MasterStates:
     """The state of one run, as its master sees it.
 
     Attributes:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
-        hold: the point at which all nodes pause.
-        saves_at: the point at which all nodes save their states, and beyond which nothing is granted until then.
         reports: how nodes have ended, by name.
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
@@ -121,7 +150,9 @@ class MasterStates:
     most as long as a heartbeat.
     """
 
-    def __init__(self, plan: Plan, *, paused: bool = False) -> None:
+    def __init__(
+        self, plan: Plan, *, paused: bool = False, replays_to: int = 0, commanded: Commanded | None = None
+    ) -> None:
         self.plan = plan
         self.state: MeshState = "starting"
         self.deadlines = Deadlines.of(
@@ -129,9 +160,8 @@ class MasterStates:
         )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
-        self.hold = plan.grid.first_point if paused else None
-        self.saves_at: int | None = None
-        self._every = math.lcm(*(own.step_points for own in plan.system.instances.values()))
+        again = commanded or Commanded("", plan.grid.first_point if paused else None)
+        self._course = _Course(again.hold, replays_to, again.stopped_at)
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -141,6 +171,20 @@ class MasterStates:
         self._moved_at: float | None = None  # when any node has moved; None: since the last decision
         self._slowest_moved_at: float | None = None
         self._sent_at = 0.0
+
+    @property
+    def hold(self) -> int | None:
+        """The point at which all nodes pause."""
+        return self._course.hold
+
+    @hold.setter
+    def hold(self, point: int | None) -> None:
+        self._course = replace(self._course, hold=point)
+
+    @property
+    def saves_at(self) -> int | None:
+        """The point at which all nodes save their states, if they do; beyond it, nothing is granted until then."""
+        return self._course.saves_at
 
     @property
     def is_over(self) -> bool:
@@ -165,9 +209,16 @@ class MasterStates:
     @property
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
-        # Each once: the recorder asks on its own thread.
-        limits = self.granting.last_point, self.hold, self.saves_at
+        course = self._course  # once: the recorder asks on its own thread
+        limits = [self.granting.last_point, course.hold, course.saves_at]
+        if self.is_replaying and self.plan.system.config.simulation.real_time_factor > 0.0:
+            limits.append(course.replays_to)
         return min(limit for limit in limits if limit is not None)
+
+    @property
+    def is_replaying(self) -> bool:
+        """Whether the run has not yet come to where it was before a restart."""
+        return self._course.replays_to > 0 and self.granting.slowest < self._course.replays_to
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
@@ -254,7 +305,7 @@ class MasterStates:
                 text = f"reset by a command at point {slowest}"
                 self.fail(RunReset(text, point=slowest, time=self.plan.grid.time(slowest)))
         if command.command in ("resume", "step"):
-            self._actions.append(FollowClock(granting.reached, command.paced))
+            self._actions.append(FollowClock(granting.reached, command.paced and not self.is_replaying))
         self._moved_at = self._slowest_moved_at = None
         if self.hold is not None and not rested:  # a message to all: the recorder may sleep until there are many rows
             self._sent_at = -math.inf
@@ -269,7 +320,7 @@ class MasterStates:
         Raises:
             CallRefused: the mesh pauses, or ends, before the next such point.
         """
-        granting, every = self.granting, self._every
+        granting, every = self.granting, math.lcm(*(own.step_points for own in self.plan.system.instances.values()))
         at = -(-granting.halt(claimed) // every) * every
         self._actions.append(RaiseGrant(granting.grant))
         self._moved_at = self._slowest_moved_at = None
@@ -278,13 +329,14 @@ class MasterStates:
             text = f"the mesh {rests}, and all instances are at a point of their own only at every {every}th point"
             hint = f"`step` it by {at - self.hold}." if self.hold is not None else None
             raise CallRefused(text, hint=hint)
-        self.saves_at = at
+        self._course = replace(self._course, saves_at=at)
         self._actions.append(SendToAll(SAVE, at))
         return at
 
     def saved(self) -> None:
         """The nodes have saved their states, or need not: they go on."""
-        self.saves_at = self._moved_at = self._slowest_moved_at = None
+        self._course = replace(self._course, saves_at=None)
+        self._moved_at = self._slowest_moved_at = None
 
     def fail(self, error: FmuMeshError) -> None:
         """The run has to end; the first reason counts."""
@@ -359,7 +411,9 @@ class MasterStates:
     def _wait_for_initialization(self, now: float) -> None:
         if self.granting.has_begun:
             self._enter("running" if self.hold is None else "paused", now)
-            self._actions.append(FollowClock(self.granting.first_point))
+            self._actions.append(FollowClock(self.granting.first_point, paced=not self.is_replaying))
+            if self._course.stopped_at is not None and self.plan.grid.stop_time is None:
+                self._stop(self._course.stopped_at)
             self._moved_at = self._slowest_moved_at = now
             return
         first = self.granting.first_point
@@ -369,6 +423,13 @@ class MasterStates:
 
     def _go_on(self, now: float, paced: int, stopped: Sequence[str]) -> None:
         granting = self.granting
+        if self._course.replays_to and not self.is_replaying:
+            self._course = replace(self._course, replays_to=0)
+            self._actions.append(FollowClock(granting.reached))
+        stopped_at = self._course.stopped_at if self.plan.grid.stop_time is not None else None
+        if stopped_at is not None and not self.is_replaying:
+            self._stop(stopped_at)
+            return
         if granting.slowest >= granting.last_point and self.saves_at is None:
             if isinstance(self.ended_by, NotFinite):
                 self.fail(self.ended_by)

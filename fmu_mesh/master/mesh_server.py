@@ -18,12 +18,13 @@ from zenoh.handlers import Callback
 
 from ..config.access_sections import Role
 from ..errors import MessageRefused
+from ..system.attempt import Attempt
 from ..wire.inbox import Inbox
 from ..wire.keys import Keys
 from ..wire.messages import decode_json
 from ..wire.session import matches, undeclare_all
 from ..wire.values import json_encoding
-from ..wire.views import LogLine, MeshHello, MeshStatus
+from ..wire.views import WAITING, LogLine, MeshHello, MeshStatus
 
 __all__ = ["STATUS_S", "Events", "MasterServer", "MasterSettings"]
 
@@ -59,6 +60,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         paused: whether the run begins paused at its first point.
         table: number of the table of roles; 0: it has none of our authority.
         as_file: a state file with the states of all instances at a point.
+        attempt: which attempt of the run this is.
     """
 
     endpoints: tuple[str, ...] = ()
@@ -68,6 +70,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     paused: bool = False
     table: int = 0
     as_file: Callable[[int, Mapping[str, bytes]], bytes] = lambda _point, _states: b""
+    attempt: Attempt = Attempt()
 
 
 class MasterServer:
@@ -92,6 +95,7 @@ class MasterServer:
         self._entities: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._of_run: list[zenoh.Queryable[None] | zenoh.Subscriber[None]] = []
         self._log_lines = 0
+        self._waits: dict[str, LogLine] = {}
         self._newest_lines: deque[msgspec.Raw] = deque()
         self._newest_bytes = 0
         declare, drop = partial(session.declare_publisher, encoding=json_encoding), zenoh.CongestionControl.DROP
@@ -160,8 +164,17 @@ class MasterServer:
             line = decode_json(sample.payload.to_bytes(), LogLine, _MOST_LOG_BYTES)
             if key != f"{self._keys.instance(line.instance)}/log" or line.instance not in self._instances:
                 raise MessageRefused("it is not the log of an instance of this mesh")
+            if (line.status, line.category) == WAITING:
+                self._waits[line.instance] = line
             self._events.log(line)
             self._keep(line)
+
+    def waits(self, point: int) -> str | None:
+        """In words what instances that have reached ``point`` have said that they wait for; None: none has."""
+        said = (
+            f"{name} at point {line.point}: {line.message}" for name, line in self._waits.items() if line.point >= point
+        )
+        return f"{'; '.join(said)}." if any(line.point >= point for line in self._waits.values()) else None
 
     def say(self, line: LogLine) -> None:
         """From any thread: add a line of the mesh itself to the log of all instances."""

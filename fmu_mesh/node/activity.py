@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from ..awake import AwakeClock
 from ..errors import FmuMeshError, StepFailed
@@ -13,7 +13,7 @@ from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.stream_keeper import StreamKeeper
-from ..wire.views import InstanceStatus
+from ..wire.views import WAITING, InstanceStatus, LogLine
 from ..wire.ways import Ways
 from .engine import Engine
 from .inputs import TimedInputs
@@ -45,6 +45,7 @@ class Activity:
         self._keeper: StreamKeeper | None = None
         self._keys: KeyEnds | None = None
         self._under_way: tuple[str, int, float] | None = None
+        self._waits: dict[str, tuple[int, float, bool]] = {}  # own step, since when, whether it was told
 
     def enter(self, state: str) -> None:
         """From now on the node is in this state."""
@@ -79,12 +80,13 @@ class Activity:
             time=self._plan.grid.time(step * points),
             step_time=step_time,
             wait_time=engine.waited_s if engine is not None else 0.0,
-            restarts=self._plan.restarts,
+            restarts=self._plan.attempt.number - 1,
             refused=self._refusals.count,
             timed_out=late,
             running_time=time.monotonic() - self._started if engine is not None else 0.0,
             keys=self._keys.statuses(name) if self._keys is not None else (),
             deploy_host=self._plan.host or "",
+            failed=runner.failed if runner is not None else "",
         )
 
     def look_at_steps(self) -> StepFailed | None:
@@ -117,15 +119,41 @@ class Activity:
             hint="If it needs that long, raise `timeouts.step` in the configuration.",
         )
 
+    def look_at_waits(self) -> Iterator[LogLine]:
+        """What instances wait for: a row or a value of a key, for a third of `timeouts.step`; once for each wait.
+
+        Call it several times a second, on one thread. Who waits for the grant of the master, as in a pause, is quiet.
+        """
+        engine, now = self._engine, self._clock()
+        for name, runner in self.runners.items() if engine is not None and self.state == "running" else ():
+            step, points = runner.step, runner.plan.step_points
+            own, since, told = self._waits.get(name, (-1, now, False))
+            may_step = engine is not None and (step + 1) * points <= engine.granted
+            what = self._waits_for(runner) if may_step else None
+            if what is None or own != step:
+                since, told = now, False
+            elif not told and now - since > self._plan.timeouts.step / 3:
+                told = True
+                yield LogLine(name, *WAITING, f"it has waited {now - since:.3g} s for {what}", step * points)
+            self._waits[name] = step, since, told
+
+    def _waits_for(self, runner: Runner) -> str | None:
+        """In words the row or the value of a key that the next step waits for; None: it has all of them."""
+        if any(runner.lacking):
+            return runner.waits_for
+        key = self._keys.waits_for(runner.name) if self._keys is not None else None
+        return f"a value of {key}" if key is not None else None
+
     def _in_words(self, runner: Runner, late: Mapping[str, int]) -> str:
+        if runner.failed:
+            return f"its outputs are {runner.failed}"
         if late:
             without = (f"no value for '{name}' since point {point}" for name, point in late.items())
             return "; ".join((self._in_words(runner, {}), *without))
         current = self._engine.current if self._engine is not None else None
         if current is None:
             cut = self._keeper.cut_in_words(self._plan.node) if self._keeper is not None else ()
-            key = self._keys.waits_for(runner.name) if self._keys is not None and not any(runner.lacking) else None
-            what = f"a value of {key}" if key is not None else runner.waits_for
+            what = self._waits_for(runner) or runner.waits_for
             return "; ".join((f"waiting at point {runner.point} for {what}", *cut))
         if current is not runner:
             return f"waiting at point {runner.point} for its turn: '{current.name}' is in doStep"

@@ -236,18 +236,26 @@ class BurstEngine(Engine):
     def _step_of(self, runner: Runner) -> Callable[[int], None]:
         """How Python takes a step of a runner, whose inputs that are no texts are there."""
         do_step, is_timed = runner.instance.do_step, isinstance(runner.instance, TimedInputs)
+        may_fail = runner.plan.section.on_failure != "stop"
         texts = [source.transfer for source in runner.sources if source.transfer.has_text]
-        if not texts and not is_timed:
+        if not texts and not is_timed and not may_fail:
             return do_step
 
         def step_all(step: int) -> None:
             for transfer in texts:
                 transfer.step_text(step)
             do_step(step)
+            if may_fail:
+                self._look_at_failure(runner)
             if is_timed:
                 self.follow_inputs(runner)
 
         return step_all
+
+    def _look_at_failure(self, runner: Runner) -> None:
+        """If an instance with native steps has failed and goes on with held outputs, Python takes its steps."""
+        if runner.table.kind != StepKind.BY_PYTHON and runner.failed:
+            self.refit(runner)
 
     def follow_inputs(self, runner: Runner) -> None:
         """Note in the table of a runner which step Python takes next, and what its inputs are in the steps before."""
@@ -263,13 +271,16 @@ class BurstEngine(Engine):
         member = runner.table
         step = member.step
         if result == BurstEnd.NOT_FINITE:
-            raise runner.is_finite.error(step + 1, runner.grid)
+            runner.not_finite(step)
+            self._look_at_failure(runner)
+            return
         if divmod(member.outcome, 1 << STAGE_BITS) == (Stage.SETTING, OUT_OF_RANGE):
             for source in runner.sources:
                 source.transfer.check_range(step)
         if member.kind == StepKind.BY_PYTHON:
             raise self._forged(runner)  # it was out of range when the burst has read it
         cast("StepsNatively", runner.instance).finish(step, member.outcome)
+        self._look_at_failure(runner)
 
     def _forged(self, runner: Runner) -> ProtocolBroken:
         step, sources = runner.step, runner.sources

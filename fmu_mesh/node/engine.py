@@ -96,7 +96,7 @@ class Engine(ABC):
             self._units[number] = self._unit(*both)
         for unit, tables in zip(units, members, strict=True):
             for runner, member in zip(unit, tables, strict=True):
-                member.step = runner.step  # not 0 where the run begins with a state
+                member.note(step=runner.step)  # not 0 where the run begins with a state
                 runner.follow(member, self)
 
     def _unit(self, unit: Sequence[Runner], members: object) -> native.UnitTable:
@@ -196,6 +196,11 @@ class Engine(ABC):
         """While a step is under way, by another thread that holds `sending`: send all rows before it."""
         for runner in self.runners:
             runner.flush()
+
+    @property
+    def granted(self) -> int:
+        """The point up to which the master lets nodes step; from any thread."""
+        return int(self._memory.grant.value)
 
     @property
     def covered(self) -> int:
@@ -313,7 +318,7 @@ class PlainEngine(Engine):
             member.stage = Stage.IN_PYTHON
             runner.instance.do_step(step)
             if not runner.is_finite.check(step + 1):
-                raise runner.is_finite.error(step + 1, runner.grid)
+                runner.not_finite(step)
         except FmuMeshError as error:
             place.stopped = 1
             runner.is_finite.explain(error)

@@ -6,7 +6,7 @@ Owns how a step gets its value from them, as `fmi_adapter` does for a ROS node. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -25,11 +25,13 @@ from ..rings.packed_member import PackedMember
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.input_timeouts import InputTimeout, LastValues
+from ..system.live_keys import KeyValue
 from ..system.plan import InstancePlan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
 from ..text import listed
 from ..variables.model_description import Value
+from ..variables.value_conversion import checked_value
 from ..variables.value_types import is_float
 from ..wire.values import ValueRefused
 from .stepping import Runner
@@ -379,21 +381,41 @@ class TimedInputs(AroundNativeSteps):
         return self._grid.time(step * self._points)
 
 
-def with_times(instance: Instance, plan: InstancePlan, grid: TimeGrid, warn: Callable[[LogMessage], None]) -> Instance:
+def with_times(
+    instance: Instance,
+    plan: InstancePlan,
+    grid: TimeGrid,
+    warn: Callable[[LogMessage], None],
+    given: Sequence[KeyValue] = (),
+) -> Instance:
     """The instance as its plan wants it: with what a scenario prescribes, and with inputs that follow times.
+
+    After a restart, it gets again what was ``given`` to it before.
 
     Raises:
         ConfigurationError: a table of the scenario, or the values of keys of an earlier run, cannot be read, or have
             changed since the run was planned.
     """
     interpolation = plan.section.interpolation
-    if interpolation is None and not plan.scenario and not plan.timeouts and not plan.keys_in:
+    if interpolation is None and not plan.scenario and not plan.timeouts and not plan.keys_in and not given:
         return instance
     courses = courses_of(plan.scenario, instance.description, grid, plan.step_points)
     keys = {own.variable: own.linear for own in plan.keys_in}
     known = {one.name: one for one in instance.description.variables if one.name in keys}
-    recorded = recorded_values(plan.recorded_keys, plan.name, known) if plan.recorded_keys is not None else ()
+    recorded = (
+        recorded_values(plan.recorded_keys, plan.name, known)
+        if plan.recorded_keys is not None
+        else _again(instance, given)
+    )
     return TimedInputs(instance, interpolation or "hold", courses, plan.timeouts, warn, keys=keys, recorded=recorded)
+
+
+def _again(instance: Instance, given: Sequence[KeyValue]) -> Iterator[tuple[str, int, float | None, Value]]:
+    for path, point, time, plain in given:
+        name = path.partition(".")[2]
+        variable = instance.description.variable(name)
+        assert variable is not None  # it was set before
+        yield name, point, time, checked_value(plain, variable, name)
 
 
 def set_input(runner: Runner, name: str, value: Value, time: float | None, *, more: bool = False) -> int:

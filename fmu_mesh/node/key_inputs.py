@@ -173,6 +173,8 @@ class KeyFeed:
 
     def _take_newest(self) -> None:
         """On the main thread, at the begin of a step."""
+        if not self._begun:  # after a restart: what came before is given again first
+            return
         self._posted = False
         with self._lock:
             found = [*self._waiting]

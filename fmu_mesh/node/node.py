@@ -43,6 +43,7 @@ from ..system.plan import MASTER, RECORDER, Link, NodePlan
 from ..system.states import BeginsWith
 from ..wire.frames import FrameReceiver, SourceRows, of_text
 from ..wire.inbox import Inbox, Message
+from ..wire.journal import NodeJournal
 from ..wire.meeting import Meeting
 from ..wire.membership import Membership, Welcome
 from ..wire.messages import (
@@ -59,8 +60,8 @@ from ..wire.messages import (
     InstanceState,
     NewStart,
     NodeReport,
+    Noted,
     SetValue,
-    Stiff,
     decode_json,
     encode_news,
     encode_state,
@@ -175,6 +176,7 @@ class Node:
         self._streams: RowStreams | None = None
         self._keeper: StreamKeeper | None = None
         self._profiler: Profiler | None = None
+        self._journal = NodeJournal(plan.attempt.journal)
         self._activity = Activity(plan, self._inbox.refusals)
         self.server = NodeServer(plan, session, self._inbox, self._activity, on_hang, self.tell_recorder)
 
@@ -219,6 +221,7 @@ class Node:
             self._membership.close()
             self._inbox.close()
             self._memory.close()
+            self._journal.close()
 
     def interrupt(self, reason: str) -> None:
         """From any thread: end the run with `Interrupted` at the next point or during the current wait."""
@@ -228,8 +231,9 @@ class Node:
 
         self._inbox.post(end, first=True)
 
-    def tell_recorder(self, news: SetValue | AuditEntry | Stiff | Sequence[KeyValue]) -> None:
+    def tell_recorder(self, news: SetValue | AuditEntry | Noted | Sequence[KeyValue]) -> None:
         """What the metadata of results and the audit get, such as a value that another program has set."""
+        self._journal.keep(news)
         self._put_set(encode_news(news))
 
     def report_hang(self, error: FmuError) -> bool:
@@ -254,8 +258,10 @@ class Node:
         plan = self._plan
         self._activity.enter("loading")
         instances = {}
+        given = self._journal.given()
         for item in plan.instances:
-            instances[item.name] = with_times(self._open_instance(item.name), item, plan.grid, self._warn)
+            own, instance = given.get(item.name, ()), self._open_instance(item.name)
+            instances[item.name] = with_times(instance, item, plan.grid, self._warn, own)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.memory or self._own_memory
@@ -311,8 +317,9 @@ class Node:
         self._initialization.run(self._runners.values())
         if self._begins_with is not None:
             load_states(self._begins_with, self._runners)
-            for link in (link for runner in self._runners.values() for link in runner.out_links):
-                link.sent = self._runners[link.link.source].step
+            for runner in self._runners.values():
+                for link in runner.out_links:
+                    link.begin_at(runner.step)
         units = [[self._runners[name] for name in names] for names in plan.units]
         self._engine = engine = self._make_engine(
             plan,
@@ -329,6 +336,8 @@ class Node:
             runner.flush()
         if self._begins_with is not None:
             set_again(self._begins_with, self._runners)
+        for news in self._journal.entries():  # it belongs to the metadata of this attempt, too
+            self._put_set(encode_news(news))
         self.server.started()
         self._memory.progress[plan.node].raise_to(engine.covered + 1)
         self._tell_progress(engine)
@@ -393,7 +402,7 @@ class Node:
         while not self.finished:
             try:
                 wait_s = self._wait_s(left_s if eager else _LONGEST_SLEEP_S)
-                stepped = engine.run(wait_s, eager=eager, quiet=quiet and not self.server.is_followed)
+                stepped = engine.run(wait_s, eager=eager, quiet=quiet and self.server.is_unfollowed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)

@@ -73,6 +73,7 @@ class NodeServer:
 
     Attributes:
         keys: the Zenoh keys at ends of connections.
+        is_live: whether values are published and set; after a restart, not before the last point that was seen.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917  one node and whom it tells
@@ -103,7 +104,7 @@ class NodeServer:
         self._status_publishers: dict[str, zenoh.Publisher] = {}
         self._log_publishers: dict[str, zenoh.Publisher] = {}
         self._early_lines: list[LogLine] = []
-        self._begun = False
+        self._begun = self.is_live = False
         self._visible = threading.Event()
         self._closing, self._hurries = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="server", daemon=True)
@@ -134,12 +135,19 @@ class NodeServer:
                 self._entities.append(self._session.declare_subscriber(key, take, allowed_origin=zenoh.Locality.REMOTE))
 
     @property
-    def is_followed(self) -> bool:
-        """Whether somebody would get the next row at once: some streams have subscribers, or rows go to keys."""
-        return self.keys.publishes or any(own.is_active and self._waiting_rows <= own.backlog for own in self._streams)
+    def is_unfollowed(self) -> bool:
+        """Whether nobody would get the next row at once: no streams have subscribers, and no rows go to keys."""
+        follow = self.keys.publishes or any(
+            own.is_active and self._waiting_rows <= own.backlog for own in self._streams
+        )
+        return self.is_live and not follow
 
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers, and to keys."""
+        if not self.is_live:
+            if any(own.runner.point < self._plan.attempt.replays_to for own in self._streams):
+                return
+            self._go_live()
         self.keys.publish_now()
         for streams in (*self.keys.lossy, *self._streams):
             if (batch := streams.collect(self._waiting_rows)) is not None:
@@ -150,8 +158,6 @@ class NodeServer:
     def started(self) -> None:
         """All streams begin at the first point: find the subscriptions that were made before it."""
         self._begun = True
-        self._answers.begin()
-        self.keys.begin()
         looked = threading.Event()
 
         def look() -> None:
@@ -166,6 +172,14 @@ class NodeServer:
         for streams in self._streams:
             streams.update()
         self.stepped()
+
+    def _go_live(self) -> None:
+        """Set the values that came before, and publish from here on."""
+        self.is_live = True
+        self._answers.begin()
+        self.keys.begin()
+        for streams in self._streams:
+            streams.skip()
 
     def log_message(self, line: LogLine) -> None:
         """Publish one log message; never waits."""
@@ -215,6 +229,8 @@ class NodeServer:
         for name, publisher in self._status_publishers.items():
             if matches(publisher):
                 publisher.put(msgspec.json.encode(self._activity.status(name)))
+        for line in self._activity.look_at_waits():
+            self._publish_log(line)
         if (hang := self._activity.look_at_steps()) is not None:
             self._on_hang(hang)
 

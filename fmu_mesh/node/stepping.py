@@ -141,6 +141,23 @@ class Runner:
         self.outputs.stamp(self.step)
         self.counter.raise_to(self.step + 1)
 
+    def not_finite(self, step: int) -> None:
+        """The row that own step ``step`` has written is not finite: the instance holds its outputs, if it may.
+
+        Raises:
+            NotFinite: it may not.
+        """
+        error = self.is_finite.error(step + 1, self.grid)
+        if self.plan.section.on_failure == "stop":
+            raise error
+        self.is_finite.explain(error)
+        cast("AroundInstance[Instance]", self.instance).hold(step, error)
+
+    @property
+    def failed(self) -> str:
+        """In words since when and why its outputs are held; empty: they are not."""
+        return self.instance.failed if isinstance(self.instance, AroundInstance) else ""
+
     def stop(self) -> None:
         """This instance takes no more steps: its outputs hold to the end."""
         self.last_step = self.step

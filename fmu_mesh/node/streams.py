@@ -161,6 +161,10 @@ class RowsFor:
         """On the main thread: whether `collect` has something to do."""
         return bool(self._active)
 
+    def skip(self) -> None:
+        """On the main thread: begin with the newest row."""
+        self._next = self.runner.step
+
     def collect(self, waiting_rows: int) -> WaitingRows | None:
         """On the main thread: the rows since the last call, copied; None if there is nothing to publish."""
         end, watched = self.runner.step + 1, self.runner.watched

@@ -8,7 +8,8 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 # other processes, often on the same host. They meet in two places: counters in shared memory, which the nodes raise and
 # this thread reads (and the other way round for the progress), and the inbox, into which Zenoh's threads put frames and
 # messages, and the main thread the end of the run (`__exit__`). Only this thread touches the sources and the files
-# until it has ended; then the main thread writes what is left and closes them.
+# until it has ended; then a second one writes what is left and closes them. The main thread reads in which file a
+# write is under way, and for how long (`check_writing`).
 #
 # What may go wrong:
 # * A node could overwrite rows that are not written yet. The windows forbid it, and the stamps of all rows are compared
@@ -17,6 +18,8 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 #   says that all nodes have begun (ADR 50): the last result stays.
 # * A run that ends early still has rows on their way. This thread waits half a second for the nodes to say that they
 #   have sent their last ones, and not for those that are lost.
+# * A disk may not take what is written (a network disk whose server is gone). A write cannot be cancelled, and not even
+#   SIGKILL ends it. So the main thread ends the run after `timeouts.write`, and this thread is left behind (ADR 89).
 # * The reason of such an end comes from the master of this process and not by a message: on the other thread a message
 #   may arrive after the end.
 #
@@ -32,17 +35,25 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, cast
 
-import numpy as np
 import zenoh
 from msgspec import to_builtins
 from msgspec.structs import astuple
 
-from ..errors import ConfigurationError, FmuMeshError, MeshLost, MessageRefused, ProtocolBroken, RunReset
-from ..results.growth import GrowthWatch, ReadColumn
+from ..awake import AwakeClock
+from ..errors import (
+    ConfigurationError,
+    DeadlineExceeded,
+    FmuMeshError,
+    MeshLost,
+    MessageRefused,
+    RunReset,
+)
+from ..results.growth import GrowthWatch
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
@@ -50,8 +61,7 @@ from ..simtime import ENDLESS
 from ..system.live_keys import KeyValue
 from ..system.plan import RECORDER, Link, NodePlan
 from ..variables.value_conversion import MAX_TEXT_SIZE
-from ..variables.value_types import is_text
-from ..wire.frames import FrameReceiver, SourceRows, rows_of
+from ..wire.frames import SourceRows, rows_of
 from ..wire.inbox import Inbox, Message
 from ..wire.membership import Membership
 from ..wire.messages import (
@@ -64,21 +74,22 @@ from ..wire.messages import (
     INITIAL,
     KEYS,
     LAST,
+    NOTED,
     PROGRESS,
     REFUSED,
     RESET,
     SAVE,
     SET,
-    STIFF,
     NodeReport,
+    Noted,
     SetValue,
-    Stiff,
     decode_json,
 )
 from ..wire.router_link import RouterLink
 from ..wire.ways import Ways
+from .recorded_source import RecordedSource
 
-__all__ = ["RecordedSource", "Recorder"]
+__all__ = ["Recorder"]
 
 log = logging.getLogger(__name__)
 
@@ -98,6 +109,9 @@ _MOST_KEYS = 8 * MAX_TEXT_SIZE
 """How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 
 _FLUSH_S = 0.2
+_LOOK_S = 0.1
+"""How often in s the end of the recorder is looked at for a write that does not return."""
+
 _AUDIT_S = 10.0
 """Time in s between two notes of the audit, but for the last one."""
 
@@ -155,6 +169,7 @@ class Recorder:
         self._membership = Membership(plan, session, self._inbox, launch, self._router, memory=memory)
         self._put_progress: Callable[[bytes], None]
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._clock, self._watched, self._watched_at = AwakeClock(), cast("object", None), 0.0
 
     @property
     def files(self) -> tuple[tuple[str, int], ...]:
@@ -175,8 +190,39 @@ class Recorder:
     ) -> None:
         self._membership.give_up()
         self._inbox.post(lambda: self._end(error))
-        self._thread.join()  # all its waits have deadlines; a slow disk takes its time
+        last = Future[None]()
+        threading.Thread(target=self._finish, args=(error, last), name="recorder's end", daemon=True).start()
         try:
+            while not wait([last], _LOOK_S).done:  # a slow disk takes its time, but each write has its deadline
+                self.check_writing()
+            last.result()
+        except (ConfigurationError, DeadlineExceeded):
+            # The master has already reported a failure during the run; this failure came after the last point.
+            if error is None:
+                raise
+        finally:
+            self._membership.close()
+            self._inbox.close()
+
+    def check_writing(self) -> None:
+        """From the thread of the master, at least twice a second: look whether each write returns in time.
+
+        Raises:
+            DeadlineExceeded: one has not returned for `timeouts.write`. The thread stays in it.
+        """
+        now, writing = self._clock(), self._files.writing
+        if writing is not self._watched:
+            self._watched, self._watched_at = writing, now
+        elif writing is not None and (blocked_s := now - self._watched_at) > self._plan.timeouts.write:
+            text = f"'{writing[0]}' has not taken what the recorder writes for {blocked_s:.1f} s"
+            hint = "Does its file system answer? `timeouts.write` limits it."
+            point = max(self._written - 1, 0)
+            raise DeadlineExceeded(text, point=point, time=self._plan.grid.time(point), hint=hint)
+
+    def _finish(self, error: BaseException | None, last: Future[None]) -> None:
+        """Write all that is complete after the end, and close the files."""
+        try:
+            self._thread.join()  # all its waits have deadlines, but that for a disk
             try:
                 self._take_notes()
                 self._write_rows()
@@ -185,13 +231,10 @@ class Recorder:
                     self._files.note({"ended_by": error.message})
             finally:
                 self._files.close()
-        except ConfigurationError:
-            # The master has already reported a failure during the run; this failure came after the last point.
-            if error is None:
-                raise
-        finally:
-            self._membership.close()
-            self._inbox.close()
+        except BaseException as failure:  # noqa: BLE001  the thread of the master raises it
+            last.set_exception(failure)
+        else:
+            last.set_result(None)
 
     def _take_notes(self) -> None:
         """All nodes have reported: what they have told before, faster rows may have overtaken."""
@@ -298,8 +341,8 @@ class Recorder:
         if kind == SET:
             self._files.note(to_builtins(decode_json(data[HEADER.size :], SetValue)))
             return
-        if kind == STIFF:
-            self._files.note_stiff(*astuple(decode_json(data[HEADER.size :], Stiff)))
+        if kind == NOTED:
+            self._files.note_event(*astuple(decode_json(data[HEADER.size :], Noted)))
             return
         if kind == KEYS:
             self._files.keep(decode_json(data[HEADER.size :], list[KeyValue], _MOST_KEYS))
@@ -388,53 +431,3 @@ class Recorder:
             self._membership.report(report, self._plan.timeouts.stop, lambda: self._membership.given_up)
         except FmuMeshError as unreachable:
             log.info("end_not_reported", extra={"error": str(unreachable)})
-
-
-class RecordedSource:
-    """Rows of one instance that wait for rows of the others.
-
-    Args:
-        rows: its ring, if the recorder can read it; then the mirror for what comes in frames, if something does.
-    """
-
-    def __init__(self, link: Link, last_point: int, rows: Sequence[SourceRows], receiver: FrameReceiver | None) -> None:
-        self.link = link
-        self.receiver = receiver
-        self.counters = [own.counter for own in rows]
-        self._rings = [own.ring for own in rows]
-        self._last_point = last_point
-
-    @property
-    def covered(self) -> int:
-        """The last point for which the value is known; it holds until the next own point."""
-        received = min(counter.value for counter in self.counters) * self.link.step_points
-        return self._last_point if received > self._last_point else received - 1
-
-    def check(self, first: int, end: int) -> None:
-        """The rows for the points first to end - 1 are complete.
-
-        Raises:
-            ProtocolBroken: one is not.
-        """
-        low, high = first // self.link.step_points, (end - 1) // self.link.step_points + 1
-        wanted = np.arange(low + 1, high + 1)
-        for ring in self._rings:
-            mask = ring.mask
-            slots = slice(low & mask, (high - 1 & mask) + 1) if self.link.step_points == 1 else (wanted - 1) & mask
-            wrong = ring.stamps[slots] != wanted
-            if wrong.any():
-                raise ProtocolBroken(
-                    f"a row of '{self.link.source}' for the recorder is not the one that was written",
-                    instance=self.link.source,
-                    point=(low + int(wrong.argmax())) * self.link.step_points,
-                    hint="Does another process write to the memory of this run?",
-                )
-
-    def column(self, variable: str) -> ReadColumn:
-        """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""
-        ring = self._rings[-1 if is_text(self.link.layout.column(variable).type) else 0]
-        step_points, place, mask = self.link.step_points, ring.layout.place(variable), ring.mask
-        values = ring.parts[place.part][:, place.first]
-        if step_points == 1:
-            return lambda first, end: values[first & mask :][: end - first]
-        return lambda first, end: values[(np.arange(first, end) // step_points) & mask]

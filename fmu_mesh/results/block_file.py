@@ -44,6 +44,11 @@ class BlockFile(ABC):
         self._block_rows = max(1, _BLOCK_NUMBERS // width)
         self._file = open_alone(path)
 
+    def resume(self, rows: int) -> None:
+        """Go on after the rows that are in the file; see `Resumable`."""
+        self._file.append_after(self.path.stat().st_size)
+        self.rows, self.kept = rows, Kept(rows, self._file.size)
+
     @classmethod  # noqa: B027  there is nothing to find
     def check(cls, recording: Recording, findings: Findings) -> None:
         """Do nothing: the file can hold values of all types."""

@@ -97,6 +97,7 @@ class CsvFile(BlockFile):
         super().__init__(path, 1 + len(columns))
         is_device = str(path.parent) in _DEVICES or (exists(path) and not is_file(path))
         self._notes = NotesFile(path, metadata) if metadata and not is_device else None
+        self._has_notes = False
         header = io.StringIO()
         csv.writer(header, lineterminator="\n").writerow([_TIME, *(name for name, _ in columns)])
         self._header = header.getvalue().encode()  # it is written with the first rows
@@ -186,7 +187,8 @@ class CsvFile(BlockFile):
 
     def write(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> None:
         """Append one row per time; ``columns`` are arrays of the same length, of their types' dtypes."""
-        if self._notes is not None and not self.rows:
+        if self._notes is not None and not self._has_notes:
+            self._has_notes = True
             self._notes.begin()
         super().write(times, columns)
 

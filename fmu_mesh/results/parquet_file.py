@@ -122,7 +122,10 @@ class ParquetFile:
             with opened(path) as file:
                 return int(open_parquet(file).metadata.num_rows)
         rows = 0
-        if stream.stat().st_size:
+        if is_file(path):  # `resume` was not over: the stream has no row that the file has not
+            with opened(path) as file:
+                rows = int(open_parquet(file).metadata.num_rows)
+        elif stream.stat().st_size:
             with _batches(stream) as (schema, batches, notes), closing(_GroupWriter(path, schema)) as groups:
                 for batch in batches:
                     groups.add(batch)
@@ -181,6 +184,17 @@ class ParquetFile:
             if self._waiting == self._block_rows or self._texts:
                 self._send()
 
+    def resume(self, rows: int) -> None:
+        """Go on after the rows that are in the file, which becomes a stream again; see `Resumable`."""
+        pa = pyarrow_module()
+        self._stream = pa.ipc.new_stream(self._sink, self._schema)
+        with opened(self.path) as file:
+            for batch in parquet_batches(open_parquet(file)):
+                self._stream.write_batch(pa.RecordBatch.from_arrays(batch.columns, schema=self._schema))
+                self._write_pieces()
+        self.rows, self.kept, self._stream_only = rows, Kept(rows, self._file.size), True
+        Path(os.path.realpath(self.path)).unlink()
+
     def note(self, entry: Mapping[str, Any]) -> None:
         """Add an entry to the metadata."""
         self._notes.append(entry)
@@ -230,12 +244,8 @@ class ParquetFile:
         if self._stream is None:
             self._stream = pa.ipc.new_stream(self._sink, self._schema)
         self._stream.write_batch(batch, {KEY: msgspec.json.encode(notes)} if notes else None)
-        left = memoryview(self._sink.getvalue())
-        self._sink.seek(0)
-        self._sink.truncate()
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            self._write_pieces()
         except OSError:
             self.rows = self.kept.rows
             with suppress(OSError):
@@ -253,6 +263,14 @@ class ParquetFile:
             if groups is not None:
                 groups.close()
             raise
+
+    def _write_pieces(self) -> None:
+        """Give the operating system what pyarrow has written."""
+        left = memoryview(self._sink.getvalue())
+        self._sink.seek(0)
+        self._sink.truncate()
+        while left:
+            left = left[self._file.write(left) :]
 
 
 @contextmanager

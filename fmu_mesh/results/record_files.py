@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from msgspec import to_builtins
@@ -33,6 +33,7 @@ from .formats import reading, required_format
 from .growth import GrowthWatch, ReadColumn
 from .keys_file import KeysFile, keys_beside
 from .recording import Recording, ResultFile
+from .resumed_file import opened_again
 
 __all__ = ["ReadColumn", "RecordFiles", "open_result", "open_results", "rows_left", "what_is_kept"]
 
@@ -40,12 +41,18 @@ _NOTE = struct.Struct("<qq")
 
 
 def open_results(
-    loaded: LoadedConfig, system: ResolvedSystem, *, digest: str = "", contents: Mapping[str, str] = {}
+    loaded: LoadedConfig,
+    system: ResolvedSystem,
+    *,
+    digest: str = "",
+    contents: Mapping[str, str] = {},
+    rows: Sequence[int] = (),
 ) -> list[ResultFile]:
     """Open the result files of a run, in their order; none if nothing is recorded.
 
     Their metadata have the digest of the mesh and the SHA-256 of the model of each instance (``contents``). Without a
-    digest they have no metadata, which saves milliseconds.
+    digest they have no metadata, which saves milliseconds. If the run starts again, ``rows`` has the number of rows
+    that each file has of it.
 
     Raises:
         ConfigurationError: a file cannot be written, or another run is writing it. All files are as they were.
@@ -54,13 +61,14 @@ def open_results(
     places = {str(file): place for place, file in record_paths(loaded).items()}
     files: list[ResultFile] = []
     try:
-        for record in system.records:
+        for number, record in enumerate(system.records):
             place = places.get(record.file, "record")
             recording = Recording(loaded, descriptions, record.variables, place, record.first, record.every)
             if digest:
                 metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
                 recording = replace(recording, metadata=to_builtins(metadata) | _keys_of(system, record.file))
-            files.append(required_format(record.file).open(Path(record.file), recording))
+            there = rows[number] if number < len(rows) else 0
+            files.append(opened_again(Path(record.file), recording, there))
     except BaseException:
         for file in files:
             with suppress(OSError):
@@ -80,6 +88,9 @@ def open_result(loaded: LoadedConfig, system: ResolvedSystem) -> ResultFile:
     return open_results(loaded, replace(system, records=system.records[:1]))[0]
 
 
+Result = TypeVar("Result")
+
+
 class RecordFiles:
     """The open result files of a run.
 
@@ -94,12 +105,15 @@ class RecordFiles:
 
     Attributes:
         in_memory: whether no file has a path.
+        writing: the file that the thread of this object writes or closes just now, another tuple for each call; None:
+            none. For any thread.
     """
 
     def __init__(
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
+        self.writing: tuple[Path] | None = None
         self._files = [
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)
             for number, file in enumerate(files)
@@ -107,7 +121,7 @@ class RecordFiles:
         self._begin_files()
 
     def _begin_files(self) -> None:
-        self._stiff: dict[str, Any] = {}
+        self._events: dict[str, dict[str, Any]] = {}
         paths = [own.file.path for own in self._files]
         self.in_memory = not any(path.name for path in paths)
         self._keys = KeysFile(paths[0]) if paths and paths[0].name else None
@@ -115,7 +129,9 @@ class RecordFiles:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the rows so far warn of."""
-        return self._growth.warnings if self._growth is not None else ()
+        failed = {**self._events.get("held", {}), **self._events.get("disabled", {})}
+        told = tuple(f"{name}, from point {own['point']} on: {own['message']}" for name, own in failed.items())
+        return (*told, *(self._growth.warnings if self._growth is not None else ()))
 
     @property
     def counted(self) -> tuple[tuple[str, int], ...]:
@@ -157,10 +173,13 @@ class RecordFiles:
         """Add what happened to the metadata of all files; the errors are those of `write`."""
         self._each(lambda own: own.file.note(entry))
 
-    def note_stiff(self, instance: str, point: int, message: str) -> None:
-        """Add to the metadata at which point a model was found to be stiff; the errors are those of `write`."""
-        self._stiff = {**self._stiff, instance: {"point": point, "message": message}}
-        self.note({"stiff": self._stiff})
+    def note_event(self, what: str, instance: str, point: int, message: str) -> None:
+        """Add to the metadata at which point an instance was found to be stiff, or has failed and is held or disabled.
+
+        The errors are those of `write`.
+        """
+        self._events[what] = {**self._events.get(what, {}), instance: {"point": point, "message": message}}
+        self.note({what: self._events[what]})
 
     def keep(self, values: Sequence[KeyValue]) -> None:
         """Keep values that have come by keys, beside the first file; the errors are those of `write`."""
@@ -170,7 +189,7 @@ class RecordFiles:
     def _keep(self, write: Callable[[], str | None]) -> None:
         first = self._files[0].file.path
         try:
-            name = write()
+            name = self._write_to(keys_beside(first), write)
         except OSError as error:
             raise unwritable(keys_beside(first), error) from error
         if name is not None:
@@ -185,12 +204,19 @@ class RecordFiles:
         """Close all files. Nothing happens if they are closed. The errors are those of `write`."""
         if self._keys is not None:
             self._keys.close()
-        self._raise_first([(own, own.close()) for own in self._files])
+        self._raise_first([(own, self._write_to(own.file.path, own.close)) for own in self._files])
 
     def _each(self, call: Callable[[_RecordFile], None]) -> None:
         """Do something with each file that can be written; then raise the first error."""
-        if any(errors := [own.tried(call) for own in self._files]):
+        if any(errors := [self._write_to(own.file.path, partial(own.tried, call)) for own in self._files]):
             self._raise_first([*zip(self._files, errors, strict=True)])
+
+    def _write_to(self, path: Path, call: Callable[[], Result]) -> Result:
+        self.writing = (path,)
+        try:
+            return call()
+        finally:
+            self.writing = None
 
     @staticmethod
     def _raise_first(done: Sequence[tuple[_RecordFile, OSError | None]]) -> None:

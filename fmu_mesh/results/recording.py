@@ -21,7 +21,17 @@ from ..files import Kept, decoded_json
 from ..variables.model_description import ModelDescription, Variable
 from ..variables.value_types import VariableType
 
-__all__ = ["Columns", "Recording", "ResultFile", "ResultFormat", "Tail", "joined", "metadata_in", "with_notes"]
+__all__ = [
+    "Columns",
+    "Recording",
+    "ResultFile",
+    "ResultFormat",
+    "Resumable",
+    "Tail",
+    "joined",
+    "metadata_in",
+    "with_notes",
+]
 
 
 class Recording(msgspec.Struct, frozen=True):
@@ -207,6 +217,17 @@ class ResultFile(Protocol):
         ...
 
 
+class Resumable(Protocol):
+    """What a `ResultFile` may have besides: then the rows of a run that starts again stay in its file."""
+
+    def resume(self, rows: int) -> None:
+        """The next `write` goes after the ``rows`` whole rows that the file at the path has; called before it.
+
+        The file is one that `close` or `keep_whole_rows` has finished. Until this call it stays as it is.
+        """
+        ...
+
+
 class Tail(Protocol):
     """The rows of a result file in pieces, while it grows and afterwards; only reads, and the run never waits for it.
 
@@ -274,6 +295,7 @@ def with_notes(metadata: Mapping[str, Any], entries: Iterable[Mapping[str, Any]]
         if "variable" in entry:
             values.append(entry)
         else:
+            values = [*entry.get("set", values)]  # the run has started again
             noted |= entry
     return {**noted, "set": values} if values else noted
 

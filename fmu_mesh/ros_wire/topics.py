@@ -17,6 +17,8 @@ from .definitions import CLOCK, MessageTypes
 
 __all__ = [
     "CLOCK_TOPIC",
+    "DIAGNOSTICS",
+    "DIAGNOSTICS_TOPIC",
     "Descriptions",
     "Direction",
     "Kind",
@@ -27,6 +29,7 @@ __all__ = [
 ]
 
 CLOCK_TOPIC = "/clock"
+DIAGNOSTICS_TOPIC, DIAGNOSTICS = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 
 Descriptions = Mapping[str, ModelDescription]
 Direction = Literal["out", "in"]
@@ -91,6 +94,7 @@ class RosPlan(msgspec.Struct, frozen=True):
     Attributes:
         clock_points: points between two /clock messages; None: no /clock.
         time_source: the variable whose samples show the time if no topic is published; None if there is none.
+        may_fail: the instances that may fail without an end of the run: they are in `/diagnostics`.
     """
 
     types: MessageTypes
@@ -100,6 +104,7 @@ class RosPlan(msgspec.Struct, frozen=True):
     namespace: str = "/"
     clock_points: int | None = None
     time_source: Port | None = None
+    may_fail: tuple[str, ...] = ()
 
     @property
     def listed(self) -> tuple[MeshTopic, ...]:
@@ -115,4 +120,6 @@ class RosPlan(msgspec.Struct, frozen=True):
             for topic in self.topics
         ]
         clock = MeshTopic(CLOCK_TOPIC, "out", CLOCK, Qos(), ("simulation time",))
-        return (*shown, clock) if self.clock_points is not None else tuple(shown)
+        failed = MeshTopic(DIAGNOSTICS_TOPIC, "out", DIAGNOSTICS, Qos(), self.may_fail)
+        clocks = (clock,) if self.clock_points is not None else ()
+        return (*shown, *clocks, *((failed,) if self.may_fail else ()))

@@ -64,11 +64,15 @@ class OutputLine(msgspec.Struct, frozen=True, tag="output"):
 
 
 class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
-    """The run starts again from its first point, for the ``number``-th of ``most`` times, because of an error."""
+    """All processes start again, for the ``number``-th of ``most`` times, because of an error.
+
+    The rows up to ``point`` are there, and are made again unpaced.
+    """
 
     error: ErrorReport
     number: int
     most: int
+    point: int = 0
 
 
 class WasReset(msgspec.Struct, frozen=True, tag="reset"):

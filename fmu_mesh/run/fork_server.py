@@ -155,7 +155,8 @@ class ForkServer:
     def discard(self) -> None:
         """End a server that has forked nothing."""
         self.process.kill()
-        self.process.communicate()
+        with suppress(subprocess.TimeoutExpired):  # it waits for a disk that does not answer (state D)
+            self.process.communicate(timeout=_KILL_S)
         self.close()
 
     def close(self) -> None:

@@ -39,6 +39,7 @@ from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.placement import manual_hosts, placed
 from ..system.plan import MASTER, RECORDER, NodePlan
+from ..wire.journal import JOURNAL
 from ..wire.refused_links import RefusedLinks
 from ..wire.runtime import box_of, remove_stale_folders, run_folder, run_name, socket_endpoint, write_note
 from .child import Child, Process
@@ -96,6 +97,7 @@ class Launcher:
 
     Attributes:
         outcome: how the run ended, also where `run` raises an error; None before.
+        next: the plan with which the run starts again, if it was lost and may; its journals are still there.
     """
 
     def __init__(
@@ -104,7 +106,9 @@ class Launcher:
         self._connect = elsewhere
         self._elsewhere: Elsewhere | None = None
         self.outcome: Outcome | None = None
-        self._run = self._first = with_doors(replace(run, run=run_name()))  # the newest, and the first one
+        self.next: RunPlan | None = None
+        is_again = run.restarts > 0  # at the same endpoints, with the same journals
+        self._run = self._first = run if is_again else with_doors(replace(run, run=run_name()))  # the newest, the first
         self._on_event = on_event
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._server: ForkServer | None = None
@@ -138,16 +142,18 @@ class Launcher:
         self._check_reachable()
         remove_stale_folders()
         self._folder = run_folder(self._run.mesh, self._run.run)
+        has_run = False
         try:
             socket_endpoint(self._folder, MASTER)  # a path that is too long is found here
             for name, node in self._run.plan.nodes.items():
                 if node.process.is_sandboxed:
-                    box_of(self._folder, name).mkdir(mode=0o700)
+                    box_of(self._folder, name).mkdir(mode=0o700, exist_ok=True)
             self._file = str(self._run.write(self._folder))
             self._reach_others()
             self._do(self._states.begin())
             while not self._states.is_ending:
                 self._turn()
+            has_run = True
         finally:
             self._do(self._states.end(self._clock()))
             while not self._states.is_over:
@@ -155,8 +161,35 @@ class Launcher:
             self._close_all()
             if self._files is None:  # the master could not say it any more
                 self._files = rows_left([record.file for record in self._run.plan.system.records], self._folder)
-            remove_tree(self._folder)
+            self._files = self._run.with_earlier(self._files)
+            self.next = self._next(self._files) if has_run else None
+            if self.next is None:
+                self.clear()
+            else:
+                self._clear_for_next()
         return self._result(self._files)
+
+    def clear(self) -> None:
+        """Remove the folder of the run: it does not start again."""
+        remove_tree(self._folder)
+
+    def _clear_for_next(self) -> None:
+        """Remove what the processes of this attempt have left, but for their journals and the note about the mesh."""
+        journals = [*self._folder.glob(f"**/*{JOURNAL}")]
+        kept = {*journals, *(file.parent for file in journals), self._folder / "mesh.json"}
+        boxes = [entry for entry in kept if entry.is_dir()]
+        for entry in [entry for folder in {self._folder, *boxes} for entry in folder.iterdir()]:
+            if entry not in kept:
+                remove_tree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+
+    def _next(self, files: Sequence[tuple[str, int]]) -> RunPlan | None:
+        """The plan of the next attempt; None if there is none."""
+        run, error = self._run, self._states.error()
+        if type(error) is not MeshLost or run is not self._first or run.restarts >= run.max_restarts:
+            return None
+        seen = max(run.replays_to, last_recorded(run.plan, files), self._states.point)
+        rows = tuple(rows for _, rows in files)
+        return replace(run, restarts=run.restarts + 1, rows=rows, replays_to=min(seen, run.plan.grid.last_point))
 
     def _check_reachable(self) -> None:
         """Check that nodes that are started manually on other hosts can reach the master.

@@ -165,6 +165,11 @@ class LaunchStates:
         """How long to wait for an event; then comes `go_on`."""
         return self._terms.deadlines.look_at_end if self.is_ending else self._terms.deadlines.look
 
+    @property
+    def point(self) -> int:
+        """The last point that all instances are known to have reached."""
+        return self._status.point if self._status is not None else 0
+
     def begin(self) -> Sequence[Action]:
         """Start the run. If there is a gateway, the nodes start when it is ready, so that it misses no sample."""
         return self._starts(SERVER, THE_MASTER, *([GATEWAY] if self._terms.has_gateway else self._terms.nodes))

@@ -111,6 +111,7 @@ class LocalMember:
 
     def bind(self, grid: TimeGrid, members: Mapping[str, LocalMember]) -> None:
         """Prepare `step_from`: what it needs at every point is looked up here, once."""
+        self._grid = grid
         self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
         self._last = LastValues(self.plan.timeouts, self._courses, self.instance.description)
         names = [column.name for column in self._inputs.layout.columns if column.shape or column.name in self._courses]
@@ -157,7 +158,11 @@ class LocalMember:
         if floating_point_changed():
             restore_floating_point()
         if self._looks_at_rows and not self.is_finite.check(step + 1):
-            raise NotFinite("an output is not finite", instance=self.plan.name)
+            if self.plan.section.on_failure == "stop":
+                raise NotFinite("an output is not finite", instance=self.plan.name)
+            error = self.is_finite.error(step + 1, self._grid)
+            self.is_finite.explain(error)
+            self.instance.hold(step, error)
         self.step = step + 1
 
     def getter(self, name: str) -> Callable[[int], Value]:

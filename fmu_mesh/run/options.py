@@ -36,7 +36,13 @@ StartValues = Annotated[Values, Option("start values by `instance.variable`", "-
 Processes = Annotated[bool, Option("False: run everything in this one process", "--local")]
 MemoryLimit = Annotated[int, Option("the most bytes of results in memory; a run ends there, or is refused", least=0)]
 Restarts = Annotated[
-    int, Option("restart from the first point when a process is lost, at most N times", "--restarts", "N", least=0)
+    int | None,
+    Option(
+        "start all processes again when one is lost, at most N times; None: as `recovery` says",
+        "--restarts",
+        "N",
+        least=0,
+    ),
 ]
 State = Annotated[
     File, Option("begin with this state, which `System.save` or `Run.checkpoint` has written", "--from", "FILE")
@@ -143,7 +149,7 @@ class StartOptions(CallOptions, frozen=True, kw_only=True):
 
     processes: Processes = True
     memory_limit: MemoryLimit = MEMORY_LIMIT
-    restarts: Restarts = 0
+    restarts: Restarts = None
     on_progress: OnProgress = None
     on_event: OnEvent = None
 
@@ -153,7 +159,7 @@ class RunOptions(PlanOptions, frozen=True, kw_only=True):
 
     processes: Processes = True
     memory_limit: MemoryLimit = MEMORY_LIMIT
-    restarts: Restarts = 0
+    restarts: Restarts = None
     on_progress: OnProgress = None
     on_event: OnEvent = None
 

@@ -216,6 +216,8 @@ def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None
     elsewhere = {name: bool(section.host or section.interpreter) for name, section in own.items()}
     if elsewhere and (why := why_no_sandbox(config.zenoh, elsewhere)) is not None:
         obstacles.add("process.sandbox", *why)
+    if config.recovery.restarts and (no := config.why_not_restarted) is not None:
+        obstacles.add("recovery.mode", f"restart, and {no}", "stop")
     if (group := config.runtime.share_with) is not None:
         trusted = f"the members of the group '{group}' are trusted as you are: they can read, set and end this mesh"
         warnings.add("runtime.share_with", trusted, "")

@@ -26,6 +26,7 @@ import select
 import socket
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
@@ -393,7 +394,8 @@ class ProcessCopies:
             server.process.communicate(timeout=_EXIT_S)
         except subprocess.TimeoutExpired:
             server.process.kill()
-            server.process.communicate()
+            with suppress(subprocess.TimeoutExpired):  # it waits for a disk that does not answer (state D)
+                server.process.communicate(timeout=_EXIT_S)
         server.close()
 
 

@@ -226,8 +226,8 @@ class RepeatedRuns:
 
     def _log(self, message: LogMessage) -> None:
         self._around.log(message)
-        if message.is_stiff and self._run is not None:
-            self._run.note_stiff(message)
+        if message.noted and self._run is not None:
+            self._run.note_event(message)
 
     def _remove_scratch(self) -> None:
         shutil.rmtree(self._around.scratch, ignore_errors=True)
@@ -390,10 +390,10 @@ class _Run:
         if (engine := self._engine) is not None:
             engine.ring_bell()
 
-    def note_stiff(self, message: LogMessage) -> None:
-        """A solver has found that its model is stiff."""
+    def note_event(self, message: LogMessage) -> None:
+        """Note in the results what has turned out; see `LogMessage.noted`."""
         step_points = self._plan.system.instances[message.instance].step_points
-        self.writer.note_stiff(message.instance, message.step * step_points, message.message)
+        self.writer.note_event(message.noted, message.instance, message.step * step_points, message.message)
 
     def _step_to_the_end(self, engine: Engine) -> None:
         """Take steps and write rows; rows that are not written yet are never overwritten."""

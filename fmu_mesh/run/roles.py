@@ -10,7 +10,7 @@ import logging
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,12 +30,13 @@ from ..recorder.recorder import Recorder
 from ..results.growth import GrowthWatch
 from ..results.record_files import open_results
 from ..results.recording import ResultFile
+from ..system.attempt import Attempt
 from ..system.plan import MASTER, RECORDER, Plan
 from ..variables.value_types import PlainValue
 from ..wire.host_processes import ask_outside
 from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
-from ..wire.messages import NewStart, Stiff
+from ..wire.messages import NewStart, Noted
 from ..wire.router_link import RouterLink
 from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_endpoint, write_note
 from ..wire.session import Wiring, close_session, open_session, own_endpoints
@@ -209,7 +210,8 @@ class _NodeProcess:
         plan, showing = self._first.plan, self._first.showing
         if showing.video is not None:
             showing = replace(showing, video=numbered(showing.video, start.resets))
-        self._run = replace(self._first, showing=showing, plan=replace(plan, digest=start.digest, instances=instances))
+        plan = replace(plan, digest=start.digest, instances=instances, attempt=Attempt())
+        self._run = replace(self._first, showing=showing, plan=plan)
 
     def _open(self, name: str) -> Guarded:
         opening = _opening(self._run, name, self._process.folder, self._log)
@@ -226,8 +228,8 @@ class _NodeProcess:
         if self._node is not None:
             line = log_line(message, self._run.plan.instance(message.instance).step_points)
             self._node.server.log_message(line)
-            if message.is_stiff:
-                self._node.tell_recorder(Stiff(line.instance, line.point, line.message))
+            if message.noted:
+                self._node.tell_recorder(Noted(message.noted, line.instance, line.point, line.message))
             if message.status in ("error", "fatal"):  # the FMU may end the process next
                 self._node.server.say_everything(heard=True)
 
@@ -285,6 +287,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 launch=process.launch,
                 profile=run.profile,
                 paused=run.paused,
+                attempt=run.attempt_of(MASTER),
                 table=table_of(own),
                 as_file=lambda point, states: state_bytes(runs.run, point, states),
             )
@@ -305,7 +308,9 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             try:
                 if RECORDER in run.plan.nodes:
                     recorder = runs.recorder(master)
-                with recorder or nullcontext():
+                    with recorder:
+                        master.run(recorder.check_writing)
+                else:
                     master.run()
             except FmuMeshError as error:
                 failure = error
@@ -375,7 +380,7 @@ class _MasterRuns:
         from .preparing import KnownModels, planned_reset  # noqa: PLC0415  most runs are never reset
 
         self._known = self._known or KnownModels.of(self._first)
-        run = planned_reset(self._first, start_values, resets, self._known)
+        run = replace(planned_reset(self._first, start_values, resets, self._known), rows=())
         self._files = _opened_results(run)
         self.run, self.resets = run, resets
         return run.plan
@@ -416,7 +421,7 @@ class _MasterRuns:
 
 
 def _opened_results(run: RunPlan) -> Sequence[ResultFile]:
-    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents)
+    return open_results(run.loaded, run.plan.system, digest=run.plan.digest, contents=run.contents, rows=run.rows)
 
 
 def _outcome_of(
@@ -426,15 +431,8 @@ def _outcome_of(
     point, ended_by = master.last_status().point, master.ended_by if error is None else None
     if isinstance(error, RunReset):
         point, error, ended_by = max(point, last_recorded(run.plan, files)), None, error
-    outcome = outcome_at(
-        run.plan,
-        point,
-        files,
-        error,
-        ended_by,
-        seconds=master.seconds,
-        warnings=(*warnings, *master.warnings),
-    )
+    told = (*warnings, *master.warnings)
+    outcome = outcome_at(run.plan, point, files, error, ended_by, seconds=master.seconds, warnings=told)
     return replace(outcome, profile=master.profile(), signal=signal)
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 
 from ..node.stepping import Runner
-from ..recorder.recorder import RecordedSource
+from ..recorder.recorded_source import RecordedSource
 from ..results.growth import GrowthWatch
 from ..results.record_files import RecordFiles, what_is_kept
 from ..results.recording import ResultFile
@@ -107,10 +107,10 @@ class RowWriter:
                 self._files.flush()
             self._flushed = now if is_late else self._flushed
 
-    def note_stiff(self, instance: str, point: int, message: str) -> None:
-        """Add to the metadata at which point a model was found to be stiff; the errors are those of `write`."""
+    def note_event(self, what: str, instance: str, point: int, message: str) -> None:
+        """See `RecordFiles`; from any thread."""
         with self._writing:
-            self._files.note_stiff(instance, point, message)
+            self._files.note_event(what, instance, point, message)
 
     def close(self) -> None:
         """Close the files; from any thread, and nothing happens if they are closed.

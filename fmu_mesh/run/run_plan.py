@@ -21,13 +21,15 @@ from ..errors import ConfigurationError, UnknownName
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
 from ..simtime import ENDLESS
+from ..system.attempt import Attempt
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
 from ..system.start_values import why_not_settable
 from ..system.states import BeginsWith
 from ..text import counted, did_you_mean, listed, meant, nearest, shown
 from ..variables.model_description import ModelDescription, Variable
-from ..wire.runtime import MeshNote
+from ..wire.journal import JOURNAL
+from ..wire.runtime import MeshNote, box_of, run_folder
 from .limits import ring_problem
 
 __all__ = [
@@ -114,6 +116,9 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         run: name of the run: that of the launcher (`run_name`), or `MANUAL`.
         restarts: how often the run was started before.
         begins_with: the states of its first point; None: it is that after Initialization Mode.
+        max_restarts: how often it may be started again.
+        rows: of each result file, how many rows it has from before.
+        replays_to: the last point that was seen before: up to it, the run is as it was.
     """
 
     loaded: LoadedConfig
@@ -126,6 +131,9 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     run: str = MANUAL
     restarts: int = 0
     begins_with: BeginsWith | None = None
+    max_restarts: int = 0
+    rows: tuple[int, ...] = ()
+    replays_to: int = 0
 
     @property
     def config_file(self) -> Path:
@@ -190,7 +198,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             run=self.run,
             zenoh=self.zenoh(),
             showing=self.showing,
-            plan=replace(plan.nodes[name], restarts=self.restarts),
+            plan=replace(plan.nodes[name], attempt=self.attempt_of(name)),
             models={
                 item.name: PlannedModel(plan.system.instances[item.name].description, self.contents[item.name])
                 for item in plan.nodes[name].instances
@@ -198,6 +206,15 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             security=self.loaded.config.security,
             begins_with=self.begins_with and self.begins_with.only(item.name for item in plan.nodes[name].instances),
         )
+
+    def attempt_of(self, participant: str) -> Attempt:
+        """Which attempt this is, for a node or the master."""
+        number, most, journal = self.restarts + 1, self.max_restarts + 1, ""
+        if self.max_restarts:
+            folder = run_folder(self.mesh, self.run)
+            box = box_of(folder, participant)
+            journal = str((box if box.is_dir() else folder) / f"{box.name}{JOURNAL}")
+        return Attempt(number, most, self.replays_to, journal)
 
     def variable(self, name: str, *, elements: bool = False) -> tuple[str, Variable]:
         """The instance and the variable ``instance.variable``; with ``elements``, it may be an element of the variable.
@@ -233,6 +250,12 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             nodes[RECORDER] = replace(nodes[RECORDER], records=records)
         plan = replace(self.plan, system=replace(system, records=records), nodes=nodes)
         return replace(self, plan=plan)
+
+    def with_earlier(self, files: Sequence[tuple[str, int]]) -> tuple[tuple[str, int], ...]:
+        """Each result file and the number of rows in it, where an attempt may have ended before it had any."""
+        found, names = dict(files), [record.file for record in self.plan.system.records]
+        before = self.rows or [0] * len(names)
+        return tuple((name, max(found.get(name, 0), rows)) for name, rows in zip(names, before, strict=True))
 
     def write(self, folder: Path) -> Path:
         """Write the plan into a private folder, for the other processes of the run; returns the file.
@@ -274,6 +297,7 @@ def opening_in(
         description=description,
         folder=folder,
         limits=node.limits,
+        timeouts=node.timeouts,
         linear_inputs=item.linear_inputs,
         log=log,
     )

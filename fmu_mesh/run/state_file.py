@@ -12,6 +12,7 @@ import os
 import struct
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple, Self
 
 import msgspec
@@ -19,9 +20,8 @@ from msgspec.structs import replace
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
-from ..simtime import ENDLESS
 from ..system.plan import RECORDER
-from ..system.states import AgreedInstance, BeginsWith, agreed_of, differences, stateless
+from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
 from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
@@ -33,43 +33,24 @@ _VERSION = 1
 _START = struct.Struct("<8sIQ32s")  # letters, version, length of the head, its SHA-256
 
 
-class _Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True, array_like=True):
-    """The state of one instance in the file: its size in bytes, and its SHA-256."""
-
-    instance: str
-    size: int
-    sha256: bytes
-
-
 class _Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The head; ``time``, ``start_time`` and ``step_size`` in s."""
+    """The head: times in s; of each block, in their order, its instance, and its size in bytes and its SHA-256."""
 
     fmu_mesh: str
     mesh: str
     point: int
-    time: float
     start_time: float
     step_size: float
-    instances: dict[str, AgreedInstance]
-    blocks: tuple[_Block, ...]
+    instances: dict[str, SavedInstance]
+    blocks: dict[str, tuple[int, bytes]]
 
 
 class StateFile(NamedTuple):
-    """A state that was read from a file.
-
-    Attributes:
-        point: its communication point.
-        states: the state of each instance, as `fmu_mesh.run.local_member.LocalMember.packed` makes it.
-    """
+    """A state that was read from a file; ``states`` has that of each instance, as `LocalMember.packed` makes it."""
 
     file: Path
     head: _Head
     states: Mapping[str, bytes]
-
-    @property
-    def point(self) -> int:
-        """Its communication point."""
-        return self.head.point
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -102,11 +83,10 @@ class StateFile(NamedTuple):
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise damaged from error
         states = {}
-        for block in known.blocks:
-            content, rest = rest[: block.size], rest[block.size :]
-            if hashlib.sha256(content).digest() != block.sha256:
+        for name, (size, expected) in known.blocks.items():
+            states[name], rest = bytes(rest[:size]), rest[size:]
+            if hashlib.sha256(states[name]).digest() != expected:
                 raise damaged
-            states[block.instance] = bytes(content)
         if rest or states.keys() != known.instances.keys():
             raise damaged
         return cls(file, known, states)
@@ -122,8 +102,8 @@ class StateFile(NamedTuple):
             if (was := getattr(head, what)) != (now := getattr(grid, what)):
                 text = f"was {short_number(was)} s where the state was written, and is {short_number(now)} s"
                 findings.append(Finding(str(self.file), f"simulation.{what}", text, ""))
-        if grid.last_point < min(head.point, ENDLESS):
-            text = f"{short_number(grid.stop_time or 0.0)} s, and the state is of {short_number(head.time)} s"
+        if (stop := grid.stop_time) is not None and grid.last_point < head.point:
+            text = f"{short_number(stop)} s, and the state is of {short_number(grid.time(head.point))} s"
             findings.append(Finding(str(self.file), "simulation.stop_time", text, "a later time"))
         refused, values = differences(head.instances, run.plan, run.contents)
         findings += [Finding(str(self.file), f"instances.{name}", why, "") for name, why in refused]
@@ -139,7 +119,7 @@ class StateFile(NamedTuple):
         Raises:
             ConfigurationError: it cannot begin here; carries all differences.
         """
-        values, plan, point, findings = self.check(run), run.plan, self.point, []
+        values, plan, point, findings = self.check(run), run.plan, self.head.point, []
         for name, own in plan.system.instances.items():
             if point % own.step_points:
                 text = f"its step is {own.step_points} points, and the state is of point {point}, within one"
@@ -160,13 +140,21 @@ class StateFile(NamedTuple):
         return replace(run, plan=replace(plan, system=system, nodes=nodes), begins_with=begins_with)
 
 
-def state_bytes(run: RunPlan, point: int, states: Mapping[str, bytes]) -> bytes:
-    """The content of a state file: the states of a run at a point; see `StateFile`."""
+def state_bytes(
+    run: RunPlan,
+    point: int,
+    states: Mapping[str, bytes],
+    others: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
+) -> bytes:
+    """The content of a state file: the states of a run at a point; see `StateFile`.
+
+    ``others`` are the start values that are not as in the plan, by instance and variable.
+    """
     grid = run.plan.grid
-    blocks = tuple(_Block(name, len(own), hashlib.sha256(own).digest()) for name, own in states.items())
-    instances = agreed_of(run.plan, run.contents)
-    times = grid.time(point), grid.start_time, grid.step_size
-    head = msgspec.msgpack.encode(_Head(__version__, run.mesh, point, *times, instances, blocks))
+    blocks = {name: (len(own), hashlib.sha256(own).digest()) for name, own in states.items()}
+    instances = saved_instances(run.plan, run.contents, others)
+    own = _Head(__version__, run.mesh, point, grid.start_time, grid.step_size, instances, blocks)
+    head = msgspec.msgpack.encode(own)
     start = _START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest())
     return b"".join((start, head, *states.values()))
 

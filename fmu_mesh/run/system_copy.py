@@ -161,7 +161,10 @@ class SystemCopy:
         for part, kept in zip(parts, cast("tuple[NDArray[Any], ...]", saved.states[""]), strict=True):
             part[...] = kept
         for runner in self.runners.values():
-            runner.follow_inputs()
+            if runner.plan.section.on_failure == "stop":
+                runner.follow_inputs()
+            else:  # it had failed, or has failed
+                runner.refit()
 
     def restored_by(self, saved: SavedCopy) -> tuple[list[native.CopyCall], list[native.Keep], list[int]] | None:
         """What `restore` does, as calls, pieces, and their places in memory; None if there is more to do.

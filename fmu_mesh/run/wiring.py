@@ -163,4 +163,5 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool, is_mirrore
     is_local = all(map(is_socket, made.connect)) and not is_mirrored
     lease_s = max(timeouts.link, 4 * timeouts.step) if is_local else timeouts.link
     waits = is_node or not all(map(is_socket, (*made.listen, *made.connect)))
-    return replace(made, lease_s=lease_s, stuck_s=lease_s if waits else made.stuck_s)
+    stuck_s = lease_s if waits else made.stuck_s
+    return replace(made, lease_s=lease_s, stuck_s=stuck_s, patience_s=timeouts.router)

@@ -48,6 +48,7 @@ _INSTANCE_KEYS: Final = (
     "inputs",
     "interpolation",
     "not_finite",
+    "on_failure",
     "retry_discarded_steps",
     "sha256",
     "solver",

@@ -21,6 +21,7 @@ from ..simtime import TimeGrid
 from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, to_plain
 from ..variables.value_types import PlainValue, is_float
+from .attempt import Attempt
 from .digest import digest_of
 from .execution_order import execution_order
 from .feeds import Feed, feeds_of
@@ -131,8 +132,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         units: the instances in execution order. Those of one inner tuple form a cycle within the node and step point by
             point; the others run ahead as far as their inputs and the grant allow.
         window: number of points that this node may be behind the grant.
-        progress_stride: number of points between two progress messages to the master: a quarter of the window, or 1 if
-            a single step is that long.
+        progress_stride: points between two progress messages to the master: a quarter of the window, or a longer step.
         windows: number of points that each node, and last the recorder, may be behind the others, by name.
         batch: number of points that it may sleep for at once; 1 if others may wait for its own next row.
         memory: where everything lies in the memory that processes of one host share.
@@ -166,7 +166,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limits: LimitsConfig = LimitsConfig()
     shared_memory: bool = True
     row_streams: bool = True
-    restarts: int = 0
+    attempt: Attempt = Attempt()
     secured: bool = False
     process: ProcessConfig = ProcessConfig()
     host: str | None = None

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from fmu_mesh.config.findings import Findings
-from fmu_mesh.config.instance_sections import InstanceSection
+from fmu_mesh.config.instance_sections import InstanceSection, SubstitutesConfig
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.system.connections import element_of
 from fmu_mesh.text import listed, nearest, shown
@@ -21,7 +21,14 @@ from fmu_mesh.variables.model_description import ModelDescription, Value, Variab
 from fmu_mesh.variables.value_conversion import ValueRefused, to_value
 from fmu_mesh.variables.value_types import MAX_ELEMENTS, flattened, nested, split_element
 
-__all__ = ["forbidden", "forbidden_start_values", "resolve_start_values", "sized", "why_not_settable"]
+__all__ = [
+    "check_substitutes",
+    "forbidden",
+    "forbidden_start_values",
+    "resolve_start_values",
+    "sized",
+    "why_not_settable",
+]
 
 _SOURCES: Final = {"1": "FMI 1.0 (ME 3.3)", "2": "FMI 2.0 (2.2.7)", "3": "FMI 3.0 (2.4.7)"}
 """The clause that says which variables may have a start value, by version of FMI."""
@@ -89,6 +96,29 @@ def resolve_start_values(
                     found = f"{shown(value)} for '{variable_name}', which is out of its range"
                 findings.add(path, found, refused.expected, refused.suggestion)
     return values
+
+
+def check_substitutes(
+    name: str, config: InstanceSection, description: ModelDescription, findings: Findings, *, finite: bool
+) -> None:
+    """Add a finding for each substitute of `on_failure` that is for no output, or that its output cannot have."""
+    given = config.on_failure.disable if isinstance(config.on_failure, SubstitutesConfig) else {}
+    outputs = {variable.name: variable for variable in description.with_causality("output")}
+    for output, value in given.items():
+        path = f"instances.{name}.on_failure.disable.{output}"
+        if output not in outputs:
+            variable = description.variable_of(output)
+            what = f"the unknown variable '{output}' of instance '{name}'"
+            if variable is not None:
+                is_element = variable.name != output and variable.name in outputs
+                what = f"'{output}', an element of an array" if is_element else f"'{output}', {variable.role}"
+            findings.add(path, what, f"one of the outputs {listed([*outputs])}", nearest(output, [*outputs]))
+            continue
+        try:
+            to_value(value, outputs[output], finite=finite)
+        except ValueRefused as refused:
+            found = f"{shown(value)} for the {outputs[output].type_name} '{output}'"
+            findings.add(path, found, refused.expected, refused.suggestion)
 
 
 def forbidden_start_values(

@@ -6,8 +6,8 @@ Owns no file and no state; those are `fmu_mesh.run.state_file` and the instances
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 
 import msgspec
 
@@ -19,36 +19,20 @@ from .plan import Plan
 from .start_values import why_not_settable
 from .system import ResolvedSystem
 
-__all__ = ["AgreedInstance", "BeginsWith", "Differences", "agreed_of", "differences", "stateless"]
+__all__ = ["BeginsWith", "SavedInstance", "differences", "saved_instances", "stateless"]
 
-_HASHES = {
-    "variables": "variables",
-    "options": "options",
-    "connections": "connections",
-    "scenario": "values over time",
-    "timeouts": "timeouts",
-}
+_DIGITS = 16
 
 
-class AgreedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SavedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a state says about the instance that it is of.
 
     Attributes:
-        model: a hash of the SHA-256 of its files, and of its GUID.
-        kind: such as `co_simulation 2.0`.
-        step: its own step in base points.
-        variables, options, connections, scenario, timeouts: a hash of each.
+        agreed: what must be equal where it is restored, by its name: in words, or a hash.
         start_values: those that were given, by variable.
     """
 
-    model: str
-    kind: str
-    step: int
-    variables: str
-    options: str
-    connections: str
-    scenario: str
-    timeouts: str
+    agreed: dict[str, str]
     start_values: dict[str, PlainValue]
 
 
@@ -72,13 +56,6 @@ class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
-class Differences(NamedTuple):
-    """What differs between a state and a mesh: why it cannot be restored, in words, and values that can be set."""
-
-    refused: list[tuple[str, str]]  # the instance, and a sentence about it without its name
-    set_again: dict[str, dict[str, PlainValue]]  # by instance and variable
-
-
 def stateless(system: ResolvedSystem, *, keys: bool = True) -> dict[str, str]:
     """The instances whose state cannot outlive their process, and why, as the end of a sentence.
 
@@ -96,8 +73,13 @@ def stateless(system: ResolvedSystem, *, keys: bool = True) -> dict[str, str]:
     return found
 
 
-def agreed_of(plan: Plan, contents: Mapping[str, str]) -> dict[str, AgreedInstance]:
-    """What a state of this plan says, by instance; ``contents`` is the SHA-256 of each model."""
+def saved_instances(
+    plan: Plan, contents: Mapping[str, str], others: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({})
+) -> dict[str, SavedInstance]:
+    """What a state of this plan says, by instance.
+
+    ``contents`` is the SHA-256 of each model, and ``others`` are the start values that are not as in the plan.
+    """
     found = {}
     for name, own in plan.system.instances.items():
         described = own.description
@@ -106,68 +88,64 @@ def agreed_of(plan: Plan, contents: Mapping[str, str]) -> dict[str, AgreedInstan
             for c in plan.connections
             if c.target_instance == name
         ]
-        found[name] = AgreedInstance(
-            model=_hash((contents.get(name, ""), described.guid)),
-            kind=f"{described.kind} {described.fmi_version}".strip(),
-            step=own.step_points,
-            variables=_hash([(v.name, v.type, v.shape, v.causality, v.variability) for v in described.variables]),
-            options=_hash(placed(plan.system.config.instances[name]).agreed()),
-            connections=_hash(fed),
-            scenario=_hash([schedule.agreed() for schedule in own.scenario]),
-            timeouts=_hash(own.timeouts),
-            start_values={variable: to_plain(value) for variable, value in own.start_values.items()},
-        )
+        agreed = {
+            "kind": f"{described.kind} {described.fmi_version}".strip(),
+            "step": counted(own.step_points, "point"),
+            "model": _hash((contents.get(name, ""), described.guid)),
+            "variables": _hash([(v.name, v.type, v.shape, v.causality, v.variability) for v in described.variables]),
+            "options": _hash(placed(plan.system.config.instances[name]).agreed()),
+            "connections": _hash(fed),
+            "values over time": _hash([schedule.agreed() for schedule in own.scenario]),
+            "timeouts": _hash(own.timeouts),
+        }
+        given = {variable: to_plain(value) for variable, value in own.start_values.items()}
+        found[name] = SavedInstance(agreed, given | dict(others.get(name, {})))
     return found
 
 
-def differences(saved: Mapping[str, AgreedInstance], plan: Plan, contents: Mapping[str, str]) -> Differences:
+def differences(
+    saved: Mapping[str, SavedInstance], plan: Plan, contents: Mapping[str, str]
+) -> tuple[list[tuple[str, str]], dict[str, dict[str, PlainValue]]]:
     """What differs between the mesh of a state and that of a plan.
 
-    Start values may differ where they can be set between two steps: tunable parameters, and inputs that are free.
+    Returns:
+        Why the state cannot be restored: instances, and what differs, in words. And the start values that differ and
+        can be set between two steps, by instance and variable: of tunable parameters, and of inputs that are free.
     """
-    found, own = Differences([], {}), agreed_of(plan, contents)
-    found.refused.extend((name, "the mesh has no such instance") for name in saved if name not in own)
+    own, set_again = saved_instances(plan, contents), dict[str, dict[str, PlainValue]]()
+    refused = [(name, "the mesh has no such instance") for name in saved if name not in own]
     for name, there in own.items():
-        if (before := saved.get(name)) is None:
-            found.refused.append((name, "the state has no such instance"))
+        if name not in saved:
+            refused.append((name, "the state has no such instance"))
             continue
-        told = [
-            ("kind", before.kind, there.kind),
-            ("step", counted(before.step, "point"), counted(there.step, "point")),
-        ]
-        wrong = [f"its {what} was {was} and is {now}" for what, was, now in told if was != now]
-        if before.model != there.model:
-            wrong.append("its model is another one: the SHA-256 of its files, or its GUID, differs")
-        else:
-            wrong += [
-                f"its {said} differ" for what, said in _HASHES.items() if getattr(before, what) != getattr(there, what)
-            ]
-            wrong += _start_values(plan, name, before, found.set_again)
-        found.refused.extend((name, why) for why in wrong)
-    return found
+        for what, now in there.agreed.items():
+            if (was := saved[name].agreed.get(what, "not known")) != now:
+                refused.append((name, f"{what}: {now} here, and {was} in the state"))
+        for variable, value, why in _start_values(plan, name, saved[name].start_values, there.start_values):
+            if why:
+                refused.append((name, why))
+            else:
+                set_again.setdefault(name, {})[variable] = value
+    return refused, set_again
 
 
 def _start_values(
-    plan: Plan, name: str, saved: AgreedInstance, set_again: dict[str, dict[str, PlainValue]]
-) -> list[str]:
-    """Note the start values that differ and can be set; the others, in words."""
-    own, item, wrong = plan.system.instances[name], plan.nodes[plan.node_of(name)].instance(name), []
-    prescribed = {schedule.variable for schedule in own.scenario}
-    for variable_name in dict.fromkeys([*saved.start_values, *own.start_values]):
-        variable = own.description.variable(variable_name)
-        default = to_plain(variable.start) if variable is not None and variable.start is not None else None
-        given = own.start_values.get(variable_name)
-        was, now = saved.start_values.get(variable_name, default), default if given is None else to_plain(given)
-        if variable is None or repr(was) == repr(now):
+    plan: Plan, name: str, saved: Mapping[str, PlainValue], own: Mapping[str, PlainValue]
+) -> Iterator[tuple[str, PlainValue, str]]:
+    """The variables with another start value: the new value, and why it cannot be set later, empty if it can."""
+    instance, sources = plan.system.instances[name], plan.nodes[plan.node_of(name)].instance(name).sources
+    prescribed = {schedule.variable for schedule in instance.scenario}
+    for variable in instance.description.variables:
+        if variable.name not in own and variable.name not in saved:
             continue
-        refusal = why_not_settable(variable, item.sources.get(variable_name))
-        why = "it has values over time" if variable_name in prescribed else refusal and f"it {refusal}"
-        if why is None and now is not None:
-            set_again.setdefault(name, {})[variable_name] = now
-        else:
-            wrong.append(f"its start value of '{variable_name}' was {shown(was)} and is {shown(now)}, and {why}")
-    return wrong
+        default = to_plain(variable.start) if variable.start is not None else ""
+        was, now = saved.get(variable.name, default), own.get(variable.name, default)
+        if repr(was) == repr(now):
+            continue
+        why = why_not_settable(variable, sources.get(variable.name))
+        why = "has values over time" if variable.name in prescribed else why
+        yield variable.name, now, f"'{variable.name}' is {shown(now)}, was {shown(was)}, and {why}" if why else ""
 
 
 def _hash(value: object) -> str:
-    return hashlib.sha256(msgspec.json.encode(value, order="deterministic")).hexdigest()
+    return hashlib.sha256(msgspec.json.encode(value, order="deterministic")).hexdigest()[:_DIGITS]

@@ -37,7 +37,7 @@ from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_n
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
-from fmu_mesh.system.start_values import forbidden_start_values, resolve_start_values, sized
+from fmu_mesh.system.start_values import check_substitutes, forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
 from fmu_mesh.variables.units import BaseUnit
@@ -301,12 +301,12 @@ def _instances(
         step_points = _step_points(name, config, base, findings)
         if name not in descriptions:
             continue
-        not_finite = loaded.config.not_finite(config)
-        start_values = resolve_start_values(name, config, descriptions[name], findings, finite=not_finite == "stop")
+        not_finite, described = loaded.config.not_finite(config), descriptions[name]
+        start_values = resolve_start_values(name, config, described, findings, finite=not_finite == "stop")
+        check_substitutes(name, config, described, findings, finite=not_finite == "stop")
         config.check(f"instances.{name}", descriptions[name], findings)
-        fixed, own = descriptions[name].fixed_step_size, step_points * base
-        is_fmu = descriptions[name].fmi_version != ""
-        if fixed is not None and not is_fmu and 0.0 < own < math.inf and not steps_between(0.0, own, fixed):
+        fixed, own = None if described.fmi_version else described.fixed_step_size, step_points * base
+        if fixed is not None and 0.0 < own < math.inf and not steps_between(0.0, own, fixed):
             found = f"{own:.12g} s, no whole multiple of the {fixed:.12g} s that one step in '{name}' takes"
             findings.add(f"instances.{name}.step_size", found, "a multiple of it")
         instances[name] = SystemInstance(

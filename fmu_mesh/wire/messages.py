@@ -2,8 +2,8 @@
 
 Every message starts with 24 bytes, little endian: kind (u8), three spare bytes, number of the link (u32), count (u32),
 four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), and in these as JSON: in an ABORT an
-`ErrorReport`, in a RESET a `NewStart`, and for the recorder (`FOR_METADATA`) in a SET a `SetValue`, in a STIFF a
-`Stiff`, in a KEYS values that have come by keys, and for the audit in a REFUSED an `AuditEntry`. LAST says that no more
+`ErrorReport`, in a RESET a `NewStart`, and for the recorder (`FOR_METADATA`) in a SET a `SetValue`, in a NOTED a
+`Noted`, in a KEYS values that have come by keys, and for the audit in a REFUSED an `AuditEntry`. LAST says that no more
 rows of a link come, because the run has ended early. SAVE asks the nodes for their states at a point, and a STATE has
 that of one instance, as MessagePack (`InstanceState`). Every decoder checks sizes before it reads anything, and raises
 only `MessageRefused`.
@@ -45,12 +45,10 @@ __all__ = [
     "SAVE",
     "SET",
     "STATE",
-    "STIFF",
     "InstanceState",
     "NewStart",
     "NodeReport",
     "SetValue",
-    "Stiff",
     "decode_json",
     "decode_state",
     "encode_json",
@@ -73,11 +71,11 @@ ALIVE: Final = 10
 
 RESET: Final = 11
 KEYS: Final = 12
-STIFF: Final = 13
+NOTED: Final = 13
 REFUSED: Final = 14
 SAVE: Final = 15
 STATE: Final = 16
-FOR_METADATA: Final = (SET, KEYS, STIFF)
+FOR_METADATA: Final = (SET, KEYS, NOTED)
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
 MAX_STATE_SIZE: Final = MAX_MESSAGE_SIZE - 2**16
@@ -131,9 +129,10 @@ class InstanceState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     error: ErrorReport | None = None
 
 
-class Stiff(msgspec.Struct, frozen=True):
-    """A model that has turned out to be stiff in the step from a point, and what its solver says."""
+class Noted(msgspec.Struct, frozen=True):
+    """What has turned out in the step from a point, see `LogMessage.noted`, and what was said then."""
 
+    what: str
     instance: str
     point: int
     message: str
@@ -161,21 +160,21 @@ def sealed(secret: str) -> str:
 
 
 def encode_json(
-    kind: int, content: ErrorReport | NewStart | SetValue | AuditEntry | Stiff | Sequence[KeyValue], point: int = 0
+    kind: int, content: ErrorReport | NewStart | SetValue | AuditEntry | Noted | Sequence[KeyValue], point: int = 0
 ) -> bytes:
-    """An ABORT, RESET, SET, REFUSED, STIFF or KEYS message."""
+    """An ABORT, RESET, SET, REFUSED, NOTED or KEYS message."""
     return HEADER.pack(kind, 0, 0, point) + msgspec.json.encode(content)
 
 
-def encode_news(news: SetValue | AuditEntry | Stiff | Sequence[KeyValue]) -> bytes:
-    """What has happened at a node, for the metadata of results and the audit: a SET, REFUSED, STIFF or KEYS message."""
+def encode_news(news: SetValue | AuditEntry | Noted | Sequence[KeyValue]) -> bytes:
+    """What has happened at a node, for the metadata of results and the audit: a SET, REFUSED, NOTED or KEYS message."""
     match news:
         case SetValue():
             return encode_json(SET, news, news.point)
         case AuditEntry():
             return encode_json(REFUSED, news, news.point)
-        case Stiff():
-            return encode_json(STIFF, news, news.point)
+        case Noted():
+            return encode_json(NOTED, news, news.point)
     return encode_json(KEYS, news, news[-1][1])
 
 

@@ -17,6 +17,7 @@ from .runtime import this_host
 
 __all__ = [
     "GOING_ON",
+    "WAITING",
     "AuditEntry",
     "AuditView",
     "Command",
@@ -37,12 +38,12 @@ __all__ = [
     "Way",
 ]
 
-MeshState = Literal["starting", "initializing", "running", "paused", "stopping", "done", "failed"]
+MeshState = Literal["starting", "initializing", "restarting", "running", "paused", "stopping", "done", "failed"]
 
 Way = Literal["ring", "stream", "zenoh"]
 """How rows go between two processes: by memory that both share, by a row stream, or in messages of Zenoh."""
 
-GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "running", "paused"))
+GOING_ON: frozenset[MeshState] = frozenset(("starting", "initializing", "restarting", "running", "paused"))
 """The states of a mesh that has not ended."""
 
 
@@ -178,6 +179,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         timed_out: the inputs without a value for longer than their timeout, and the points of their last values.
         keys: what has come by keys of connections, and gone to them.
         deploy_host: the host of `deploy.hosts` on which it runs; empty for that of `launch`.
+        failed: since when its outputs are held, or have substitutes, and why; empty: it has not failed.
     """
 
     instance: str
@@ -194,6 +196,7 @@ class InstanceStatus(msgspec.Struct, frozen=True):
     timed_out: dict[str, int] = {}
     keys: tuple[KeyStatus, ...] = ()
     deploy_host: str = ""
+    failed: str = ""
 
     def rates_since(self, before: InstanceStatus | None) -> tuple[float, float, float]:
         """Points per second, and the shares of the time in steps and waiting, since an earlier status.
@@ -208,6 +211,10 @@ class InstanceStatus(msgspec.Struct, frozen=True):
         waiting = min(max(0.0, self.wait_time - before.wait_time) / wall_s, 1.0)
         steps_s = self.step_time * self.point - before.step_time * before.point
         return (self.point - before.point) / wall_s, min(max(0.0, steps_s) / wall_s, 1.0 - waiting), waiting
+
+
+WAITING = "warning", "waiting"
+"""Status and category of the line with which a node says once what an instance waits for."""
 
 
 class LogLine(msgspec.Struct, frozen=True):
@@ -341,6 +348,9 @@ class MeshStatus(msgspec.Struct, frozen=True):
         cut: the nodes whose row streams to the master are cut, and for how long in s. Who is cut from another node says
             so in the `activity` of its instances.
         missing: while it starts, the nodes that are not ready.
+        restarts: how often all processes were started again, because one was lost.
+        restarting: while it comes back, such as `attempt 2 of 3, from point 812`.
+        may_restart: whether it starts again if a process is lost.
     """
 
     mesh: str
@@ -357,6 +367,9 @@ class MeshStatus(msgspec.Struct, frozen=True):
     cut: dict[str, float] = {}
     resets: int = 0
     missing: tuple[str, ...] = ()
+    restarts: int = 0
+    restarting: str = ""
+    may_restart: bool = False
 
 
 class RosTopicView(msgspec.Struct, frozen=True):

@@ -110,7 +110,7 @@ CALLS = {
     "check": Call(PlanOptions, lambda mesh, **options: mesh.check(**options).require(), {}),
     "run": Call(RunOptions, fmu_mesh.Mesh.run, SHORT),
     "start": Call(RunOptions, started, SHORT),
-    "open": Call(OpenOptions, opened, {}, {**RIGHT, "keys_from": None}),
+    "open": Call(OpenOptions, opened, {}, {**RIGHT, "keys_from": None, "state": None}),
     "simulate": Call(SimulateOptions, simulated, {**SHORT, "step_size": 0.002}, {**RIGHT, **OF_ONE_FMU}),
     "sweep": Call(SweepOptions, swept, {"stop_time": 0.004, "executor": Nowhere()}),
 }

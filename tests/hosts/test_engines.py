@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.hosts.processes import names_for
+from fmu_mesh.run import preparing
 from fmu_mesh.wire.security.authority import Authority
 from tests.helpers import DEADLINE_S, FAILING, Place, free_port, row_count, wait_until, write_config
 
@@ -192,8 +193,13 @@ def test_nobody_is_let_in_who_was_not_asked_for(tmp_path: Path, capsys: pytest.C
     ],
 )
 def test_what_no_engine_can_start_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], sections: dict[str, Any], found: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    sections: dict[str, Any],
+    found: str,
 ) -> None:
+    monkeypatch.setattr(preparing, "why_no_sandbox", lambda *_: None)  # as where bubblewrap is installed
     config = write_config(tmp_path, **sections)
 
     assert found in refused(capsys, "render", "slurm", config, "--insecure")

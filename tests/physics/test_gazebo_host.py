@@ -15,8 +15,8 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.config.instance_sections import ActuatorConfig
+from fmu_mesh.config.mesh import TimeoutsConfig
 from fmu_mesh.errors import FmuError, InitializationFailed, LoadFailed, StepFailed
-from fmu_mesh.instances.gazebo import gazebo_process
 from fmu_mesh.instances.gazebo.gazebo_classic import GazeboClassicInstance
 from fmu_mesh.instances.gazebo.gazebo_section import GazeboClassicConfig
 from fmu_mesh.instances.gazebo.gazebo_world import load_gazebo_world
@@ -65,8 +65,10 @@ class Driven:
         outputs: Sequence[str],
         config: GazeboClassicConfig | None = None,
         start_values: Mapping[str, float] | None = None,
+        timeouts: TimeoutsConfig = TimeoutsConfig(),  # noqa: B008  a frozen Struct
     ) -> None:
-        self.instance = GazeboClassicInstance(path, "world", config or GazeboClassicConfig(gazebo_classic=""))
+        own = config or GazeboClassicConfig(gazebo_classic="")
+        self.instance = GazeboClassicInstance(path, "world", own, timeouts)
         self.inputs = Ring(Layout.of([(name, "Float64") for name in inputs]), 4)
         self.outputs = Ring(Layout.of([(name, "Float64") for name in outputs]), 4)
         self.instance.enter_initialization(0.0, 1.0, start_values or {})
@@ -429,11 +431,11 @@ def test_without_the_program_the_error_says_what_to_do(monkeypatch: pytest.Monke
     ],
 )
 def test_a_step_that_fails_is_an_error_and_leaves_no_process(
-    kind: str, expected: str, fault: Callable[[str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, expected: str, fault: Callable[[str], None], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(gazebo_process, "_STEP_S", 0.3)
     fault(kind)
-    driven = Driven(write_world(tmp_path, arm()), ["elbow.effort"], ["elbow.position"])
+    timeouts = TimeoutsConfig(step=0.3)
+    driven = Driven(write_world(tmp_path, arm()), ["elbow.effort"], ["elbow.position"], timeouts=timeouts)
     driven.take(1.0)
 
     with pytest.raises(StepFailed) as caught:

@@ -6,7 +6,7 @@ import json
 import random
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,15 +54,14 @@ WORLD = """
 GO_ON = """
 import json, sys
 import fmu_mesh
+from tests.property.test_state_files import rows_from
 
-config, state, names, points = sys.argv[1], sys.argv[2], json.loads(sys.argv[3]), int(sys.argv[4])
-rows = []
-with fmu_mesh.load(config).open(state=state) as system:
-    for _ in range(points + 1):
-        rows.append(repr([system.point, system.time, *(system.get(name) for name in names)]))
-        if _ < points:
-            system.step()
-print(json.dumps(rows))
+config, names, *states = sys.argv[1:]
+mesh, found = fmu_mesh.load(config), []
+for state in states:
+    with mesh.open(state=state) as system:
+        found.append(rows_from(system, json.loads(names)))
+print(json.dumps(found))
 """
 
 
@@ -124,28 +123,63 @@ def everything(tmp_path_factory: pytest.TempPathFactory, event_fmu: Callable[...
 
 def test_a_fresh_process_goes_on_with_the_same_floats(everything: Path, tmp_path: Path) -> None:
     mesh, drawn = fmu_mesh.load(everything), random.Random(7)  # noqa: S311  a test
-    names = outputs_of(mesh)
-    for number in range(2):
-        file, rows = tmp_path / f"{number}.state", []
-        with mesh.open() as system:
-            system.step(drawn.randrange(1, 120))
+    instances = mesh.plan().plan.system.instances
+    names = [f"{n}.{v.name}" for n, own in instances.items() for v in own.description.with_causality("output")]
+    names += ["Gain.u", "fast.k", "pid.target", "noise.level"]
+    files, expected = [str(tmp_path / "1.state"), str(tmp_path / "2.state")], []
+    with mesh.open() as system:
+        for file in files:
+            system.step(drawn.randrange(1, 50))
             system.set("Gain.u", drawn.random())
             system.set("fast.k", drawn.random())
             system.step(drawn.randrange(1, 30))
             system.save(file)
-            for point in range(GONE_ON + 1):
-                rows.append(repr([system.point, system.time, *(system.get(name) for name in names)]))
-                if point < GONE_ON:
-                    system.step()
-        command = [sys.executable, "-c", GO_ON, str(everything), str(file), json.dumps(names), str(GONE_ON)]
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=on_a_busy_machine(DEADLINE_S), check=False
-        )
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout) == rows
+            expected.append(rows_from(system, names))
+
+    command = [sys.executable, "-c", GO_ON, str(everything), json.dumps(names), *files]
+    limit_s = on_a_busy_machine(DEADLINE_S)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s, check=False)
+
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == expected
+    assert len({*expected[0], *expected[1]}) == 2 * (GONE_ON + 1)
 
 
-def outputs_of(mesh: fmu_mesh.Mesh) -> list[str]:
-    instances = mesh.plan().plan.system.instances
-    outputs = [f"{n}.{v.name}" for n, own in instances.items() for v in own.description.with_causality("output")]
-    return [*outputs, "Gain.u", "fast.k", "pid.target", "noise.level"]
+def rows_from(system: fmu_mesh.System, names: Sequence[str]) -> list[str]:
+    """The values of this point and the next ones."""
+    rows = []
+    for steps in (0, *[1] * GONE_ON):
+        if steps:
+            system.step()
+        rows.append(repr([system.point, system.time, *(system.get(name) for name in names)]))
+    return rows
+
+
+@pytest.mark.parametrize("at", [2, 30])
+def test_a_branch_equals_a_run_whose_scenario_changes_the_parameter(
+    at: int, event_fmu: Callable[..., Path], tmp_path: Path
+) -> None:
+    file, names = tmp_path / "a.state", ("oscillator.x", "oscillator.u", "tank.y", "gain.y")
+
+    def mesh(*, changed: bool) -> fmu_mesh.Mesh:
+        made = fmu_mesh.Mesh("branch", step_size=H, stop_time=1.0)
+        made.add("oscillator", fmu=event_fmu("Oscillator", 2), kind="model_exchange")
+        made.add("tank", fmu=FMUS / "Integrator.fmu", step_size=2 * H)
+        made.add("gain", fmu=FMUS / "Gain.fmu")
+        made.connect("oscillator.x", "tank.u")
+        made.connect("tank.y", "gain.u")
+        if changed:
+            values = {"oscillator.u": 0.5, "tank.k": 3.0, "gain.k": 2.0}
+            made.scenario(events=[{"at": at * H, "set": values}])
+        return made
+
+    with mesh(changed=False).open() as system:
+        system.step(at)
+        system.save(file)
+    branch = {"oscillator.u": 0.5, "tank.k": 3.0, "gain.k": 2.0}
+    with mesh(changed=True).open() as whole, mesh(changed=False).open(branch, state=file) as system:
+        whole.step(at)
+        for _ in range(GONE_ON):
+            system.step()
+            whole.step()
+            assert [system.get(name) for name in names] == [whole.get(name) for name in names]

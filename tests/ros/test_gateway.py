@@ -459,3 +459,27 @@ def test_the_gateway_by_hand_says_what_is_missing(place: Place) -> None:
 
     assert gateway.wait() == 2
     assert "there is no section `ros`" in gateway.message
+
+
+def test_an_instance_that_has_failed_is_in_diagnostics(place: Place, ros: Ros, faulty: Path) -> None:
+    config = write_config(
+        place.folder,
+        name="lab",
+        instances={"pump": {"fmu": str(faulty), "start_values": {"fail_at": 0.3}, "on_failure": "hold"}},
+        connections=[],
+        simulation={"step_size": 0.01, "stop_time": None, "real_time_factor": 1.0},
+        ros={"connect": [f"tcp/127.0.0.1:{ros.port}"], "topics": []},
+    )
+    launched = place.start("launch", config)
+    codec = Codec(MessageTypes(), "diagnostic_msgs/msg/DiagnosticArray")
+
+    def failed() -> Any:  # noqa: ANN401  a message
+        told = [codec.decode(data)["status"][0] for data in ros.samples.get("diagnostics", [])]
+        return next((status for status in told if status["level"]), None)
+
+    status = wait_until(failed, "a level that is not OK")
+
+    assert (status["level"], status["name"]) == (2, "lab/pump")
+    assert status["message"].startswith("held since point 30: fmi2DoStep returned error")
+    assert place.run("stop", "lab").wait() == 0
+    assert launched.wait() == 0

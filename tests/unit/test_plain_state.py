@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as of_numpy
 
-from fmu_mesh.instances.python.plain_state import NotPlain, encoded, plain, shared_memory
+from fmu_mesh.instances.python.plain_state import NotPlain, check_memory, encoded, plain
 from tests.helpers import examples
 
 scalars = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.binary())
@@ -110,8 +110,9 @@ def test_other_bytes_are_refused_or_are_plain(data: bytes) -> None:
     encoded(value)
 
 
-def test_arrays_that_share_memory_are_found() -> None:
+def test_arrays_that_share_memory_are_refused() -> None:
     whole, other = np.zeros(6), np.zeros(6)
 
-    assert shared_memory({"whole": whole, "again": whole, "first": other[:3], "last": other[3:]}) is None
-    assert shared_memory({"whole": whole, "other": other, "part": whole[2:]}) == ("whole", "part")
+    check_memory({"whole": whole, "again": whole, "first": other[:3], "last": other[3:]})
+    with pytest.raises(NotPlain, match="has arrays in 'whole' and 'part' that share memory"):
+        check_memory({"whole": whole, "other": other, "part": whole[2:]})

@@ -129,12 +129,12 @@ def test_files_of_a_run_that_has_not_begun_are_only_closed() -> None:
 def test_files_of_another_run_get_their_own_rows_and_notes() -> None:
     first, second = ListFile("first.csv"), ListFile("second.csv")
     record = begun([first], [RecordPlan("first.csv", (("a", "x"),))])
-    record.note_stiff("a", 1, "stiff")
+    record.note_event("stiff", "a", 1, "stiff")
     record.write(0, 5)
     record.close()
 
     record.begin_again([second])
-    record.note_stiff("b", 2, "stiff")
+    record.note_event("stiff", "b", 2, "stiff")
     record.write(0, 3)
     record.close()
 

@@ -75,6 +75,7 @@ def test_every_key_without_an_example_is_a_section(pages: ModuleType) -> None:
             "ros",
             "solver",
             "security",
+            "recovery",
             "runtime",
             "deploy",
         )

@@ -37,7 +37,7 @@ def test_a_node_reads_its_own_part(run: RunPlan, tmp_path: Path, name: str) -> N
     node = read_node(again.write(tmp_path), name)
 
     assert node == again.node(name)
-    assert (node.run, node.plan.restarts, list(node.models)) == ("4711", 2, [name])
+    assert (node.run, node.plan.attempt.number, list(node.models)) == ("4711", 3, [name])
 
 
 def test_values_that_json_does_not_have_stay_what_they_are(run: RunPlan, tmp_path: Path) -> None:

@@ -106,8 +106,8 @@ class Display:
                 self.log(line)
             case OutputLine(process, text) if text:
                 self._print(printable(text.expandtabs()), front=f"{process} | ")
-            case Restarted(error, number, most):
-                again = f"The run starts again from its first point (restart {number} of {most})."
+            case Restarted(error, number, most, point):
+                again = f"The run starts again and goes on from point {point} (restart {number} of {most})."
                 say(str(from_report(error).instead_of_hint(again)))
             case WasReset(outcome, number) if not self._quiet:
                 files = "".join(f"; result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files)

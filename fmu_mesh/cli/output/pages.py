@@ -76,7 +76,7 @@ def mesh_status(status: MeshStatus, ros: Sequence[RosView] = ()) -> list[str]:
     return pairs(
         [
             ("mesh", status.mesh),
-            ("state", status.state),
+            ("state", f"restarting, {status.restarting}" if status.restarting else status.state),
             ("point", progress(status)),
             ("time", seconds(status.time)),
             ("speed", f"{status.points_per_second:.0f} points/s, real-time factor {status.real_time_factor:.3g}"),

@@ -115,7 +115,7 @@ def progress_parts(grid: TimeGrid, status: MeshStatus | None, width: int) -> lis
     else:
         parts.append(f"{status.time:.6g} s")
     if status.state != "running":
-        parts.append(status.state)
+        parts.append(status.restarting or status.state)
     elif grid.stop_time is not None and rate > 0.0:
         parts.append(f"{_duration((grid.last_point - status.point) / rate)} left")
     parts += [f"{rate:,.0f} points/s", f"factor {status.real_time_factor:.3g}"]

@@ -81,7 +81,7 @@ class RunReporter:
     def event(self, event: Event) -> None:
         """Take an event of the run."""
         match event:
-            case Restarted(_, number, _):
+            case Restarted(_, number):
                 self._restarts = number
             case WasReset(_, number):
                 self._resets = number

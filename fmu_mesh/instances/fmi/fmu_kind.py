@@ -22,6 +22,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    OnFailure,
     Process,
     StartValues,
     StepSize,
@@ -107,6 +108,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
     process: Process = None
     interpolation: Annotated[
         Literal["hold", "linear"] | None,

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...config.mesh import TimeoutsConfig
 from ...errors import InitializationFailed, LoadFailed, StepFailed
 from ...rings.ring import Ring
 from ...simtime import TimeGrid, steps_between
@@ -41,7 +42,13 @@ Floats = NDArray[np.float64]
 class GazeboClassicInstance:
     """One world; see `fmu_mesh.instances.contract.Instance` for the call sequence."""
 
-    def __init__(self, path: Path, name: str, config: GazeboClassicConfig) -> None:
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        config: GazeboClassicConfig,
+        timeouts: TimeoutsConfig = TimeoutsConfig(),  # noqa: B008  a frozen Struct
+    ) -> None:
         self.name = name
         self._world = world = load_gazebo_world(path, config)
         self.description = world.description
@@ -51,6 +58,7 @@ class GazeboClassicInstance:
                 world.text,
                 [(joint.scoped, joint.free) for joint in world.joints],
                 [link.scoped for link in world.links],
+                timeouts,
             )
         except GazeboGone as error:
             text = f"Gazebo classic does not run '{path}': {error}"

@@ -47,7 +47,7 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
         """Start Gazebo with the world."""
         from .gazebo_classic import GazeboClassicInstance  # noqa: PLC0415  as above
 
-        return GazeboClassicInstance(opening.path, opening.name, opening.section)
+        return GazeboClassicInstance(opening.path, opening.name, opening.section, opening.timeouts)
 
 
 KIND_OF_GAZEBO_CLASSIC = GazeboClassicKind()  # what the entry point `gazebo_classic` names

@@ -17,13 +17,14 @@ import tempfile
 import time
 from collections.abc import Sequence
 
+from ...config.mesh import TimeoutsConfig
+
 __all__ = ["HOW_TO_GET_IT", "PROGRAM_VARIABLE", "GazeboGone", "GazeboProcess", "check_program", "find_program"]
 
 # Which processes meet here: the node and one Gazebo, over pipes (ADR 21). Gazebo ends when its standard input ends, so
 # it needs no signal when the node is killed. What it writes to standard error goes to a file: nobody reads it during a
-# step, and a full pipe would stop Gazebo. Each answer has a deadline of its own, by `select`. A command has none: if
-# Gazebo hangs while one is written that the pipe cannot take as a whole, the deadline of the step ends the node
-# (`call_guard`).
+# step, and a full pipe would stop Gazebo. Each command and each answer has a deadline of its own, by `select`: that of
+# `timeouts.start` or `timeouts.step`.
 
 PROGRAM_VARIABLE = "FMU_MESH_GAZEBO"
 """The environment variable with the command of the lock-step program, as a shell would split it."""
@@ -32,7 +33,11 @@ HOW_TO_GET_IT = f"Build bridges/gazebo_classic and put it on the path, or its co
 
 PROGRAM = "gazebo_lockstep"
 
-_START_S, _STEP_S, _END_S = 60.0, 60.0, 5.0
+_CHECK_S = 60.0
+"""How long `fmu-mesh check` waits for a Gazebo without a world."""
+
+_END_S = 5.0
+"""How long Gazebo may take to end by itself, and to be gone after it was killed."""
 _TAIL = 2000
 """Length in bytes of the end of Gazebo's output, of which an error quotes the last line."""
 
@@ -57,13 +62,13 @@ def check_program() -> None:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env=_environment(),
-            timeout=_START_S,
+            timeout=_CHECK_S,
             check=False,
         )
     except OSError as error:
         raise GazeboGone(f"'{find_program()[0]}' does not start: {error.strerror}") from error
     except subprocess.TimeoutExpired as error:
-        raise GazeboGone(f"it has not answered for {_START_S:g} s") from error
+        raise GazeboGone(f"it has not answered for {_CHECK_S:g} s") from error
     if not done.stdout.startswith(b"error standard input ended"):
         raise GazeboGone(_ended(done.returncode, done.stderr[-_TAIL:]))
 
@@ -71,12 +76,17 @@ def check_program() -> None:
 class GazeboProcess:
     """One world in one process: ``joints`` are scoped names, and whether they have no limits, ``links`` scoped names.
 
+    ``timeouts`` say how long it may take to start, and for a step.
+
     Call sequence: the constructor, which loads the world and leaves its state, as the protocol has it, in ``state``;
     then `set_step_size` and `step`; at the end, and after any exception, which is `GazeboGone`, `close`.
     """
 
-    def __init__(self, text: bytes, joints: Sequence[tuple[str, bool]], links: Sequence[str]) -> None:
+    def __init__(
+        self, text: bytes, joints: Sequence[tuple[str, bool]], links: Sequence[str], timeouts: TimeoutsConfig
+    ) -> None:
         self._received = b""
+        self._limit_s, self._step_s = timeouts.start, timeouts.step
         with contextlib.ExitStack() as stack:
             self._errors = stack.enter_context(tempfile.TemporaryFile())
             self._process = subprocess.Popen(
@@ -89,11 +99,14 @@ class GazeboProcess:
                 start_new_session=True,  # Ctrl-C reaches the node only, which then closes this process
             )
             stack.callback(self.close)
+            assert self._process.stdin is not None
+            os.set_blocking(self._process.stdin.fileno(), False)
             parts = [f"joint {name} {'free' if free else 'limited'}\n" for name, free in joints]
             parts += [f"link {name}\n" for name in links]
             self._send(b"world %d\n%b%b" % (len(text), text, "".join([*parts, "go\n"]).encode()))
-            self._answer(_START_S)  # the versions of Gazebo and its engine
-            self.state = self._numbers(_START_S)
+            self._answer()  # the versions of Gazebo and its engine
+            self.state = self._numbers()
+            self._limit_s = self._step_s
             stack.pop_all()
 
     def set_step_size(self, step_size: float) -> None:
@@ -104,7 +117,7 @@ class GazeboProcess:
         """Take ``count`` steps with the efforts of all joints and force and moment of all links; then ``state``."""
         numbers = " ".join(map(repr, (*efforts, *wrenches)))
         self._send(f"step {count} {numbers}\n".encode())
-        self.state = self._numbers(_STEP_S)
+        self.state = self._numbers()
 
     def close(self) -> None:
         """End the process. Never raises; may be called twice."""
@@ -115,7 +128,8 @@ class GazeboProcess:
             self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it waits for a disk that does not answer (state D)
+                self._process.wait(_END_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
         self._errors.close()
@@ -125,24 +139,27 @@ class GazeboProcess:
         if pipe is None or pipe.closed:
             raise GazeboGone("it was ended")
         try:
+            end = time.monotonic() + self._limit_s
             while data:
+                if not select.select([], [pipe], [], max(0.0, end - time.monotonic()))[1]:
+                    raise GazeboGone(f"it has not taken a command for {self._limit_s:g} s")
                 data = data[pipe.write(data) or 0 :]
         except OSError as error:
             raise GazeboGone(self._last_words()) from error
 
-    def _numbers(self, deadline_s: float) -> list[float]:
-        return [float(word) for word in self._answer(deadline_s).split()]
+    def _numbers(self) -> list[float]:
+        return [float(word) for word in self._answer().split()]
 
-    def _answer(self, deadline_s: float) -> str:
+    def _answer(self) -> str:
         """The next line."""
         pipe = self._process.stdout
         if pipe is None:
             raise GazeboGone("it was ended")
-        end = time.monotonic() + deadline_s
+        end = time.monotonic() + self._limit_s
         while b"\n" not in self._received:
             readable, _, _ = select.select([pipe], [], [], max(0.0, end - time.monotonic()))
             if not readable:
-                raise GazeboGone(f"it has not answered for {deadline_s:g} s")
+                raise GazeboGone(f"it has not answered for {self._limit_s:g} s")
             data = pipe.read(1 << 16)
             if not data:
                 raise GazeboGone(self._last_words())

@@ -16,6 +16,7 @@ from ...config.instance_sections import (
     Host,
     Inputs,
     NotFinitePolicy,
+    OnFailure,
     PhysicsSection,
     Process,
     StartValues,
@@ -45,4 +46,5 @@ class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_f
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
     process: Process = None

@@ -16,6 +16,7 @@ from ...config.instance_sections import (
     Host,
     Inputs,
     NotFinitePolicy,
+    OnFailure,
     PhysicsSection,
     Process,
     StartValues,
@@ -46,4 +47,5 @@ class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KI
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
     process: Process = None

@@ -22,6 +22,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    OnFailure,
     Process,
     StartValues,
     StepSize,
@@ -45,6 +46,7 @@ class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIN
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
     process: Process = None
 
 

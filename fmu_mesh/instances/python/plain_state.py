@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 
-__all__ = ["NotPlain", "encoded", "plain", "shared_memory"]
+__all__ = ["NotPlain", "check_memory", "encoded", "plain"]
 
 _AS_THEY_ARE: Final = (type(None), bool, float, str, bytes)
 _GENERATORS: Final = ("MT19937", "PCG64", "PCG64DXSM", "Philox", "SFC64")
@@ -53,7 +54,8 @@ def encoded(value: object) -> bytes:  # noqa: C901  one case for each type
         if kind is list:
             return ["l", [tree(one, f"{place}[{n}]") for n, one in enumerate(own)]]
         if kind is dict:
-            return ["d", [[tree(k, f"a key of {place}"), tree(v, _inside(place, k))] for k, v in own.items()]]
+            values = ((k, v, f"{place}[{k!r}]" if place else f"attribute {k!r}") for k, v in own.items())
+            return ["d", [[tree(k, f"a key of {place}"), tree(v, inside)] for k, v, inside in values]]
         if kind is np.ndarray and _is_plain(own.dtype):
             # As it lies in memory: the order of a sum, and so its last digits, may depend on it.
             axes = sorted(range(own.ndim), key=lambda axis: -abs(own.strides[axis]))
@@ -127,19 +129,16 @@ def plain(data: bytes) -> Any:  # noqa: ANN401, C901  what was encoded
         raise ValueError(str(error)) from error
 
 
-def shared_memory(attributes: Mapping[str, object]) -> tuple[str, str] | None:
-    """Two attributes whose arrays have memory in common and are not one array; None if there are none."""
-    owners: dict[int, list[tuple[str, np.ndarray[Any, Any]]]] = {}
-    for name, own in attributes.items():
-        if isinstance(own, np.ndarray):
-            owner: Any = own
-            while isinstance(owner.base, np.ndarray):
-                owner = owner.base
-            for other, array in owners.setdefault(id(owner), []):
-                if array is not own and np.may_share_memory(array, own):
-                    return other, name
-            owners[id(owner)].append((name, own))
-    return None
+def check_memory(attributes: Mapping[str, object]) -> None:
+    """Refuse arrays that are parts of one: each of them would come back with memory of its own.
+
+    Raises:
+        NotPlain: two of these attributes have memory in common, and are not one array.
+    """
+    arrays = [(name, own) for name, own in attributes.items() if isinstance(own, np.ndarray)]
+    for (name, own), (other, array) in combinations(arrays, 2):
+        if own is not array and np.may_share_memory(own, array):
+            raise NotPlain(f"has arrays in '{name}' and '{other}' that share memory")
 
 
 def _is_plain(dtype: np.dtype[Any]) -> bool:
@@ -151,8 +150,3 @@ def _dtype(text: object) -> np.dtype[Any]:
     if not _is_plain(dtype):
         raise ValueError(f"arrays of the type {dtype}")
     return dtype
-
-
-def _inside(place: str, key: object) -> str:
-    """The place of a value in a dict; that of the attribute itself in the outer one."""
-    return f"{place}[{key!r}]" if place else f"attribute '{key}'"

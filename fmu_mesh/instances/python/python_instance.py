@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from ...errors import FmuError, FmuMeshError, InitializationFailed, LoadFailed, StepFailed, TerminationRequested
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
-from ...text import listed
 from ...variables.model_description import Variable
 from ...variables.value_conversion import ValueRefused, to_value
 from ...variables.value_types import DTYPES, INTEGERS, Value, is_float, is_text, nested
@@ -28,7 +27,7 @@ from ..call_guard import lines_shown_of
 from ..contract import LogMessage, Opening
 from .component import Component, declared_variables
 from .importing import ImportedComponent
-from .plain_state import NotPlain, encoded, plain, shared_memory
+from .plain_state import NotPlain, check_memory, encoded, plain
 from .python_section import PythonConfig, class_place_of
 
 __all__ = ["PythonInstance"]
@@ -188,17 +187,12 @@ class PythonInstance:
         assert isinstance(state, _State)
         component = self._live()
         hint = "Leave it out of what `get_state` of the component returns, and make it again in `set_state`."
-        both = shared_memory(vars(component)) if type(component).get_state is Component.get_state else None
-        refused, data = "", b""
         try:
-            data = msgspec.msgpack.encode((encoded(state.own), encoded(state.values)))
-        except NotPlain as error:
-            refused = str(error)
-        if both is not None:
-            refused = f"has arrays in {listed(both)} that share memory"
-        if refused:
-            raise FmuError(f"its state cannot be written: it {refused}", instance=self.name, hint=hint)
-        return data
+            if type(component).get_state is Component.get_state:
+                check_memory(vars(component))
+            return msgspec.msgpack.encode((encoded(state.own), encoded(state.values)))
+        except NotPlain as refused:
+            raise FmuError(f"its state cannot be written: it {refused}", instance=self.name, hint=hint) from refused
 
     def deserialize_state(self, data: bytes) -> object:
         """See `serialize_state`."""

@@ -16,6 +16,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    OnFailure,
     Process,
     StartValues,
     StepSize,
@@ -81,6 +82,7 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
     process: Process = None
 
     names_code = True

@@ -17,6 +17,7 @@ from ...config.instance_sections import (
     Inputs,
     InstanceSection,
     NotFinitePolicy,
+    OnFailure,
     StartValues,
     StepSize,
 )
@@ -106,6 +107,7 @@ class RosSimulatorConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_f
     group: Group = None
     host: Host = None
     not_finite: NotFinitePolicy = None
+    on_failure: OnFailure = "stop"
 
     @property
     def path(self) -> str:

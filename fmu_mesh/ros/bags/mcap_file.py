@@ -60,12 +60,16 @@ class McapFile:
         ConfigurationError: the file cannot be written, or the package `mcap` is not installed.
     """
 
+    rounds = True
+    """Whether a value that is read may be rounded, as by a field of 32 bits."""
+
     def __init__(self, path: Path, recording: Recording, plan: RosPlan) -> None:
         writer = _writer_class()
         self._first, self._every = recording.first, recording.every
         self.path = path
         self.rows = 0
         self.kept = Kept()
+        self._resumed = False
         index = {name: number for number, (name, _) in enumerate(recording.columns)}
         self._own = open_alone(path)
         self._file = BufferedWriter(self._own, _BUFFER_BYTES)
@@ -146,6 +150,15 @@ class McapFile:
                     self._add(topic.channel, stamp, topic.message([field[row] for field in fields], time), point)
             self.rows += 1
 
+    def resume(self, rows: int) -> None:
+        """Go on after the rows that are in the file; see `Resumable`. Its index is made anew at the end."""
+        from .mcap_records import end_of_rows  # noqa: PLC0415 an optional dependency
+
+        self._own.append_after(end_of_rows(self.path))
+        self._file.seek(self._own.size)
+        self.rows, self.kept, self._resumed = rows, Kept(rows, self._own.size), True
+        self._add_note({"set": []})  # what was set before is noted again
+
     def note(self, entry: Mapping[str, Any]) -> None:
         """Add an entry to the metadata."""
         if self.rows:
@@ -164,7 +177,10 @@ class McapFile:
             return
         written, self.rows = self.rows, self.kept.rows
         try:
-            if written:
+            if self._resumed:  # the writer knows nothing of the rows before
+                self._mcap.flush()
+                self.keep_whole_rows(self.path, Kept(written, self._own.size))
+            elif written:
                 self._mcap.flush()  # the number of rows follows the last message
                 self._mcap.add_metadata(ROWS, {"rows": str(written)})
                 self._mcap.finish()

@@ -47,7 +47,7 @@ from ...simtime import ENDLESS, TimeGrid
 from ...variables.value_types import DTYPES, VariableType, is_text
 from .mcap_layout import NOTE, RECORDING, ROWS, RecordedMcap, TopicColumns
 
-__all__ = ["finish_mcap", "read_mcap"]
+__all__ = ["end_of_rows", "finish_mcap", "read_mcap"]
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _HEAD: Final = struct.Struct("<BQ")
@@ -75,6 +75,18 @@ def finish_mcap(path: Path, kept: Kept) -> int:
         rows = max(rows, kept.rows)
         _write_end(file, content, rows, changed)
     return rows
+
+
+def end_of_rows(path: Path) -> int:
+    """Where the end of a finished file begins, in bytes: more rows can be written there.
+
+    Raises:
+        ConfigurationError: it is not the MCAP of a run.
+        OSError: it cannot be read.
+    """
+    with opened(path) as file:
+        content = McapContent(file, path)
+        return max(offset for offset, _, note in content.notes if note.name == ROWS)
 
 
 def read_mcap(path: Path) -> Columns:
@@ -232,7 +244,7 @@ def _channels(content: McapContent) -> list[_ChannelReader]:
                 case Schema():
                     types.define(record.name, record.data.decode())
                     schemas[record.id] = record.name
-                case Channel() if record.topic in topics:
+                case Channel() if record.topic in topics and record.id not in channels:  # who resumes writes it again
                     channels[record.id] = _ChannelReader(topics[record.topic], types, schemas[record.schema_id])
     return list(channels.values())
 

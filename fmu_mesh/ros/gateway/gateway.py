@@ -42,7 +42,7 @@ from ...ros_wire.cdr import CdrError, Codec
 from ...ros_wire.definitions import CLOCK
 from ...ros_wire.profile import Profile, Put, Take
 from ...ros_wire.stamp import to_stamp
-from ...ros_wire.topics import CLOCK_TOPIC, Port, RosPlan, Topic
+from ...ros_wire.topics import CLOCK_TOPIC, DIAGNOSTICS, DIAGNOSTICS_TOPIC, Port, RosPlan, Topic
 from ...simtime import TimeGrid
 from ...text import shown
 from ...wire.client.readings import latecomers
@@ -53,6 +53,7 @@ from ...wire.session import Question, ask, undeclare_all
 from ...wire.values import Stamp, encode_origin, encode_value, encode_values, json_encoding
 from ...wire.views import MeshInfo
 from .deadline import Deadline
+from .diagnostics import Diagnostics
 from .simulation_services import Settling
 
 __all__ = ["Gateway"]
@@ -102,6 +103,7 @@ class Gateway:
         self._watched: dict[str, _WatchedVariable] = {}
         self._complete = self._newest = -1
         self._clock: _ClockPublisher | None = None
+        self._diagnostics: Diagnostics | None = None
 
     def open(self, profiles: Mapping[str, Profile], patience_s: float = 60.0) -> None:
         """Declare all topics; every later sample is carried. The first profile has `/clock`.
@@ -122,6 +124,10 @@ class Gateway:
             first = self._plan.topics[0].profile if self._plan.topics else "ros2dds"
             put = next(iter(profiles.values())).publish(Topic(CLOCK_TOPIC, CLOCK, "out", (), first))
             self._clock = _ClockPublisher(put, self._plan, self._grid)
+        if self._plan.may_fail and all(topic.name != DIAGNOSTICS_TOPIC for topic in self._plan.topics):
+            put = next(iter(profiles.values())).publish(Topic(DIAGNOSTICS_TOPIC, DIAGNOSTICS, "out", ()))
+            self._diagnostics = Diagnostics(put, self._plan, self._keys)
+            self._entities += self._diagnostics.follow(self._mesh, self._post)
         for key, variable in self._watched.items():
             self._take_values(key, variable)
         if not self._watched:  # nothing shows when they are there
@@ -141,6 +147,8 @@ class Gateway:
                 self._report_left_out()
                 if self._clock is not None:
                     self._clock.repeat()
+                if self._diagnostics is not None:
+                    self._diagnostics.publish()
             # A message that waits in the queue has met its deadline.
             waits = min([due - now, *(own.left(now) for own in self.deadlines)]) if self._events.empty() else 0
             try:

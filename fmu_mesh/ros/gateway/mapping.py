@@ -194,6 +194,7 @@ class Resolver:
             node=self._section.node or ros_name(self._config.mesh),
             namespace=self._section.namespace,
             clock_points=max(1, round(1 / (rate * step_size))) if rate and step_size > 0 else None,
+            may_fail=tuple(name for name, own in self._config.instances.items() if own.on_failure != "stop"),
             time_source=next(
                 (
                     self._as_port(instance, variable, "")

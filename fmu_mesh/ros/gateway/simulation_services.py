@@ -65,6 +65,7 @@ _TIME_AND_STATE = 1 | 2
 _STATES: dict[MeshState, SimulationStates] = {
     "starting": SimulationStates.LOADING_WORLD,
     "initializing": SimulationStates.LOADING_WORLD,
+    "restarting": SimulationStates.LOADING_WORLD,
     "running": SimulationStates.PLAYING,
     "paused": SimulationStates.PLAYING,  # in a step
 }

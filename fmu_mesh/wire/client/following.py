@@ -13,26 +13,33 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import Generic, Self, TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
 
 from ...errors import DeadlineExceeded, MessageRefused
+from ...files import decoded_json
 from ..keys import Keys
+from ..views import GOING_ON, MeshStatus
 from .readings import Reading, Target, latecomers, reading_of
 
-__all__ = ["Follower", "ValueStream"]
+__all__ = ["COMES_BACK_S", "Follower", "ValueStream"]
 
 # Threads: those of Zenoh put samples (`take`, `arrived`) and the loss of the token; any other thread takes them.
 # Callbacks are `indirect=False`: a thread for each of 1,000 keys would be too many, so they only store, and never
 # wait; of what is stored there is a limit. The token may be reported as gone before samples that were sent earlier
 # have arrived (another priority, another thread), so the end is only the end after `latecomers`. And Zenoh may report
-# one token twice: a mesh that has ended does not begin again for the same follower (ADR 67 on lost tokens).
+# one token twice: a mesh that has ended does not begin again for the same follower (ADR 67 on lost tokens). A mesh that
+# may start again says so in its status: then a thread waits for its token, and ends the follower if none comes (ADR
+# 87).
 
 Item = TypeVar("Item")
 
 _WAITING_SAMPLES = 1 << 16
+COMES_BACK_S = 30.0
+"""For how long in s a mesh that may start again counts as one that comes back after its master was lost."""
 
 
 class Follower(Generic[Item]):
@@ -47,16 +54,21 @@ class Follower(Generic[Item]):
         self._on_end = on_end
         self._stack = ExitStack()
         self._over = False
+        self._may_restart = False
+        self._back: threading.Event | None = None  # set when the master is there again
         self.arrived: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self.there = threading.Event()
 
     def __enter__(self) -> Self:
         token = self._session.liveliness().declare_subscriber(self._keys.master, self._token_changed, history=True)
         self._stack.callback(token.undeclare)
+        seen = Callback(self._status_came, indirect=False)
+        self._stack.callback(self._session.declare_subscriber(self._keys.mesh_key("status"), seen).undeclare)
         return self
 
     def __exit__(self, *_error: object) -> None:
         self._stack.close()
+        self._stop_waiting()
         self.arrived.put(None)  # another thread may be waiting for more
 
     def subscribe(
@@ -104,10 +116,35 @@ class Follower(Generic[Item]):
     def _token_changed(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and not self._over:
             self.there.set()  # Zenoh may report it twice, for example if other code with this session queries tokens
+            self._stop_waiting()
+        elif self._may_restart and not self._over:
+            if self._back is None or self._back.is_set():
+                self._back = threading.Event()
+                wait = partial(self._wait, self._back)
+                threading.Thread(target=wait, name="waits for a master", daemon=True).start()
         else:
-            self._over = True
-            self.arrived.put(None)
-            self._on_end()
+            self._end()
+
+    def _status_came(self, sample: zenoh.Sample) -> None:
+        with suppress(ValueError):
+            status = decoded_json(sample.payload.to_bytes(), MeshStatus)
+            self._may_restart = status.may_restart and status.state in GOING_ON
+            if not self._may_restart and self._back is not None and not self._back.is_set():
+                self._end()
+
+    def _wait(self, back: threading.Event) -> None:
+        if not back.wait(COMES_BACK_S):
+            self._end()
+
+    def _end(self) -> None:
+        self._over = True
+        self._stop_waiting()
+        self.arrived.put(None)
+        self._on_end()
+
+    def _stop_waiting(self) -> None:
+        if self._back is not None:
+            self._back.set()
 
 
 class ValueStream:

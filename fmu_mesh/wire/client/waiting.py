@@ -27,12 +27,14 @@ _LONGEST_ASK_S = 0.05
 _RANKS: Final[dict[MeshState, int]] = {
     "starting": 0,
     "initializing": 1,
+    "restarting": 1,
     "running": 2,
     "paused": 2,
     "stopping": 3,
     "done": 4,
     "failed": 4,
 }
+_BEFORE: Final = ("starting", "initializing", "restarting")
 _GOES_AND_RESTS: Final = 2
 """Running and paused have the same rank: a mesh can change from each of them to the other."""
 # How long an instance may stay at one point before it has come to the next value of a replay.
@@ -52,7 +54,7 @@ def begun_again(client: MeshClient, command: Command) -> CommandAnswer:
     with client.statuses(_START_S) as statuses:
         answer, last = client.command(command), None
         for last in statuses:
-            if last.resets >= answer.resets and last.state not in ("starting", "initializing"):
+            if last.resets >= answer.resets and last.state not in _BEFORE:
                 if last.state == "failed":
                     raise _ended(last, what)
                 return replace(answer, state=last.state, point=last.point)
@@ -111,7 +113,7 @@ def wait_for_start(client: MeshClient) -> None:
     """
     with client.statuses(_START_S) as statuses:
         for status in statuses:
-            if status.state not in ("starting", "initializing"):
+            if status.state not in _BEFORE:
                 return
 
 

@@ -33,7 +33,7 @@ from ..fmu_values import Verb
 from ..loaded_fmu import FmuFunctions
 from ..native_instance import NativeInstance
 from ..step_options import NO_STATE_OF_CVODE
-from .dormand_prince import NOT_SET, DormandPrinceSolver, HeldRow, RowBytes, Solved
+from .dormand_prince import NOT_SET, AutoSolver, DormandPrinceSolver, HeldRow, RowBytes, Solved
 from .model_calls import Fmi1Calls, Fmi3Calls, InputLine, InputSetter, ModelCalls
 from .model_exchange import EventLoop
 
@@ -112,8 +112,9 @@ class ContinuousInstance(NativeInstance):
         self._linear_columns = np.array(linear, dtype=np.intp)
 
     def serialize_state(self, state: object) -> bytes:
-        """See `KeepsState`; refused where the solver has a history."""
-        if self._event_loop().solver.has_history(of_kind(FmuState, state).kept.solver):
+        """See `KeepsState`; refused where the solver `auto` has turned to CVode."""
+        solver, place = self._event_loop().solver, of_kind(FmuState, state).kept.solver
+        if isinstance(solver, AutoSolver) and solver.goes_on_with_cvode(place):
             raise FmuError(f"its state cannot be written: {NO_STATE_OF_CVODE}", instance=self.name)
         return super().serialize_state(state)
 
@@ -223,7 +224,7 @@ class ContinuousInstance(NativeInstance):
     def _tell_doubt(self) -> None:
         """Tell once that another solver would be better."""
         if (doubt := self._event_loop().solver.doubt()) is not None:
-            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, is_stiff=True))
+            self._log(LogMessage(self.name, "warning", "solver", doubt, self._said.step, noted="stiff"))
 
     def _take_inputs(self, step: int, time: float) -> None:
         """Set the inputs of row ``step``: in event mode if a held one has changed, or a linear one jumps.

@@ -199,8 +199,8 @@ class AutoSolver(DormandPrinceSolver):
         self._cvode: CVodeSolver | None = None
         self._by_cvode = False  # whether CVode has taken the last step, or takes the next one
 
-    def has_history(self, place: tuple[float, ...]) -> bool:
-        """See `Solver.has_history`."""
+    def goes_on_with_cvode(self, place: tuple[float, ...]) -> bool:
+        """Whether CVode takes the steps from a `place` on."""
         return bool(place) and place[3] >= _IS_STIFF
 
     def restart(self) -> None:

@@ -109,10 +109,6 @@ class Solver:
         """What a state keeps besides that of the model."""
         return ()
 
-    def has_history(self, place: tuple[float, ...]) -> bool:
-        """Whether the steps from a `place` on also depend on those before it."""
-        return False
-
     def resume(self, place: tuple[float, ...]) -> None:
         """Continue where `place` was, after `restart`."""
 
@@ -248,10 +244,6 @@ class CVodeSolver(Solver):
         self._linear = api.SUNLinSol_Dense(self._x, self._matrix, self._context)
         self._memory = ctypes.c_void_p(api.CVodeCreate(_CV_BDF, self._context))
         self._maximum = maximum_step_size
-
-    def has_history(self, place: tuple[float, ...]) -> bool:
-        """See `Solver.has_history`."""
-        return True
 
     def restart(self) -> None:
         """See `Solver.restart`."""
