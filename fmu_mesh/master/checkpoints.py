@@ -18,6 +18,7 @@ import zenoh
 from ..errors import CallRefused, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
 from ..system.states import stateless
 from ..wire.messages import InstanceState, decode_state
+from ..wire.refusals import Refusals
 from .master_states import MasterStates
 from .registrations import spoken
 
@@ -33,7 +34,7 @@ class Checkpoints:
     Args:
         mesh: its name.
         withdraw: takes the grant back; see `MasterStates.command`.
-        reply: answers a query with a file, or with the reason why there is none.
+        as_file: a state file with the states of all instances at a point.
     """
 
     def __init__(
@@ -42,25 +43,24 @@ class Checkpoints:
         states: MasterStates,
         withdraw: Callable[[], int],
         as_file: Callable[[int, Mapping[str, bytes]], bytes],
-        reply: Callable[[zenoh.Query, bytes | FmuMeshError], None],
+        refusals: Refusals,
     ) -> None:
         self._mesh = f"mesh '{mesh}'"
         self._states = states
-        self._withdraw, self._as_file, self._reply = withdraw, as_file, reply
+        self._withdraw, self._as_file, self._refusals = withdraw, as_file, refusals
         self._waiting: list[tuple[zenoh.Query, float]] = []
         self._found: dict[str, InstanceState] = {}
         self._stands_since: float | None = None
         self._complete: tuple[int, Mapping[str, bytes]] | None = None
 
     def ask(self, query: zenoh.Query, wait_s: float, now: float) -> None:
-        """Answer a query with the file of a checkpoint, in ``wait_s`` seconds; 0: in the usual time.
-
-        Raises:
-            CallRefused: there can be none.
-        """
-        if self._states.saves_at is None:
-            self._begin()
-        self._waiting.append((query, now + (wait_s or _WAIT_S)))
+        """Answer a query with the file of a checkpoint, or why there is none; in ``wait_s`` seconds, 0: in 5 s."""
+        try:
+            if self._states.saves_at is None:
+                self._begin()
+            self._waiting.append((query, now + (wait_s or _WAIT_S)))
+        except CallRefused as refused:
+            self._answer(refused, [query])
 
     def _begin(self) -> None:
         for name, why in stateless(self._states.plan.system).items():
@@ -129,6 +129,11 @@ class Checkpoints:
             if not self._waiting:
                 self._states.saved()
 
-    def _answer(self, what: bytes | FmuMeshError, queries: Iterable[zenoh.Query]) -> None:
+    def _answer(self, answer: bytes | FmuMeshError, queries: Iterable[zenoh.Query]) -> None:
         for query in queries:
-            self._reply(query, what)
+            with self._refusals.guard(str(query.key_expr)):  # the client may be gone
+                if isinstance(answer, bytes):
+                    query.reply(query.key_expr, answer, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
+                else:
+                    query.reply_err(str(answer))
+                query.drop()

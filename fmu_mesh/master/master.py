@@ -181,7 +181,7 @@ class Master:
         self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
         self._checkpoints = Checkpoints(
-            self._keys.mesh, self._states, self._withdrawn_grant, self._settings.as_file, self._answer_with_file
+            self._keys.mesh, self._states, self._withdrawn_grant, settings.as_file, self._inbox.refusals
         )
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)
@@ -452,10 +452,7 @@ class Master:
             return
         if states.takes_commands and command.command == "checkpoint":
             self.audit.note("commanded", who, key, command.command)
-            try:
-                self._checkpoints.ask(query, command.wait, self._awake())
-            except FmuMeshError as refused:
-                self._answer_with_file(query, refused)
+            self._checkpoints.ask(query, command.wait, self._awake())
         elif states.takes_commands:
             self.audit.note("commanded", who, key, command.command)
             self._checkpoints.give_up(MeshLost(f"another program gave the command '{command.command}' meanwhile"))
@@ -491,14 +488,6 @@ class Master:
         key = query.key_expr
         with self._inbox.refusals.guard(str(key)):  # the client may be gone
             query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
-            query.drop()
-
-    def _answer_with_file(self, query: zenoh.Query, answer: bytes | FmuMeshError) -> None:
-        with self._inbox.refusals.guard(str(query.key_expr)):  # the client may be gone
-            if isinstance(answer, bytes):
-                query.reply(query.key_expr, answer, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
-            else:
-                query.reply_err(str(answer))
             query.drop()
 
     def _withdrawn_grant(self) -> int:

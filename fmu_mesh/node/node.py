@@ -53,18 +53,15 @@ from ..wire.messages import (
     GRANT,
     HEADER,
     INITIAL,
-    MAX_STATE_SIZE,
     PROGRESS,
     RESET,
     SAVE,
-    InstanceState,
     NewStart,
     NodeReport,
     Noted,
     SetValue,
     decode_json,
     encode_news,
-    encode_state,
 )
 from ..wire.router_link import RouterLink
 from ..wire.stream_keeper import StreamKeeper
@@ -73,12 +70,12 @@ from ..wire.views import AuditEntry, LogLine
 from ..wire.ways import Ways
 from .activity import Activity
 from .burst_engine import make_engine
-from .engine import SLICE_S, Engine, Windows
+from .engine import Engine, Windows
 from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
-from .runner_states import load_states, packed_state, set_again
+from .runner_states import load_states, set_again, state_messages
 from .stepping import Runner, connect
 from .stream_ends import streams_of
 from .streams import PRIORITY
@@ -124,7 +121,7 @@ class Node:
         launch: the launcher that started this process; None if it was started manually.
         meeting: where it meets others for row streams; the caller closes it.
         strain: which limit of this process a failure of an FMU may come from, as a sentence; None: none.
-        begins_with: the states of its instances at the first point; None: it is that after Initialization Mode.
+        begins_with: the states of its instances at the first point, if it is not that after Initialization Mode.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -153,13 +150,12 @@ class Node:
         self._open_instance = open_instance
         self._make_engine, self._strain = engine, strain
         self._finish_at: float = math.inf
-        self._token_went = False
-        self.failure_is_known = False
+        self._token_went = self.failure_is_known = False
         self.new_start: NewStart | None = None
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
         self._progress_sent = self._lazy_covered = plan.grid.first_point - 1
-        self._begins_with, self._saves_at = begins_with, -1
+        self._begins_with, self._saves_at = begins_with or BeginsWith(), -1
         self._router = router or RouterLink(session)
         self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
@@ -315,27 +311,17 @@ class Node:
         self._activity.enter("initializing")
         plan = self._plan
         self._initialization.run(self._runners.values())
-        if self._begins_with is not None:
-            load_states(self._begins_with, self._runners)
-            for runner in self._runners.values():
-                for link in runner.out_links:
-                    link.begin_at(runner.step)
+        load_states(self._begins_with, self._runners)
         units = [[self._runners[name] for name in names] for names in plan.units]
         self._engine = engine = self._make_engine(
-            plan,
-            units,
-            self._memory,
-            self._windows(),
-            spins=not ONE_CORE,
-            streams=self._streams,
+            plan, units, self._memory, self._windows(), spins=not ONE_CORE, streams=self._streams
         )
         self._inbox.move_to(self._memory, engine)
         self._activity.steps_with(engine, self._ways, self._keeper)
         for runner in self._runners.values():
             runner.begin()
             runner.flush()
-        if self._begins_with is not None:
-            set_again(self._begins_with, self._runners)
+        set_again(self._begins_with, self._runners)
         for news in self._journal.entries():  # it belongs to the metadata of this attempt, too
             self._put_set(encode_news(news))
         self.server.started()
@@ -401,8 +387,9 @@ class Node:
         left_s = 0.0
         while not self.finished:
             try:
-                wait_s = self._wait_s(left_s if eager else _LONGEST_SLEEP_S)
-                stepped = engine.run(wait_s, eager=eager, quiet=quiet and self.server.is_unfollowed)
+                has_more, saves = self._inbox.is_direct or self._inbox.has_posted, self._saves_at >= 0
+                wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
+                stepped = engine.run(wait_s, eager=eager or saves, quiet=quiet and self.server.is_unfollowed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)
@@ -442,12 +429,6 @@ class Node:
             member.flush()
         self._memory.progress[self._plan.node].raise_to(engine.covered + 1)
 
-    def _wait_s(self, longest_s: float) -> float:
-        """For how long in s the engine may wait: not where a message is to be read, or a checkpoint is near."""
-        if self._inbox.is_direct or self._inbox.has_posted:
-            return 0.0
-        return longest_s if self._saves_at < 0 else min(longest_s, SLICE_S)
-
     def _send_rows(self, engine: Engine) -> float:
         """Send the rows that a step may wait for; return how long in s this node may wait until the next call.
 
@@ -460,7 +441,7 @@ class Node:
             self._lazy_sent, self._lazy_covered = now, covered
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
-        self._send_states()
+        self._send_states(self._saves_at)
         return _LONGEST_SLEEP_S if lazy else self._lazy_sent + _LAZY_S - now
 
     def _look_at_router(self) -> None:
@@ -505,8 +486,7 @@ class Node:
         elif kind == FINISH:
             self._finish_at = point
         elif kind == SAVE:
-            self._saves_at = point
-            self._send_states()
+            self._send_states(point)
         elif kind == ABORT:
             raise _Aborted(from_report(decode_json(data[HEADER.size :], ErrorReport)))
         elif kind == RESET:
@@ -530,24 +510,12 @@ class Node:
             self._progress_told_at = now
             self._put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
 
-    def _send_states(self) -> None:
-        """If all instances are at the point of a checkpoint, beyond which the master grants nothing: send their states.
-
-        The master cannot go on without an answer; so it gets one also where an instance has no state to send.
-        """
-        at, points = self._saves_at, [runner.point for runner in self._runners.values()]
-        if at < 0 or min(points) < at:
-            return
-        self._saves_at = -1
-        for runner in self._runners.values() if max(points) == at else ():  # else it was given up
-            try:
-                own = InstanceState(runner.name, packed_state(runner))
-            except FmuError as error:
-                own = InstanceState(runner.name, error=self._located(error).report())
-            if (size := len(own.state)) > MAX_STATE_SIZE:
-                large = FmuError(f"its state takes {size} bytes; the limit is {MAX_STATE_SIZE}", instance=runner.name)
-                own = InstanceState(runner.name, error=large.report())
-            self._put_progress(encode_state(own, at))
+    def _send_states(self, at: int) -> None:
+        """At the point of a checkpoint, beyond which the master grants nothing: send the states of all instances."""
+        messages = state_messages(self._runners, at) if at >= 0 else None
+        self._saves_at = at if messages is None else -1
+        for message in messages or ():
+            self._put_progress(message)
 
     # --- the end
 
@@ -598,23 +566,11 @@ class Node:
             return not self._membership.lost_link
         self.server.say_everything()
         try:
-            self._tell_end(self._as_others_see(error), self._patience_s())
+            self._tell_end(self._activity.as_others_see(error), self._patience_s())
         except FmuMeshError as unreachable:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
             return self._has_no_master()
         return True
-
-    def _as_others_see(self, error: FmuMeshError) -> FmuMeshError:
-        """The error as other processes see it: if a signal ends this process, for them this node is lost."""
-        if not isinstance(error, Interrupted):
-            return error
-        point = min((runner.point for runner in self._runners.values()), default=0)
-        return MeshLost(
-            f"node '{self._plan.node}' was lost: its process was told to end ({error.message})",
-            instance=", ".join(item.name for item in self._plan.instances),
-            point=point,
-            time=self._plan.grid.time(point),
-        )
 
     def _patience_s(self) -> float:
         return min(self._plan.timeouts.stop, math.inf if self._membership.is_admitted else _NO_MASTER_S)

@@ -12,10 +12,11 @@ from ..instances.contract import KeepsState
 from ..rings.packed_member import PackedMember, columns_of, put_columns
 from ..system.states import BeginsWith
 from ..variables.value_conversion import to_value
+from ..wire.messages import MAX_STATE_SIZE, InstanceState, encode_state
 from .inputs import TimedInputs, set_input
 from .stepping import Runner
 
-__all__ = ["load_states", "packed_state", "set_again"]
+__all__ = ["load_states", "set_again", "state_messages"]
 
 
 def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
@@ -41,7 +42,28 @@ def set_again(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
             set_input(runners[name], own, to_value(value, variables[own]), None)
 
 
-def packed_state(runner: Runner) -> bytes:
+def state_messages(runners: Mapping[str, Runner], at: int) -> list[bytes] | None:
+    """The states of all runners at the point of a checkpoint, as messages; None before that point.
+
+    The master cannot go on without an answer: where an instance has no state to send, it gets the reason. After that
+    point the checkpoint was given up, and there are no messages.
+    """
+    points = [runner.point for runner in runners.values()]
+    if min(points) < at:
+        return None
+    messages = []
+    for name, runner in runners.items() if max(points) == at else ():
+        try:
+            own = InstanceState(name, _packed(runner))
+            if (size := len(own.state)) > MAX_STATE_SIZE:
+                raise FmuError(f"its state takes {size} bytes; the limit is {MAX_STATE_SIZE}", instance=name)  # noqa: TRY301  as from an FMU
+        except FmuError as error:
+            own = InstanceState(name, error=error.at(at, runner.grid.time(at)).report())
+        messages.append(encode_state(own, at))
+    return messages
+
+
+def _packed(runner: Runner) -> bytes:
     """The state of a runner between two steps, at a point at which all instances have an own one.
 
     So its newest row is the only one that a step may still read.
@@ -71,6 +93,8 @@ def _load(runner: Runner, data: bytes) -> None:
     if (at := own.step * runner.plan.step_points) != grid.first_point:
         raise FmuError(f"its state is of point {at}, and the run begins at point {grid.first_point}", instance=name)
     runner.table.note(step=own.step)
+    for link in runner.out_links:
+        link.begin_at(own.step)
     runner.bind()
     if own.over_time and not isinstance(runner.instance, TimedInputs):
         timed = TimedInputs(runner.instance, "hold")

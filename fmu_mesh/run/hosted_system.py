@@ -59,6 +59,7 @@ class HostedSystem:
             between steps: several times a second, and not once in each run.
         places: where the rings are in memory, if not as in the plan.
         room: memory of zeros for them; None: memory of its own.
+        begins_with: the states of the first point, if it is not that after Initialization Mode; then it has one run.
 
     Attributes:
         plan: the plan.
@@ -76,6 +77,7 @@ class HostedSystem:
         alone: bool,
         places: tuple[MemoryMap, Mapping[str, RingPlace]] | None = None,
         room: memoryview | None = None,
+        begins_with: BeginsWith | None = None,
     ) -> None:
         self.plan = plan
         self.node = node = plan.nodes[IN_ONE_NODE]
@@ -89,7 +91,8 @@ class HostedSystem:
         self._engine: Engine | None = None
         self._alone = alone
         self._state: ProcessState | None = None
-        self._begins_again, self._names = True, ", ".join(plan.order)
+        self._begins_with = begins_with or BeginsWith()
+        self._begins_again, self._names = begins_with is None, ", ".join(plan.order)
         self._initialization = Initialization(node)
 
     def open(self) -> None:
@@ -116,24 +119,18 @@ class HostedSystem:
             self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
         connect(node, self.runners, self.memory, self.memory)
 
-    def begin(
-        self, start_values: Mapping[str, Mapping[str, PlainValue]], begins_with: BeginsWith | None = None
-    ) -> Engine:
+    def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:
         """Initialization Mode, as `Node` does it; then the outputs are those of the first point.
 
         Args:
             start_values: by instance and variable, those that are not as in the plan.
-            begins_with: the states of the first point; None: it is that after Initialization Mode. A system with them
-                has one run only.
 
         Raises:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
         self._initialization.run(self.runners.values(), start_values, again=engine is not None)
-        if begins_with is not None:
-            load_states(begins_with, self.runners)
-            self._begins_again = False
+        load_states(self._begins_with, self.runners)
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
@@ -141,8 +138,7 @@ class HostedSystem:
             engine.begin_again(self._state)
         for runner in self.runners.values():
             runner.begin()
-        if begins_with is not None:
-            set_again(begins_with, self.runners)
+        set_again(self._begins_with, self.runners)
         self.memory.grant.raise_to(self.plan.grid.last_point)
         return engine
 

@@ -274,7 +274,7 @@ class LocalMember:
         own = PackedMember.decoded(data, self.plan.name)
         if own.waits:
             text = f"values of {listed([*own.waits])} wait for their time, which a program that steps cannot have"
-            raise FmuError(text, instance=self.plan.name, hint="Go on in a run: `state=...` of `run`, or `--from`.")
+            raise FmuError(text, instance=self.plan.name, hint="A run can begin with it: `run(state=...)`.")
         outputs, inputs = (tuple(part.copy() for part in ring.parts) for ring in (self._outputs, self._inputs))
         newest = self._newest(own.step)
         others = put_columns(self._outputs, outputs, newest, own.outputs, self.plan.name)

@@ -8,7 +8,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -43,6 +43,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 from .sandbox import why_no_sandbox
+from .state_file import StateFile
 
 __all__ = ["KnownModels", "OtherStartValues", "check_reset", "planned", "planned_reset", "without_keys"]
 
@@ -203,11 +204,7 @@ def planned(
         connect=tuple(options.connect or ()),
     )
     obstacles.raise_any(run)
-    if options.state is not None:
-        from .state_file import StateFile  # noqa: PLC0415  most runs begin at point 0
-
-        return StateFile.read(Path(options.state)).begin(run)
-    return run
+    return StateFile.read(Path(options.state)).begin(run) if options.state is not None else run
 
 
 def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:
@@ -331,9 +328,6 @@ def planned_reset(run: RunPlan, start_values: Mapping[str, PlainValue], resets: 
     Raises:
         ConfigurationError: a start value is wrong, or more would change than values; carries all findings.
     """
-    if run.begins_with is not None:
-        text = f"mesh '{run.mesh}' cannot be reset, because it has begun with a state"
-        raise ConfigurationError(text, hint="Start it again.")
     plain = PlainConfig(configuration_of(run.loaded), run.loaded.file)
     again = planned(plain, PlanOptions(start_values=dict(start_values), allow_code=True), known=known)
     check_reset(run, again)
@@ -346,20 +340,17 @@ def check_reset(run: RunPlan, again: RunPlan) -> None:
     Raises:
         ConfigurationError: more would change than values.
     """
-    if _without_start_values(again) != _without_start_values(run):
-        text = f"mesh '{run.mesh}' cannot be reset: it would have other sizes, or a file of it has changed"
+    if run.begins_with is not None or _without_start_values(again) != _without_start_values(run):
+        why = "it would have other sizes, or a file of it has changed"
+        text = f"mesh '{run.mesh}' cannot be reset: {why if run.begins_with is None else 'it has begun with a state'}"
         raise ConfigurationError(text, hint="Start it again.")
 
 
 def _without_start_values(run: RunPlan) -> object:
     """What must stay as it is in a reset, because processes and their links have it."""
+    plain: dict[str, Any] = {"start_values": {}, "timeouts": ()}
     return run.contents, {
-        name: replace(
-            node,
-            digest="",
-            records=(),
-            instances=tuple(replace(own, start_values={}, timeouts=()) for own in node.instances),
-        )
+        name: replace(node, digest="", records=(), instances=tuple(replace(own, **plain) for own in node.instances))
         for name, node in run.plan.nodes.items()
     }
 

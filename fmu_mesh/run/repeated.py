@@ -37,7 +37,6 @@ from ..node.engine import Engine
 from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..system.plan import Plan
-from ..system.states import BeginsWith
 from ..variables.value_types import PlainValue
 from .hosted_system import HostedSystem, in_one_node
 from .local_system import opening_of
@@ -144,7 +143,7 @@ class RepeatedRuns:
             with closing(writer):
                 system = system or self._new_system(*made_for)
                 self._around.stopping.clear()
-                self._run = current = _Run(system, writer, self._around, self._slices, run.begins_with)
+                self._run = current = _Run(system, writer, self._around, self._slices)
                 if self._stop is not None:
                     current.interrupt(self._stop)
                 return current.run(start_values, watch, self._threads)
@@ -221,7 +220,7 @@ class RepeatedRuns:
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
         self._slices, self._made_for = _Slices(), (run, files, watch)
-        self._system = HostedSystem(plan, watch, opened, self._log, alone=self._alone)
+        self._system = HostedSystem(plan, watch, opened, self._log, alone=self._alone, begins_with=run.begins_with)
         return self._system
 
     def _log(self, message: LogMessage) -> None:
@@ -291,16 +290,8 @@ class _Run:
         writer: writes its rows.
     """
 
-    def __init__(
-        self,
-        system: HostedSystem,
-        writer: RowWriter,
-        surroundings: _Surroundings,
-        slices: _Slices,
-        begins_with: BeginsWith | None,
-    ) -> None:
+    def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings, slices: _Slices) -> None:
         self.point = system.plan.grid.first_point
-        self._begins_with = begins_with
         self._slices = slices
         self._system, self._plan = system, system.plan
         self._last = self._plan.grid.last_point
@@ -346,7 +337,7 @@ class _Run:
     def _write_steps(self, start_values: Mapping[str, Mapping[str, PlainValue]], watch: CallWatch) -> None:
         """From Initialization Mode to the last point; then the files are closed, and the instances are not."""
         try:
-            self._engine = engine = self._system.begin(start_values, self._begins_with)
+            self._engine = engine = self._system.begin(start_values)
             self.writer.begin(self._plan, self._system.runners)
             started = time.perf_counter()
             try:

@@ -228,11 +228,7 @@ class MeshClient:
         return _understood(self._commanded(command, timeout_s), CommandAnswer, self._who)
 
     def checkpoint(self, timeout_s: float | None = None) -> bytes:
-        """The states of all instances at one point, as the content of a state file.
-
-        Raises:
-            ConfigurationError: an instance has no state, or there is no checkpoint for another reason, or not in time.
-        """
+        """The states of all instances at one point, as the content of a state file; `ConfigurationError` if not."""
         timeout_s = timeout_s if timeout_s is not None else self._timeout_s
         command = Command("checkpoint", wait=max(timeout_s - _ANSWER_S, timeout_s / 2))
         return self._commanded(command, timeout_s).payload.to_bytes()
