@@ -67,7 +67,15 @@ class Checkpoints:
             raise CallRefused(f"its state cannot be written to a file: {why}.", instance=name)
         self._found.clear()
         self._stands_since = None
-        self._states.save(self._withdraw())
+        states, every = (
+            self._states,
+            math.lcm(*(own.step_points for own in self._states.plan.system.instances.values())),
+        )
+        if not states.save(self._withdraw(), every):
+            last, hold = states.granting.last_point, states.hold
+            where = f"{self._mesh} {f'pauses at point {hold}' if hold is not None else f'ends at point {last}'}"
+            text = f"{where}, and all instances have a point of their own only at every {every}th point"
+            raise CallRefused(text, hint=f"`step` it by {-hold % every}." if hold is not None else None)
 
     def take(self, node: str, point: int, data: bytes) -> None:
         """A node has sent the state of an instance.

@@ -28,7 +28,6 @@ class Granting:
     """The grant of a run, and the progress of its nodes.
 
     Attributes:
-        first_point: the first point of the run.
         progress: the last point of which each node knows all outputs, by name; the one before the first: Initialization
             Mode is not over.
         slowest: the last point that all nodes know.
@@ -41,7 +40,7 @@ class Granting:
     """
 
     def __init__(self, plan: Plan) -> None:
-        self.first_point = first = plan.grid.first_point
+        first = plan.grid.first_point
         self.progress = dict.fromkeys(plan.nodes, first - 1)
         self.slowest = first - 1
         self.grant = first
@@ -76,6 +75,11 @@ class Granting:
     def measured(self, round_trip_s: float) -> None:
         """The longest round trip to a node by a row stream takes so long, in s."""
         self._round_trip_s = round_trip_s if not self.messages else None  # that of messages is not known
+
+    @property
+    def first_point(self) -> int:
+        """The first point of the run."""
+        return self._plan.grid.first_point
 
     @property
     def has_begun(self) -> bool:

@@ -73,19 +73,10 @@ from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding, who_sent
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from ..wire.ways import Ways
+from .actions import Action, AnswerAll, Commanded, EndAll, FollowClock, RaiseGrant, RaiseSent, SendToAll
 from .audit import Audit
 from .checkpoints import Checkpoints
-from .master_states import (
-    Action,
-    AnswerAll,
-    Commanded,
-    EndAll,
-    FollowClock,
-    MasterStates,
-    RaiseGrant,
-    RaiseSent,
-    SendToAll,
-)
+from .master_states import MasterStates
 from .master_streams import MasterStreams
 from .members import Followers, Members
 from .mesh_server import STATUS_S, Events, MasterServer, MasterSettings

@@ -41,7 +41,6 @@ from msgspec.structs import replace
 
 from ..config.deadlines import Deadlines
 from ..errors import (
-    CallRefused,
     DeadlineExceeded,
     FmuMeshError,
     Interrupted,
@@ -57,76 +56,17 @@ from ..system.plan import RECORDER, Plan
 from ..wire.host_processes import OR_CUT
 from ..wire.messages import FINISH, GRANT, SAVE, NodeReport
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
-from ..wire.ways import Ways
+from .actions import Action, AnswerAll, Commanded, EndAll, FollowClock, RaiseGrant, RaiseSent, SendToAll
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = [
-    "Action",
-    "AnswerAll",
-    "Commanded",
-    "EndAll",
-    "FollowClock",
-    "MasterStates",
-    "RaiseGrant",
-    "RaiseSent",
-    "SendToAll",
-]
-
-
-class AnswerAll(msgspec.Struct, frozen=True):
-    """All nodes are ready and wait for an answer: how rows go."""
-
-    ways: Ways
-
-
-class FollowClock(msgspec.Struct, frozen=True):
-    """The point is due now by the wall clock, which does not limit the grant unless the run is ``paced``."""
-
-    point: int
-    paced: bool = True
-
-
-class RaiseGrant(msgspec.Struct, frozen=True):
-    """Write the grant into the memory of the host."""
-
-    point: int
-
-
-class RaiseSent(msgspec.Struct, frozen=True):
-    """Write into the memory of the host what the row streams grant to others."""
-
-    point: int
-
-
-class SendToAll(msgspec.Struct, frozen=True):
-    """Send a message to all nodes."""
-
-    kind: int
-    point: int
-
-
-class EndAll(msgspec.Struct, frozen=True):
-    """Tell all nodes why the run has failed."""
-
-    error: FmuMeshError
-
-
-Action = AnswerAll | FollowClock | RaiseGrant | RaiseSent | SendToAll | EndAll
-
-
-class Commanded(msgspec.Struct, frozen=True):
-    """What a command has changed, for the journal: where the mesh pauses, or the point at which it is stopped."""
-
-    command: str
-    hold: int | None
-    stopped_at: int | None = None
+__all__ = ["MasterStates"]
 
 
 class _Course(msgspec.Struct, frozen=True):
     """Where the mesh pauses; after a restart, the last point that was seen before, and where it was stopped.
 
-    And the point at which all nodes save their states: beyond it, nothing is granted until then.
+    And where all nodes save their states.
     """
 
     hold: int | None
@@ -312,26 +252,18 @@ class MasterStates:
         where = (granting.slowest, self.hold) if command.command != "reset" else (0, None if before is None else 0)
         return CommandAnswer(command.command, self.state, *where)
 
-    def save(self, claimed: int) -> int:
-        """Hold all nodes at a point at which all instances have an own one, until `saved`; returns that point.
+    def save(self, claimed: int, every: int) -> bool:
+        """Hold all nodes at the next multiple of ``every`` points, until `saved`; False if they do not come there.
 
         Only while it `takes_commands`. ``claimed`` is as in `command`.
-
-        Raises:
-            CallRefused: the mesh pauses, or ends, before the next such point.
         """
-        granting, every = self.granting, math.lcm(*(own.step_points for own in self.plan.system.instances.values()))
-        at = -(-granting.halt(claimed) // every) * every
-        self._actions.append(RaiseGrant(granting.grant))
+        at = -(-self.granting.halt(claimed) // every) * every
         self._moved_at = self._slowest_moved_at = None
-        if at > self.wanted:
-            rests = f"pauses at point {self.hold}" if self.hold is not None else f"ends at point {granting.last_point}"
-            text = f"the mesh {rests}, and all instances are at a point of their own only at every {every}th point"
-            hint = f"`step` it by {at - self.hold}." if self.hold is not None else None
-            raise CallRefused(text, hint=hint)
-        self._course = replace(self._course, saves_at=at)
-        self._actions.append(SendToAll(SAVE, at))
-        return at
+        self._actions.append(RaiseGrant(self.granting.grant))
+        if at <= self.wanted:
+            self._course = replace(self._course, saves_at=at)
+            self._actions.append(SendToAll(SAVE, at))
+        return at <= self.wanted
 
     def saved(self) -> None:
         """The nodes have saved their states, or need not: they go on."""
