@@ -287,6 +287,14 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
         int, Meta(ge=1, le=1000, description="How often at most; then the run ends as with stop.")
     ] = 3
 
+    checkpoint_s: Annotated[
+        Annotated[float, Meta(gt=0.0)] | None,
+        Meta(
+            description="Time between two checkpoints in s: a restart begins with the newest one. null: with the first "
+            "point."
+        ),
+    ] = None
+
     @property
     def restarts(self) -> int:
         """How often the run may start again."""

@@ -10,22 +10,38 @@ Owns the states that have come so far and the commands that wait for them. `Mast
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 
 import zenoh
 
-from ..errors import CallRefused, DeadlineExceeded, FmuMeshError, MeshLost, MessageRefused, from_report
+from ..errors import (
+    CallRefused,
+    ConfigurationError,
+    DeadlineExceeded,
+    FmuMeshError,
+    MeshLost,
+    MessageRefused,
+    from_report,
+)
 from ..system.states import stateless
 from ..wire.messages import InstanceState, decode_state
 from ..wire.refusals import Refusals
 from .master_states import MasterStates
+from .mesh_server import MasterSettings
 from .registrations import spoken
 
 __all__ = ["Checkpoints"]
 
+log = logging.getLogger(__name__)
+
 _WAIT_S = 5.0
 """How long a command waits that does not say how long."""
+
+_LEAST_TIMES = 50
+"""So many times as long as a checkpoint has taken, there is no other one: they cost 2 % of the time at most."""
 
 
 class Checkpoints:
@@ -34,7 +50,6 @@ class Checkpoints:
     Args:
         mesh: its name.
         withdraw: takes the grant back; see `MasterStates.command`.
-        as_file: a state file with the states of all instances at a point.
     """
 
     def __init__(
@@ -42,12 +57,16 @@ class Checkpoints:
         mesh: str,
         states: MasterStates,
         withdraw: Callable[[], int],
-        as_file: Callable[[int, Mapping[str, bytes]], bytes],
+        settings: MasterSettings,
         refusals: Refusals,
     ) -> None:
         self._mesh = f"mesh '{mesh}'"
         self._states = states
-        self._withdraw, self._as_file, self._refusals = withdraw, as_file, refusals
+        self._withdraw, self._settings, self._refusals = withdraw, settings, refusals
+        recovery, attempt = states.plan.system.config.recovery, settings.attempt
+        self._every_s = recovery.checkpoint_s if attempt.number < attempt.most else None
+        self._due_at = self._every_s if self._every_s is not None else math.inf
+        self._now = 0.0
         self._waiting: list[tuple[zenoh.Query, float]] = []
         self._found: dict[str, InstanceState] = {}
         self._stands_since: float | None = None
@@ -66,11 +85,8 @@ class Checkpoints:
         for name, why in stateless(self._states.plan.system).items():
             raise CallRefused(f"its state cannot be written to a file: {why}.", instance=name)
         self._found.clear()
-        self._stands_since = None
-        states, every = (
-            self._states,
-            math.lcm(*(own.step_points for own in self._states.plan.system.instances.values())),
-        )
+        self._stands_since, states = None, self._states
+        every = math.lcm(*(own.step_points for own in states.plan.system.instances.values()))
         if not states.save(self._withdraw(), every):
             last, hold = states.granting.last_point, states.hold
             where = f"{self._mesh} {f'pauses at point {hold}' if hold is not None else f'ends at point {last}'}"
@@ -91,8 +107,12 @@ class Checkpoints:
 
     def settle(self, now: float) -> None:
         """Go on if all states are there, or if there will be no checkpoint."""
-        states, at, found = self._states, self._states.saves_at, self._found
+        states, at, found, self._now = self._states, self._states.saves_at, self._found, now
         if at is None:
+            if now >= self._due_at and states.state == "running" and not states.is_replaying:
+                self._due_at = math.inf  # without a state of each instance, there will be none
+                with suppress(CallRefused):
+                    self._begin()
             return
         if self._stands_since is None and states.granting.reached >= at:
             self._stands_since = now
@@ -105,6 +125,9 @@ class Checkpoints:
             self.give_up(from_report(failed[0]))
         elif not missing:
             states.saved()
+            if self._every_s is not None:
+                took_s = now - (self._stands_since if self._stands_since is not None else now)
+                self._due_at = now + max(self._every_s, _LEAST_TIMES * took_s)
             self._complete = at, {name: found[name].state for name in states.plan.system.instances}
         elif now - (self._stands_since if self._stands_since is not None else math.inf) > limit_s:
             nodes = sorted({states.plan.node_of(name) for name in missing})
@@ -116,14 +139,26 @@ class Checkpoints:
     def answer(self) -> None:
         """When the nodes go on: answer those who have waited for a checkpoint that is complete."""
         if self._complete is not None:
-            data, self._complete = self._as_file(*self._complete), None
+            point, states = self._complete
+            data, self._complete = self._settings.as_file(point, states), None
+            if self._every_s is not None:
+                self._keep(point, data)
             self._answer(data, [query for query, _ in self._waiting])
             self._waiting.clear()
+
+    def _keep(self, point: int, data: bytes) -> None:
+        try:
+            self._settings.keep(point, data)
+        except ConfigurationError as error:  # such as on a full disk; an older one may be there
+            self._due_at = math.inf
+            log.warning("there are no more checkpoints: %s", error)
 
     def give_up(self, error: FmuMeshError) -> None:
         """There is no checkpoint, and why; nothing happens if none is under way."""
         if self._states.saves_at is not None:
             self._states.saved()
+            if self._every_s is not None:
+                self._due_at = self._now + _LEAST_TIMES * self._every_s
         self._answer(error, [query for query, _ in self._waiting])
         self._waiting.clear()
 
@@ -134,7 +169,7 @@ class Checkpoints:
             text = f"{where}, where it saves its states"
             self._answer(DeadlineExceeded(f"{text}.", hint="A larger `timeout=...` waits longer."), late)
             self._waiting = [own for own in self._waiting if own[0] not in late]
-            if not self._waiting:
+            if not self._waiting and self._every_s is None:
                 self._states.saved()
 
     def _answer(self, answer: bytes | FmuMeshError, queries: Iterable[zenoh.Query]) -> None:

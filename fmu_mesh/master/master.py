@@ -172,7 +172,7 @@ class Master:
         self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
         self._checkpoints = Checkpoints(
-            self._keys.mesh, self._states, self._withdrawn_grant, settings.as_file, self._inbox.refusals
+            self._keys.mesh, self._states, self._withdrawn_grant, settings, self._inbox.refusals
         )
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)

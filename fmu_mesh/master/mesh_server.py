@@ -60,6 +60,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
         paused: whether the run begins paused at its first point.
         table: number of the table of roles; 0: it has none of our authority.
         as_file: a state file with the states of all instances at a point.
+        keep: gets the checkpoints for a restart, and their points.
         attempt: which attempt of the run this is.
     """
 
@@ -70,6 +71,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     paused: bool = False
     table: int = 0
     as_file: Callable[[int, Mapping[str, bytes]], bytes] = lambda _point, _states: b""
+    keep: Callable[[int, bytes], None] = lambda _point, _data: None
     attempt: Attempt = Attempt()
 
 

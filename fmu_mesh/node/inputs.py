@@ -211,6 +211,11 @@ class TimedInputs(AroundNativeSteps):
         variable = self.description.variable(name)
         return name in self._trajectories or (variable is not None and variable.causality == "input")
 
+    def skip_before(self, point: int) -> None:
+        """A state of this point has what came before it, in an earlier run or before a restart."""
+        while self._next is not None and self._next[1] < point:
+            self._next = next(self._recorded, None)
+
     def _set_changes(self, step: int) -> None:
         """Set what changes in own step ``step``."""
         time = self._time(step)

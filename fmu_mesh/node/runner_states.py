@@ -102,6 +102,8 @@ def _load(runner: Runner, data: bytes) -> None:
         runner.wrap(timed)
     instance = cast("KeepsState", runner.instance)
     together = runner.instance.together(own) if isinstance(runner.instance, TimedInputs) else own.state
+    if isinstance(runner.instance, TimedInputs):
+        runner.instance.skip_before(grid.first_point)
     state = instance.deserialize_state(together)
     try:
         instance.set_state(state)

@@ -47,7 +47,7 @@ from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
-from .state_file import state_bytes
+from .state_file import keep_state, state_bytes
 from .wiring import certified, patient, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
@@ -290,6 +290,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 attempt=run.attempt_of(MASTER),
                 table=table_of(own),
                 as_file=lambda point, states: state_bytes(runs.run, point, states),
+                keep=partial(keep_state, process.folder),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())

@@ -136,6 +136,11 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     replays_to: int = 0
 
     @property
+    def checkpoint_s(self) -> float | None:
+        """How often in s there is a checkpoint for a restart; None: never."""
+        return self.loaded.config.recovery.checkpoint_s if self.restarts < self.max_restarts else None
+
+    @property
     def config_file(self) -> Path:
         """The configuration file, absolute."""
         return self.loaded.file.absolute()

@@ -10,23 +10,28 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 import msgspec
 from msgspec.structs import replace
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
+from ..results.formats import required_format
 from ..system.plan import RECORDER
 from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
 from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
 
-__all__ = ["StateFile", "state_bytes", "write_state"]
+__all__ = ["STATE", "StateFile", "again_from_checkpoint", "keep_state", "state_bytes", "write_state"]
+
+STATE: Final = ".state"
+"""How the names of checkpoints in the folder of a run end."""
 
 _LETTERS = b"FMUSTATE"
 _VERSION = 1
@@ -159,8 +164,42 @@ def state_bytes(
     return b"".join((start, head, *states.values()))
 
 
-def write_state(file: Path, data: bytes) -> None:
-    """Write the content of a state file, in the place of an older one.
+def keep_state(folder: Path, point: int, data: bytes) -> None:
+    """Keep a checkpoint of a run in its folder, for a restart, and the one before it.
+
+    The errors are those of `write_state`.
+    """
+    write_state(folder / f"{point}{STATE}", data, synced=False)
+    for older in sorted(folder.glob(f"*{STATE}"), key=_point_of)[:-2]:
+        older.unlink(missing_ok=True)
+
+
+def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> RunPlan:
+    """A run that starts again, from its newest checkpoint of which all files have the ``rows`` before it.
+
+    Without one, and where the format of a file cannot go on, it begins where it began.
+    """
+    system = run.plan.system
+    if not all(hasattr(required_format(Path(own.file)), "resume") for own in system.records):
+        return run
+    for file in sorted(folder.glob(f"*{STATE}"), key=_point_of, reverse=True):
+        with suppress(ConfigurationError):  # its writer was killed
+            state = StateFile.read(file)
+            point = state.head.point
+            if all(there >= own.rows_before(point) for there, own in zip(rows, system.records, strict=True)):
+                grid = replace(run.plan.grid, first_point=point)
+                nodes = {name: replace(node, grid=grid) for name, node in run.plan.nodes.items()}
+                plan = replace(run.plan, system=replace(system, grid=grid), nodes=nodes)
+                return replace(run, plan=plan, begins_with=BeginsWith(dict(state.states)))
+    return run
+
+
+def _point_of(file: Path) -> int:
+    return int(file.stem) if file.stem.isdecimal() else -1
+
+
+def write_state(file: Path, data: bytes, *, synced: bool = True) -> None:
+    """Write the content of a state file, in the place of an older one; if ``synced``, it survives a power cut.
 
     Raises:
         ConfigurationError: the file cannot be written; an older one is as it was.
@@ -170,6 +209,7 @@ def write_state(file: Path, data: bytes) -> None:
         with files.replaced(file) as draft, draft.open("wb") as target:
             target.write(data)
             target.flush()
-            os.fsync(target.fileno())  # else its name could survive a power cut, and its content not
+            if synced:  # else its name could survive a power cut, and its content not
+                os.fsync(target.fileno())
     except OSError as error:
         raise ConfigurationError(f"the state '{file}' cannot be written: {error.strerror}") from error
