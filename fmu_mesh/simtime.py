@@ -24,7 +24,7 @@ _FAR_S = 1e6
 
 
 class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The communication points `0 .. last_point` of a run: `t = start_time + point * step_size`.
+    """The communication points `first_point .. last_point` of a run: `t = start_time + point * step_size`.
 
     Example:
         >>> TimeGrid(start_time=0.0, step_size=0.002, last_point=20000).time(812)
@@ -34,11 +34,13 @@ class TimeGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         start_time: time of point 0 in s.
         step_size: base communication step size in s, greater than 0.
         last_point: index of the last communication point; `ENDLESS` for a run without a stop time.
+        first_point: index of the first one; not 0 where a run begins with a state.
     """
 
     start_time: float
     step_size: float
     last_point: int
+    first_point: int = 0
 
     def time(self, point: int) -> float:
         """The time of ``point`` in s."""

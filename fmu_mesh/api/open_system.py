@@ -31,7 +31,7 @@ from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
 from ..run.preparing import OtherStartValues
 from ..run.run_plan import RunPlan
-from ..run.state_file import StateFile, write_state
+from ..run.state_file import StateFile, state_bytes, write_state
 from ..simtime import ENDLESS
 from ..system.states import stateless
 from ..text import listed, option_text, shown
@@ -349,7 +349,8 @@ class System:
         if file is not None:
             try:
                 run = replace(self._run, plan=self._plan)
-                write_state(Path(file), run, self._others, saved.point, self._local.packed(saved))
+                packed = self._local.packed(saved)
+                write_state(Path(file), state_bytes(run, saved.point, packed, self._others))
             except FmuMeshError:
                 self._local.free(saved)
                 raise

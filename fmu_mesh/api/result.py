@@ -479,7 +479,7 @@ def _type_of(array: NDArray[Any]) -> VariableType:
 
 def summary_of(outcome: Outcome, step_size: float) -> str:
     """One line about speed, with the step size in s: `20000 points in 1.234 s: 16207 points/s, real-time factor 32`."""
-    point, seconds = outcome.point, outcome.seconds
+    point, seconds = outcome.point - outcome.first, outcome.seconds
     rate = point / seconds if seconds > 0.0 else 0.0
     factor = rate * step_size
     return f"{point} points in {seconds:.3f} s: {rate:.0f} points/s, real-time factor {factor:.3g}"

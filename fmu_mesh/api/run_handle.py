@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from ..config.call_options import checked, takes
 from ..config.plain_values import plain
-from ..errors import CallRefused, ConfigurationError, FmuMeshError, MeshLost, from_report
+from ..errors import CallRefused, ConfigurationError, FmuMeshError, MeshLost
 from ..installing import importing
 from ..pictures.notebook_progress import ShownProgress, awaited, progress_of
 from ..ros.bags.play_options import PlayOptions
@@ -27,7 +27,6 @@ from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Target
 from ..wire.client.waiting import begun_again, replay, wait_for, wait_for_start
 from ..wire.views import (
-    GOING_ON,
     AuditView,
     Command,
     CommandAnswer,
@@ -40,7 +39,7 @@ from ..wire.views import (
     SetAnswer,
     VariableView,
 )
-from .samples import Sample, Watch, sample_of, target_of, targets_of
+from .samples import Sample, Watch, follow_to_end, sample_of, target_of, targets_of
 
 if TYPE_CHECKING:  # whoever attaches to a mesh needs nothing that plans or starts one
     from ..pictures.system_graph import SystemGraph
@@ -58,7 +57,6 @@ TIMEOUT_S = 5.0
 """Default deadline of a question in s."""
 
 _WAIT_S = 60.0
-_FOREVER_S = 1e9
 
 
 class Run:
@@ -377,6 +375,32 @@ class Run:
         """Run some points and pause again; returns when the mesh has paused. For ``timeout`` and errors see `pause`."""
         return self._steered().rest(Command("step", points), timeout)
 
+    @checked
+    def checkpoint(self, file: str | Path, *, timeout: float | None = None) -> int:
+        """Write the states of all instances at one point into a file, while the mesh goes on.
+
+        A run, a sweep and `Mesh.open` begin with it: ``state=file``. It replaces a file of this name.
+
+        Example:
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
+            ...     run.step(10).point, run.checkpoint("results/ten.state")
+            (10, 10)
+            >>> len(mesh.run(record="memory", stop_time=0.1, state="results/ten.state").times)
+            41
+
+        Returns:
+            The point of the states.
+
+        Raises:
+            ConfigurationError: an instance has no state, there is none in ``timeout`` s (by default that of every
+                question), or for another reason; or the file cannot be written.
+        """
+        from ..run.state_file import StateFile, write_state  # noqa: PLC0415  only this needs it
+
+        write_state(Path(file), self._steered().checkpoint(timeout))
+        return StateFile.read(Path(file)).head.point
+
     def resume(self) -> CommandAnswer:
         """Go on after a pause."""
         return self._steered().command(Command("resume"))
@@ -537,7 +561,7 @@ class Run:
             if self._ended is None:
                 future: Future[Result] = Future()
                 self._ended, client = future, self._client()
-                threading.Thread(target=_follow, args=(client, future), name="end", daemon=True).start()
+                threading.Thread(target=follow_to_end, args=(client, future), name="end", daemon=True).start()
             return self._ended
 
     def _client(self) -> MeshClient:
@@ -574,21 +598,3 @@ class Run:
     def _steered(self) -> MeshClient:
         """As `_running` for a run that was started here; a mesh that was found takes commands when it takes them."""
         return self._client() if self._own is None else self._running()
-
-
-def _follow(client: MeshClient, future: Future[Result]) -> None:
-    from .result import Result  # noqa: PLC0415  not for those who only look
-
-    try:
-        file, last = client.info().result_file, None
-        with client.statuses(_FOREVER_S) as statuses:
-            for status in statuses:
-                if last is not None and status.resets != last.resets and status.state in GOING_ON:
-                    file = client.info().result_file
-                last = status
-        if last is not None and last.error is not None:
-            future.set_exception(from_report(last.error))
-        else:
-            future.set_result(Result(client.keys.mesh, file=Path(file) if file is not None else None))
-    except BaseException as error:  # noqa: BLE001 whoever waits gets it
-        future.set_exception(error)

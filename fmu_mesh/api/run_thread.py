@@ -303,7 +303,7 @@ class RunThread:
     def _result(self, outcome: Outcome | None) -> Result:
         if outcome is not None and (self.status is None or self.status.state not in ("done", "failed")):
             grid, progress = self.plan.plan.grid, dict.fromkeys(self.plan.plan.nodes, outcome.point)
-            rate = outcome.point / outcome.seconds if outcome.seconds > 0.0 else 0.0
+            rate = (outcome.point - outcome.first) / outcome.seconds if outcome.seconds > 0.0 else 0.0
             ended = outcome.point, grid.last_point, outcome.time, rate, rate * grid.step_size
             self.status = MeshStatus(self.plan.mesh, outcome.state, *ended, progress, outcome.error)
         return self._read(outcome)

@@ -1,19 +1,26 @@
-"""Values of a running mesh as a program gets them."""
+"""Values of a running mesh as a program gets them, and its end."""
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
-from typing import Any, NamedTuple, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from ..errors import ConfigurationError, UnknownName
+from ..errors import ConfigurationError, UnknownName, from_report
 from ..variables.value_conversion import from_plain
 from ..wire.client.mesh_client import MeshClient
 from ..wire.client.readings import Reading, Target
-from ..wire.views import VariableView
+from ..wire.views import GOING_ON, VariableView
 
-__all__ = ["Sample", "Watch", "sample_of", "target_of", "targets_of"]
+if TYPE_CHECKING:
+    from .result import Result
+
+__all__ = ["Sample", "Watch", "follow_to_end", "sample_of", "target_of", "targets_of"]
+
+_FOREVER_S = 1e9
 
 
 class Sample(NamedTuple):
@@ -96,3 +103,22 @@ def sample_of(reading: Reading, view: VariableView) -> Sample:
     """A value as it came over the wire as a sample."""
     value = from_plain(reading.value, view.type, view.shape)
     return Sample(f"{reading.instance}.{reading.variable}", value, reading.point, reading.time, reading.unit)
+
+
+def follow_to_end(client: MeshClient, future: Future[Result]) -> None:
+    """Follow a mesh that somebody else has started to its end, and tell the future how it has ended."""
+    from .result import Result  # noqa: PLC0415  not for those who only look
+
+    try:
+        file, last = client.info().result_file, None
+        with client.statuses(_FOREVER_S) as statuses:
+            for status in statuses:
+                if last is not None and status.resets != last.resets and status.state in GOING_ON:
+                    file = client.info().result_file
+                last = status
+        if last is not None and last.error is not None:
+            future.set_exception(from_report(last.error))
+        else:
+            future.set_result(Result(client.keys.mesh, file=Path(file) if file is not None else None))
+    except BaseException as error:  # noqa: BLE001 whoever waits gets it
+        future.set_exception(error)

@@ -57,6 +57,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
     "resume": ("mesh", "steering", "resume a paused mesh"),
     "step": ("mesh", "steering", "run a mesh for some points and pause it again"),
     "reset": ("mesh", "steering", "begin again at the first point, in the same processes"),
+    "checkpoint": ("mesh", "steering", "write the states of all instances at one point into a file"),
     "stop": ("mesh", "steering", "end the run of a mesh"),
     "rerun": ("run", "running", "run again what a result file has recorded"),
     "play": ("mesh", "steering", "play a recorded bag into the inputs of a mesh"),

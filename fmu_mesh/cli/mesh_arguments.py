@@ -111,6 +111,10 @@ PARSERS: Parsers = {
         switch("--audit", text="instead, show who joined, set, commanded or was refused, each kind with its number"),
     ),
     **dict.fromkeys(("pause", "resume", "stop"), _COMMAND),
+    "checkpoint": (
+        *_COMMAND,
+        argument("--output", "FILE", "the file; one of this name is replaced (MESH.state)", type=Path),
+    ),
     "step": (*_COMMAND, argument("points", "N", "points (1)", nargs="?")),
     "reset": (*_COMMAND, options("start_values", of=ResetOptions)),
     "wait": (

@@ -1,4 +1,4 @@
-"""`pause`, `resume`, `step`, `reset`, `stop`, `wait`, `logs`, `play`: a running mesh is steered and heard."""
+"""`pause`, `resume`, `step`, `reset`, `stop`, `checkpoint`, `wait`, `logs`, `play`: a running mesh is steered."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import re
 import sys
 import time
+from pathlib import Path
 from typing import Final
 
 from ..api.attaching import attach
@@ -15,7 +16,7 @@ from ..errors import ConfigurationError, Interrupted
 from ..printing import printable
 from ..ros.bags.play_options import PlayOptions
 from ..run.options import ResetOptions
-from ..text import did_you_mean, listed
+from ..text import did_you_mean, listed, short_path
 from ..wire.views import AuditView, CommandAnswer
 from .arguments import Runs, reach, whole
 from .mesh_arguments import LEVELS
@@ -53,6 +54,17 @@ def _command(arguments: argparse.Namespace) -> int:
 
 _COMMANDS: Final = {"pause": Run.pause, "resume": Run.resume, "stop": Run.stop}
 _NUMBER: Final = re.compile(r"[-+]?[0-9.].*")
+
+
+def _checkpoint(arguments: argparse.Namespace) -> int:
+    with attach(arguments.mesh, **reach(arguments)) as run:
+        file = arguments.output or Path(f"{run.name}.state")
+        point = run.checkpoint(file)
+    if arguments.json:
+        print_json({"mesh": run.name, "point": point, "file": str(file.absolute())})
+    else:
+        print(f"state of mesh '{run.name}' at point {point}: {short_path(file)}")
+    return 0
 
 
 def _wait(arguments: argparse.Namespace) -> int:
@@ -125,6 +137,7 @@ def _play(arguments: argparse.Namespace) -> int:
 RUNS: Runs = {
     "wait": _wait,
     "logs": _logs,
+    "checkpoint": _checkpoint,
     "play": _play,
     **dict.fromkeys(("pause", "resume", "step", "reset", "stop"), _command),
 }

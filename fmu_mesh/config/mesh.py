@@ -294,6 +294,14 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
         ),
     ] = None
 
+    checkpoint_s: Annotated[
+        Annotated[float, Meta(gt=0.0)] | None,
+        Meta(
+            description="Time between two checkpoints in s: a restart begins with the newest one. null: with the first "
+            "point."
+        ),
+    ] = None
+
     @property
     def restarts(self) -> int:
         """How often the run may start again."""

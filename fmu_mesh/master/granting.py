@@ -28,7 +28,8 @@ class Granting:
     """The grant of a run, and the progress of its nodes.
 
     Attributes:
-        progress: the last point of which each node knows all outputs, by name; -1: Initialization Mode is not over.
+        progress: the last point of which each node knows all outputs, by name; the one before the first: Initialization
+            Mode is not over.
         slowest: the last point that all nodes know.
         grant: the point up to which all may step.
         last_point: the last point of the run, which may end early.
@@ -39,9 +40,10 @@ class Granting:
     """
 
     def __init__(self, plan: Plan) -> None:
-        self.progress = dict.fromkeys(plan.nodes, -1)
-        self.slowest = -1
-        self.grant = 0
+        first = plan.grid.first_point
+        self.progress = dict.fromkeys(plan.nodes, first - 1)
+        self.slowest = first - 1
+        self.grant = first
         self.last_point = plan.grid.last_point
         self.ways = Ways()
         self.sharing: tuple[str, ...] = ()
@@ -51,9 +53,9 @@ class Granting:
         self._plan = plan
         # The progress of a slower instance is the point up to which its outputs hold: its next own point minus one.
         self._most_ahead = 2 * max(item.step_points for item in plan.system.instances.values()) - 2
-        self._sent = 0
-        self._reach = Reach()
-        self._lead = Reach(_LEAD_S)
+        self._sent = first
+        self._reach = Reach(first=first - 1)
+        self._lead = Reach(_LEAD_S, first - 1)
         self._round_trip_s: float | None = None
 
     def go(self, ways: Ways) -> None:
@@ -73,6 +75,16 @@ class Granting:
     def measured(self, round_trip_s: float) -> None:
         """The longest round trip to a node by a row stream takes so long, in s."""
         self._round_trip_s = round_trip_s if not self.messages else None  # that of messages is not known
+
+    @property
+    def first_point(self) -> int:
+        """The first point of the run."""
+        return self._plan.grid.first_point
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether all nodes have reached the first point."""
+        return self.slowest >= self.first_point
 
     def end_at(self, point: int) -> None:
         """End the run at a point before its last one."""
@@ -170,14 +182,14 @@ class Granting:
 
         Nothing if the grant is below the ``wanted`` point and all have it: only the wall clock lets it grow.
         """
-        if not self.seen or (self.slowest >= 0 and self.reaches_all == self.grant < wanted and not self.is_led):
+        if not self.seen or (self.has_begun and self.reaches_all == self.grant < wanted and not self.is_led):
             return None
         nodes = [node for node in self.seen if node != RECORDER]
         if self._keep_windows or min(map(self.progress.__getitem__, nodes), default=self.grant) >= self.reaches_all:
             nodes = [*self.seen]  # the recorder may be far behind: what is granted next does not depend on it
         slowest = min(nodes, key=self.progress.__getitem__)
         reached = self.progress[slowest]
-        if reached >= self.reaches_all and reached >= 0:
+        if reached >= self.reaches_all and reached >= self.first_point:
             return None
         goal = self.grant if self.reaches_all == self.grant and not self.is_led else (reached + self.reaches_all) // 2
         return slowest, max(goal, reached + 1)

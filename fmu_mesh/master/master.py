@@ -64,7 +64,7 @@ from ..wire.inbox import Inbox
 from ..wire.journal import Journal
 from ..wire.keys import Keys, RunKeys, sender_in
 from ..wire.meeting import Meeting
-from ..wire.messages import FINISH, PROGRESS, NewStart, NodeReport, decode_json, sealed
+from ..wire.messages import FINISH, PROGRESS, STATE, NewStart, NodeReport, decode_json, sealed
 from ..wire.refusals import payload_of
 from ..wire.router_link import RouterLink
 from ..wire.runtime import this_host
@@ -73,18 +73,10 @@ from ..wire.time_profile import TIME_LINE_ENTRIES, MeshProfile
 from ..wire.values import json_encoding, who_sent
 from ..wire.views import Command, CommandAnswer, MeshInfo, MeshState, MeshStatus
 from ..wire.ways import Ways
+from .actions import Action, AnswerAll, Commanded, EndAll, FollowClock, RaiseGrant, RaiseSent, SendToAll
 from .audit import Audit
-from .master_states import (
-    Action,
-    AnswerAll,
-    Commanded,
-    EndAll,
-    FollowClock,
-    MasterStates,
-    RaiseGrant,
-    RaiseSent,
-    SendToAll,
-)
+from .checkpoints import Checkpoints
+from .master_states import MasterStates
 from .master_streams import MasterStreams
 from .members import Followers, Members
 from .mesh_server import STATUS_S, Events, MasterServer, MasterSettings
@@ -156,8 +148,11 @@ class Master:
         self._first_keys = self._run_keys
 
     def _made_memory(self) -> HostMemory:
+        nodes = [*self._states.plan.nodes.values()]
         memory_of = HostMemory.create if self._shares else HostMemory.private
-        return memory_of(next(iter(self._states.plan.nodes.values())).memory, MASTER)
+        memory = memory_of(nodes[0].memory, MASTER)
+        memory.begin_at(self._states.plan.grid.first_point, (place for node in nodes for place in node.rings))
+        return memory
 
     def _prepare(self, meeting: Meeting | None) -> None:
         """Make all that belongs to one run, but its states and its memory."""
@@ -176,6 +171,9 @@ class Master:
         own = settings.launch, meeting, settings.table
         self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
+        self._checkpoints = Checkpoints(
+            self._keys.mesh, self._states, self._withdrawn_grant, settings, self._inbox.refusals
+        )
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)
 
@@ -315,6 +313,7 @@ class Master:
         """Do what there is to do; return for how long there is nothing more if nothing arrives, in s."""
         states, pause_s = self._states, math.inf
         self._look_at_streams(now)
+        self._checkpoints.settle(now)
         while True:
             paced = states.wanted
             if states.takes_commands:
@@ -330,6 +329,7 @@ class Master:
             if not actions:
                 break
         self._resting.settle(now)
+        self._checkpoints.answer()
         # After what there is to do: to publish takes as long as thousands of points.
         (state, rested), self._published = self._published, (states.state, states.rests)
         if (states.state != state or (states.rests and not rested)) and not states.is_over:
@@ -397,7 +397,10 @@ class Master:
         message = self._inbox.wait(timeout_s, wishes)
         while message is not None:
             node, kind, _, _, point, _ = message
-            if kind != PROGRESS:
+            if kind == STATE:
+                with self._inbox.refusals.guard(node):
+                    self._checkpoints.take(node, point, message[5])
+            elif kind != PROGRESS:
                 self._inbox.refusals.add(spoken(node), f"a message of kind {kind} is not one that the master accepts")
             elif node not in seen:
                 reported.append((node, point))
@@ -438,10 +441,13 @@ class Master:
             query.reply_err(str(error))
             query.drop()
             return
-        if states.takes_commands:
+        if states.takes_commands and command.command == "checkpoint":
             self.audit.note("commanded", who, key, command.command)
-            claimed = self._memory.withdraw_grant() if states.granting.sharing else 0
-            answer = replace(states.command(command, claimed), resets=resets)
+            self._checkpoints.ask(query, command.wait, self._awake())
+        elif states.takes_commands:
+            self.audit.note("commanded", who, key, command.command)
+            self._checkpoints.give_up(MeshLost(f"another program gave the command '{command.command}' meanwhile"))
+            answer = replace(states.command(command, self._withdrawn_grant()), resets=resets)
             if command.command != "reset":  # a mesh that was reset does not start again
                 stopped_at = states.granting.last_point if command.command == "stop" else None
                 self._journal.add(Commanded(command.command, answer.hold, stopped_at))
@@ -475,6 +481,10 @@ class Master:
             query.reply(key, msgspec.json.encode(answer), encoding=json_encoding)
             query.drop()
 
+    def _withdrawn_grant(self) -> int:
+        """Take the grant back: what a node may have claimed."""
+        return self._memory.withdraw_grant() if self._states.granting.sharing else 0
+
     def _new_start(self, command: Command) -> NewStart:
         """What the nodes need for a reset.
 
@@ -493,7 +503,7 @@ class Master:
     @property
     def wanted(self) -> int:
         """As that of the states; negative until all nodes have reached the first point. From any thread."""
-        return self._states.wanted if self._states.granting.slowest >= 0 else -1
+        return self._states.wanted if self._states.granting.has_begun else -1
 
     @property
     def ended_by(self) -> TerminationRequested | NotFinite | None:
@@ -548,9 +558,10 @@ class Master:
     def last_status(self) -> MeshStatus:
         """The state of the run right now."""
         states, grid = self._states, self._states.plan.grid
-        point = min(max(states.granting.slowest, 0), states.granting.last_point)
+        first = grid.first_point
+        point = min(max(states.granting.slowest, first), states.granting.last_point)
         elapsed = self._clock.elapsed()
-        rate = point / elapsed if elapsed > 0 else 0.0
+        rate = (point - first) / elapsed if elapsed > 0 else 0.0
         attempt, failure = self._settings.attempt, states.failure
         goes_on = type(failure) is MeshLost and attempt.number < attempt.most and not self._resets
         is_again = bool(str(attempt)) and not self._resets and (states.state == "starting" or states.is_replaying)
@@ -568,7 +579,7 @@ class Master:
             time=grid.time(point),
             points_per_second=rate,
             real_time_factor=rate * grid.step_size,
-            progress={node: max(point, 0) for node, point in states.granting.progress.items()},
+            progress={node: max(point, first) for node, point in states.granting.progress.items()},
             error=failure.report() if failure is not None else None,
             overruns=self._pacer.overruns,
             refused=self._inbox.refusals.count,

@@ -54,80 +54,25 @@ from ..errors import (
 from ..system.placement import placed
 from ..system.plan import RECORDER, Plan
 from ..wire.host_processes import OR_CUT
-from ..wire.messages import FINISH, GRANT, NodeReport
+from ..wire.messages import FINISH, GRANT, SAVE, NodeReport
 from ..wire.views import GOING_ON, Command, CommandAnswer, MeshState
-from ..wire.ways import Ways
+from .actions import Action, AnswerAll, Commanded, EndAll, FollowClock, RaiseGrant, RaiseSent, SendToAll
 from .granting import Granting
 from .registrations import Registrations, spoken
 
-__all__ = [
-    "Action",
-    "AnswerAll",
-    "Commanded",
-    "EndAll",
-    "FollowClock",
-    "MasterStates",
-    "RaiseGrant",
-    "RaiseSent",
-    "SendToAll",
-]
-
-
-class AnswerAll(msgspec.Struct, frozen=True):
-    """All nodes are ready and wait for an answer: how rows go."""
-
-    ways: Ways
-
-
-class FollowClock(msgspec.Struct, frozen=True):
-    """The point is due now by the wall clock, which does not limit the grant unless the run is ``paced``."""
-
-    point: int
-    paced: bool = True
-
-
-class RaiseGrant(msgspec.Struct, frozen=True):
-    """Write the grant into the memory of the host."""
-
-    point: int
-
-
-class RaiseSent(msgspec.Struct, frozen=True):
-    """Write into the memory of the host what the row streams grant to others."""
-
-    point: int
-
-
-class SendToAll(msgspec.Struct, frozen=True):
-    """Send a message to all nodes."""
-
-    kind: int
-    point: int
-
-
-class EndAll(msgspec.Struct, frozen=True):
-    """Tell all nodes why the run has failed."""
-
-    error: FmuMeshError
-
-
-Action = AnswerAll | FollowClock | RaiseGrant | RaiseSent | SendToAll | EndAll
-
-
-class Commanded(msgspec.Struct, frozen=True):
-    """What a command has changed, for the journal: where the mesh pauses, or the point at which it is stopped."""
-
-    command: str
-    hold: int | None
-    stopped_at: int | None = None
+__all__ = ["MasterStates"]
 
 
 class _Course(msgspec.Struct, frozen=True):
-    """Where the mesh pauses; and after a restart, the last point that was seen before, and where it was stopped."""
+    """Where the mesh pauses; after a restart, the last point that was seen before, and where it was stopped.
+
+    And where all nodes save their states.
+    """
 
     hold: int | None
     replays_to: int
     stopped_at: int | None
+    saves_at: int | None = None
 
 
 class MasterStates:
@@ -155,7 +100,7 @@ class MasterStates:
         )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
-        again = commanded or Commanded("", 0 if paused else None)
+        again = commanded or Commanded("", plan.grid.first_point if paused else None)
         self._course = _Course(again.hold, replays_to, again.stopped_at)
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
@@ -175,6 +120,11 @@ class MasterStates:
     @hold.setter
     def hold(self, point: int | None) -> None:
         self._course = replace(self._course, hold=point)
+
+    @property
+    def saves_at(self) -> int | None:
+        """The point at which all nodes save their states, if they do; beyond it, nothing is granted until then."""
+        return self._course.saves_at
 
     @property
     def is_over(self) -> bool:
@@ -199,10 +149,11 @@ class MasterStates:
     @property
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
-        last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
+        course = self._course  # once: the recorder asks on its own thread
+        limits = [self.granting.last_point, course.hold, course.saves_at]
         if self.is_replaying and self.plan.system.config.simulation.real_time_factor > 0.0:
-            last_point = min(last_point, self._course.replays_to)
-        return last_point if hold is None else min(hold, last_point)
+            limits.append(course.replays_to)
+        return min(limit for limit in limits if limit is not None)
 
     @property
     def is_replaying(self) -> bool:
@@ -301,6 +252,24 @@ class MasterStates:
         where = (granting.slowest, self.hold) if command.command != "reset" else (0, None if before is None else 0)
         return CommandAnswer(command.command, self.state, *where)
 
+    def save(self, claimed: int, every: int) -> bool:
+        """Hold all nodes at the next multiple of ``every`` points, until `saved`; False if they do not come there.
+
+        Only while it `takes_commands`. ``claimed`` is as in `command`.
+        """
+        at = -(-self.granting.halt(claimed) // every) * every
+        self._moved_at = self._slowest_moved_at = None
+        self._actions.append(RaiseGrant(self.granting.grant))
+        if at <= self.wanted:
+            self._course = replace(self._course, saves_at=at)
+            self._actions.append(SendToAll(SAVE, at))
+        return at <= self.wanted
+
+    def saved(self) -> None:
+        """The nodes have saved their states, or need not: they go on."""
+        self._course = replace(self._course, saves_at=None)
+        self._moved_at = self._slowest_moved_at = None
+
     def fail(self, error: FmuMeshError) -> None:
         """The run has to end; the first reason counts."""
         if self.failure is None:
@@ -372,14 +341,15 @@ class MasterStates:
             self.fail(registrations.absence(self.deadlines.start))
 
     def _wait_for_initialization(self, now: float) -> None:
-        if self.granting.slowest >= 0:
+        if self.granting.has_begun:
             self._enter("running" if self.hold is None else "paused", now)
-            self._actions.append(FollowClock(0, paced=not self.is_replaying))
+            self._actions.append(FollowClock(self.granting.first_point, paced=not self.is_replaying))
             if self._course.stopped_at is not None and self.plan.grid.stop_time is None:
                 self._stop(self._course.stopped_at)
             self._moved_at = self._slowest_moved_at = now
             return
-        missing = [node for node, point in self.granting.progress.items() if point < 0]
+        first = self.granting.first_point
+        missing = [node for node, point in self.granting.progress.items() if point < first]
         self._check_deadline(now, self.deadlines.initialize, "Initialization Mode is not over in", missing)
         self._send_grant(now)
 
@@ -393,7 +363,7 @@ class MasterStates:
         if stopped_at is not None and not self.is_replaying:
             self._stop(stopped_at)
             return
-        if granting.slowest >= granting.last_point:
+        if granting.slowest >= granting.last_point and self.saves_at is None:
             if isinstance(self.ended_by, NotFinite):
                 self.fail(self.ended_by)
             else:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Literal, Protocol, get_args
 
@@ -59,6 +59,8 @@ class MasterSettings(msgspec.Struct, frozen=True):
         profile: whether nodes measure their time, and the master what limits the grant.
         paused: whether the run begins paused at its first point.
         table: number of the table of roles; 0: it has none of our authority.
+        as_file: a state file with the states of all instances at a point.
+        keep: gets the checkpoints for a restart, and their points.
         attempt: which attempt of the run this is.
     """
 
@@ -68,6 +70,8 @@ class MasterSettings(msgspec.Struct, frozen=True):
     profile: bool = False
     paused: bool = False
     table: int = 0
+    as_file: Callable[[int, Mapping[str, bytes]], bytes] = lambda _point, _states: b""
+    keep: Callable[[int, bytes], None] = lambda _point, _data: None
     attempt: Attempt = Attempt()
 
 

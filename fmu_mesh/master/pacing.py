@@ -53,10 +53,10 @@ class Reach:
         granted: the farthest point that a grant has reached so far.
     """
 
-    def __init__(self, steady_s: float = 0.05) -> None:
+    def __init__(self, steady_s: float = 0.05, first: int = -1) -> None:
         self._steady_s = steady_s
         self._points = self._fresh = 1
-        self._slowest = self.granted = self._mark = -1
+        self._slowest = self.granted = self._mark = first
         self._since = 0.0
         self._shortest_s = math.inf
 

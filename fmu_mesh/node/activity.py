@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 
 from ..awake import AwakeClock
-from ..errors import FmuMeshError, StepFailed
+from ..errors import FmuMeshError, Interrupted, MeshLost, StepFailed
 from ..instances.call_guard import not_returned
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
@@ -87,6 +87,18 @@ class Activity:
             keys=self._keys.statuses(name) if self._keys is not None else (),
             deploy_host=self._plan.host or "",
             failed=runner.failed if runner is not None else "",
+        )
+
+    def as_others_see(self, error: FmuMeshError) -> FmuMeshError:
+        """The error as other processes see it: if a signal ends this process, for them this node is lost."""
+        if not isinstance(error, Interrupted):
+            return error
+        point = min((runner.point for runner in self.runners.values()), default=0)
+        return MeshLost(
+            f"node '{self._plan.node}' was lost: its process was told to end ({error.message})",
+            instance=", ".join(item.name for item in self._plan.instances),
+            point=point,
+            time=self._plan.grid.time(point),
         )
 
     def look_at_steps(self) -> StepFailed | None:

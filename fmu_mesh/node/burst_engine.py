@@ -142,8 +142,9 @@ class BurstEngine(Engine):
 
     @property
     def copy(self) -> native.CopyTable:
-        """How the library steps it as one of many systems, from point 0 on."""
-        return native.CopyTable(node=self._address)
+        """How the library steps it as one of many systems, from the first point on."""
+        unit = self._units[0]
+        return native.CopyTable(node=self._address, point=unit.tick * unit.tick_points)
 
     @property
     def point(self) -> int:

@@ -96,12 +96,20 @@ class Engine(ABC):
             self._units[number] = self._unit(*both)
         for unit, tables in zip(units, members, strict=True):
             for runner, member in zip(unit, tables, strict=True):
+                member.note(step=runner.step)  # not 0 where the run begins with a state
                 runner.follow(member, self)
 
     def _unit(self, unit: Sequence[Runner], members: object) -> native.UnitTable:
         last_tick = unit[0].last_step if len(unit) == 1 else self._last_point
         points = self.tick_points(unit)
-        return native.UnitTable(members=members, n_members=len(unit), tick_points=points, last_tick=last_tick, burst=1)
+        return native.UnitTable(
+            members=members,
+            n_members=len(unit),
+            tick_points=points,
+            last_tick=last_tick,
+            tick=unit[0].point // points,
+            burst=1,
+        )
 
     @abstractmethod
     def refit(self, runner: Runner) -> None:

@@ -21,6 +21,7 @@ from ..instances.input_trajectory import SavedTrajectory, Trajectory
 from ..instances.instance_wrapper import AroundNativeSteps, of_kind, packed, unpacked
 from ..results.keys_file import recorded_values
 from ..rings.native import CopyCall
+from ..rings.packed_member import PackedMember
 from ..rings.ring import Ring
 from ..simtime import ENDLESS, TimeGrid
 from ..system.input_timeouts import InputTimeout, LastValues
@@ -210,6 +211,11 @@ class TimedInputs(AroundNativeSteps):
         variable = self.description.variable(name)
         return name in self._trajectories or (variable is not None and variable.causality == "input")
 
+    def skip_before(self, point: int) -> None:
+        """A state of this point has what came before it, in an earlier run or before a restart."""
+        while self._next is not None and self._next[1] < point:
+            self._next = next(self._recorded, None)
+
     def _set_changes(self, step: int) -> None:
         """Set what changes in own step ``step``."""
         time = self._time(step)
@@ -341,6 +347,29 @@ class TimedInputs(AroundNativeSteps):
         """See `KeepsState`."""
         own, rest = unpacked(data, _OverTime, getattr(self._instance, "name", None))
         return _TimedState(super().deserialize_state(rest), own)
+
+    def apart(self, data: bytes) -> tuple[PackedMember, bytes]:
+        """What `serialize_state` returned as what each engine knows of inputs over time, and that of the model."""
+        own, inner = unpacked(data, _OverTime, getattr(self._instance, "name", None))
+        time = self._time(own.step)
+        rounding = self._grid.rounding(time)
+        waits = tuple(
+            name
+            for name, one in self._trajectories.items()
+            if one.after(time + rounding) is not None or one.value(time, rounding) != own.used.get(name)
+        )
+        known = PackedMember(b"", own.step, -1, {}, {}, own.sent, msgspec.msgpack.encode(own), waits)
+        return known, inner
+
+    def together(self, packed_member: PackedMember) -> bytes:
+        """The other way round: what `deserialize_state` takes. Another engine may have known less."""
+        known = packed_member
+        if known.over_time:
+            return msgspec.msgpack.encode((msgspec.Raw(known.over_time), known.state))
+        self._last.sent.update((name, [*steps]) for name, steps in known.sent.items())
+        late = self._last.late(known.step - 1)
+        unwarned = tuple(sorted(self._timeouts.keys() - late.keys()))
+        return packed(_OverTime(known.step, {}, {}, known.sent, late, unwarned), known.state)
 
     def state_access(self, state: object) -> CopyCall | None:  # noqa: ARG002  as in `AccessedNatively`
         """See `AccessedNatively`; None, because there is more to do."""

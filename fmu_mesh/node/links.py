@@ -48,6 +48,10 @@ class OutLink:
         """Whether it sends rows at all."""
         return bool(self._picked)
 
+    def begin_at(self, step: int) -> None:
+        """The run begins with a state after so many own steps: the rows before were never there."""
+        self.sent = step
+
     def flush(self, end: int) -> None:
         """Send the rows of own steps ``sent .. end - 1``."""
         ring, first = self._outputs, self.sent

@@ -40,6 +40,7 @@ from ..rings.host_memory import ONE_CORE, HostMemory
 from ..rings.row_streams import RowStreams
 from ..system.live_keys import KeyValue
 from ..system.plan import MASTER, RECORDER, Link, NodePlan
+from ..system.states import BeginsWith
 from ..wire.frames import FrameReceiver, SourceRows, of_text
 from ..wire.inbox import Inbox, Message
 from ..wire.journal import NodeJournal
@@ -54,6 +55,7 @@ from ..wire.messages import (
     INITIAL,
     PROGRESS,
     RESET,
+    SAVE,
     NewStart,
     NodeReport,
     Noted,
@@ -73,6 +75,7 @@ from .initialization import Initialization
 from .inputs import with_times
 from .links import OutLink
 from .node_server import NodeServer
+from .runner_states import load_states, set_again, state_messages
 from .stepping import Runner, connect
 from .stream_ends import streams_of
 from .streams import PRIORITY
@@ -118,6 +121,7 @@ class Node:
         launch: the launcher that started this process; None if it was started manually.
         meeting: where it meets others for row streams; the caller closes it.
         strain: which limit of this process a failure of an FMU may come from, as a sentence; None: none.
+        begins_with: the states of its instances at the first point, if it is not that after Initialization Mode.
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
@@ -139,23 +143,25 @@ class Node:
         engine: Callable[..., Engine] = make_engine,
         strain: Callable[[], str | None] = lambda: None,
         table: int = 0,
+        begins_with: BeginsWith | None = None,
     ) -> None:
         self._plan = plan
         self._session = session
         self._open_instance = open_instance
         self._make_engine, self._strain = engine, strain
         self._finish_at: float = math.inf
-        self._token_went = False
-        self.failure_is_known = False
+        self._token_went = self.failure_is_known = False
         self.new_start: NewStart | None = None
         self._clock = AwakeClock()
         self._heard = self._lazy_sent = self._progress_told_at = 0.0
-        self._progress_sent = self._lazy_covered = -1
+        self._progress_sent = self._lazy_covered = plan.grid.first_point - 1
+        self._begins_with, self._saves_at = begins_with or BeginsWith(), -1
         self._router = router or RouterLink(session)
         self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
         self._receivers: dict[int, FrameReceiver | Link] = {}
         self._memory = self._own_memory = HostMemory.private(plan.memory, plan.node)
+        self._own_memory.begin_at(plan.grid.first_point, plan.rings)
         self._engine: Engine | None = None
         self._initialization = Initialization(plan, self._wait_for_message)
         self._inbox = Inbox(self._own_memory)
@@ -305,20 +311,17 @@ class Node:
         self._activity.enter("initializing")
         plan = self._plan
         self._initialization.run(self._runners.values())
+        load_states(self._begins_with, self._runners)
         units = [[self._runners[name] for name in names] for names in plan.units]
         self._engine = engine = self._make_engine(
-            plan,
-            units,
-            self._memory,
-            self._windows(),
-            spins=not ONE_CORE,
-            streams=self._streams,
+            plan, units, self._memory, self._windows(), spins=not ONE_CORE, streams=self._streams
         )
         self._inbox.move_to(self._memory, engine)
         self._activity.steps_with(engine, self._ways, self._keeper)
         for runner in self._runners.values():
             runner.begin()
             runner.flush()
+        set_again(self._begins_with, self._runners)
         for news in self._journal.entries():  # it belongs to the metadata of this attempt, too
             self._put_set(encode_news(news))
         self.server.started()
@@ -384,9 +387,9 @@ class Node:
         left_s = 0.0
         while not self.finished:
             try:
-                has_more = self._inbox.is_direct or self._inbox.has_posted
+                has_more, saves = self._inbox.is_direct or self._inbox.has_posted, self._saves_at >= 0
                 wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
-                stepped = engine.run(wait_s, eager=eager, quiet=quiet and self.server.is_unfollowed)
+                stepped = engine.run(wait_s, eager=eager or saves, quiet=quiet and self.server.is_unfollowed)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)
@@ -438,6 +441,7 @@ class Node:
             self._lazy_sent, self._lazy_covered = now, covered
         for runner in self._runners.values():
             runner.flush(lazy=lazy)
+        self._send_states(self._saves_at)
         return _LONGEST_SLEEP_S if lazy else self._lazy_sent + _LAZY_S - now
 
     def _look_at_router(self) -> None:
@@ -446,7 +450,7 @@ class Node:
         if self._router.endpoints and self._router.is_back:
             for runner in self._runners.values():
                 runner.send_again()
-            if self._progress_sent >= 0:
+            if self._progress_sent >= self._plan.grid.first_point:
                 self._put_progress(HEADER.pack(PROGRESS, 0, 0, self._progress_sent))
 
     def _wait_for_message(self, left_s: float) -> None:
@@ -481,6 +485,8 @@ class Node:
             self._memory.grant.raise_to(min(point, self._plan.grid.last_point))
         elif kind == FINISH:
             self._finish_at = point
+        elif kind == SAVE:
+            self._send_states(point)
         elif kind == ABORT:
             raise _Aborted(from_report(decode_json(data[HEADER.size :], ErrorReport)))
         elif kind == RESET:
@@ -503,6 +509,13 @@ class Node:
             self._progress_sent = covered
             self._progress_told_at = now
             self._put_progress(HEADER.pack(PROGRESS, 0, 0, covered))
+
+    def _send_states(self, at: int) -> None:
+        """At the point of a checkpoint, beyond which the master grants nothing: send the states of all instances."""
+        messages = state_messages(self._runners, at) if at >= 0 else None
+        self._saves_at = at if messages is None else -1
+        for message in messages or ():
+            self._put_progress(message)
 
     # --- the end
 
@@ -553,23 +566,11 @@ class Node:
             return not self._membership.lost_link
         self.server.say_everything()
         try:
-            self._tell_end(self._as_others_see(error), self._patience_s())
+            self._tell_end(self._activity.as_others_see(error), self._patience_s())
         except FmuMeshError as unreachable:
             log.info("failure_not_reported", extra={"error": str(unreachable)})
             return self._has_no_master()
         return True
-
-    def _as_others_see(self, error: FmuMeshError) -> FmuMeshError:
-        """The error as other processes see it: if a signal ends this process, for them this node is lost."""
-        if not isinstance(error, Interrupted):
-            return error
-        point = min((runner.point for runner in self._runners.values()), default=0)
-        return MeshLost(
-            f"node '{self._plan.node}' was lost: its process was told to end ({error.message})",
-            instance=", ".join(item.name for item in self._plan.instances),
-            point=point,
-            time=self._plan.grid.time(point),
-        )
 
     def _patience_s(self) -> float:
         return min(self._plan.timeouts.stop, math.inf if self._membership.is_admitted else _NO_MASTER_S)

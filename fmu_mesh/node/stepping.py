@@ -131,14 +131,15 @@ class Runner:
         fill_unconnected(self.inputs, connected, self.instance.get_values)
 
     def begin(self) -> None:
-        """The outputs after Initialization Mode are complete: row 0.
+        """The outputs after Initialization Mode, or of the state with which the run begins, are complete.
 
         Raises:
             NotFinite: one is not finite.
         """
-        self.is_finite.check_first(self.grid, self.instance.get_values)
-        self.outputs.stamp(0)
-        self.counter.raise_to(1)
+        if self.step == 0:
+            self.is_finite.check_first(self.grid, self.instance.get_values)
+        self.outputs.stamp(self.step)
+        self.counter.raise_to(self.step + 1)
 
     def not_finite(self, step: int) -> None:
         """The row that own step ``step`` has written is not finite: the instance holds its outputs, if it may.

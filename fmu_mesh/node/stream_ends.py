@@ -57,4 +57,5 @@ def _outgoing_rows(plan: NodePlan, runners: Mapping[str, Runner], targets: Itera
         if link.target_node in targets and not link.initial_only and numbers.columns:
             runner, rows = runners[link.source], plan.grid.last_point // link.step_points + 1
             lazy = link.target_node == RECORDER
-            yield RowsEnd(link.index, runner.outputs, runner.counter, numbers, rows, lazy)
+            first = plan.grid.first_point // link.step_points
+            yield RowsEnd(link.index, runner.outputs, runner.counter, numbers, rows, lazy, first)

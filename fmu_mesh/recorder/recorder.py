@@ -79,6 +79,7 @@ from ..wire.messages import (
     PROGRESS,
     REFUSED,
     RESET,
+    SAVE,
     SET,
     NodeReport,
     Noted,
@@ -153,6 +154,7 @@ class Recorder:
         self._plan = plan
         self._mirror_of, self._audit, self._audited, self._audit_at = mirror_of, audit, 0, -math.inf
         self._own_memory = HostMemory.private(plan.memory, RECORDER)
+        self._own_memory.begin_at(plan.grid.first_point, plan.rings)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
         self._rows = min(place.rows for place in plan.rings)
@@ -160,8 +162,7 @@ class Recorder:
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
         self._files = RecordFiles(files, growth, notes)
         self._wanted, self._on_flush = wanted, on_flush
-        self._written = 0
-        self._told = 0
+        self._first = self._written = self._told = plan.grid.first_point
         self._flushed = 0.0
         self._finished = False
         self._finish_at: float = math.inf
@@ -265,7 +266,7 @@ class Recorder:
             self._record()
             if self._cause is not None:
                 self._take_last_rows(self._cause)
-                log.info("recording_ended_early", extra={"rows": self._written})
+                log.info("recording_ended_early", extra={"rows": self._written - self._first})
                 return
         except Exception as error:  # noqa: BLE001 whatever it is, the master must know that nothing is recorded any more
             failure = error if isinstance(error, FmuMeshError) else FmuMeshError(f"recording failed: {error!r}")
@@ -307,7 +308,7 @@ class Recorder:
             if message is None:
                 self._write_rows()
                 self._tell_progress()
-                if self._written and (now := time.monotonic()) - self._flushed > _FLUSH_S:
+                if self._written > self._first and (now := time.monotonic()) - self._flushed > _FLUSH_S:
                     self._flushed = now
                     self._note_audit(now)
                     self._files.flush()
@@ -325,8 +326,9 @@ class Recorder:
         last_point = self._plan.grid.last_point
         if self._written > last_point:
             return []
-        due = min(self._written + self._wake_rows if complete >= 0 else 0, max(self._written, wanted), last_point)
-        if self._written <= complete and complete >= due and (self._written or wanted >= 0):
+        many = self._written + self._wake_rows if complete >= self._first else self._first
+        due = min(many, max(self._written, wanted), last_point)
+        if self._written <= complete and complete >= due and (self._written > self._first or wanted >= 0):
             return None
         slowest = min(self._sources.values(), key=lambda source: source.covered)
         rows = due // slowest.link.step_points + 1
@@ -369,6 +371,7 @@ class Recorder:
             GRANT,
             ABORT,
             RESET,
+            SAVE,
         ):  # why the run ends early comes from the master of this process: `__exit__`
             raise MessageRefused(f"a message of kind {kind} is not one that the master sends")
 
@@ -378,7 +381,7 @@ class Recorder:
 
     def _write_rows(self) -> None:
         rows = self._complete() + 1
-        if not self._written and self._wanted() < 0:
+        if self._written == self._first and self._wanted() < 0:
             return
         while (first := self._written) < rows:
             end = min(rows, first - first % self._rows + self._rows, first + _WRITE_ROWS)  # read without wrap-around
@@ -394,7 +397,7 @@ class Recorder:
 
     def _tell_progress(self) -> None:
         """Tell how many points are written; the first one before, because nothing is written until all are there."""
-        known = max(self._written, min(self._complete() + 1, 1))
+        known = max(self._written, min(self._complete(), self._first) + 1)
         if known > self._told:
             self._told = known
             if self._memory is not self._own_memory:

@@ -68,7 +68,8 @@ def open_results(
                 metadata = metadata_of(loaded, system, record, digest=digest, contents=contents)
                 recording = replace(recording, metadata=to_builtins(metadata) | _keys_of(system, record.file))
             there = rows[number] if number < len(rows) else 0
-            files.append(opened_again(Path(record.file), recording, there))
+            skipped = record.rows_before(system.grid.first_point)
+            files.append(opened_again(Path(record.file), recording, there, skipped))
     except BaseException:
         for file in files:
             with suppress(OSError):

@@ -21,8 +21,10 @@ from .recording import Columns, Recording, ResultFile, Resumable
 __all__ = ["opened_again"]
 
 
-def opened_again(path: Path, recording: Recording, rows: int) -> ResultFile:
-    """Open a result file that has ``rows`` rows of this run; of a format that cannot go on, it begins again.
+def opened_again(path: Path, recording: Recording, rows: int, skipped: int = 0) -> ResultFile:
+    """Open a result file that has ``rows`` rows of this run, of which the first ones are not made again.
+
+    Of a format that cannot go on, it begins again.
 
     The errors are those of `ResultFormat.open`.
     """
@@ -30,7 +32,7 @@ def opened_again(path: Path, recording: Recording, rows: int) -> ResultFile:
     file: ResultFile = format_.open(path, recording)
     if not rows or not is_file(path) or not hasattr(file, "resume"):
         return file
-    return ResumedFile(file, recording, rows, rounds=getattr(format_, "rounds", False))
+    return ResumedFile(file, recording, rows, skipped, rounds=getattr(format_, "rounds", False))
 
 
 class ResumedFile:
@@ -39,13 +41,15 @@ class ResumedFile:
     Args:
         file: it, open.
         rows: number of rows in it.
+        skipped: how many of them are not made again.
         rounds: whether a value in it may be rounded to 32 bits.
     """
 
-    def __init__(self, file: ResultFile, recording: Recording, rows: int, *, rounds: bool) -> None:
+    def __init__(self, file: ResultFile, recording: Recording, rows: int, skipped: int, *, rounds: bool) -> None:
         self._file, self._recording, self._rows, self._rounds = file, recording, rows, rounds
         self._there = Kept(rows, file.path.stat().st_size)
         self._compared = 0
+        self._skipped = skipped
         self._begun = False
         self._notes: list[Mapping[str, Any]] = []
         types = dict(recording.columns)
@@ -74,6 +78,10 @@ class ResumedFile:
         Raises:
             NotDeterministic: a value is another one; nothing has changed.
         """
+        while self._compared < self._skipped:
+            self._take_piece()
+            count = min(len(self._piece.times) - self._used, self._skipped - self._compared)
+            self._used, self._compared = self._used + count, self._compared + count
         count, done = min(len(times), self._rows - self._compared), 0
         while done < count:
             done += self._compare(times[done:count], [column[done:count] for column in columns])
@@ -105,8 +113,7 @@ class ResumedFile:
 
     def _compare(self, times: NDArray[np.float64], columns: Sequence[NDArray[Any]]) -> int:
         """Compare rows up to the end of a piece of the file; returns their number."""
-        while self._used == len(self._piece.times):
-            self._piece, self._used = next(self._pieces, None) or self._too_short(), 0
+        self._take_piece()
         count = min(len(times), len(self._piece.times) - self._used)
         rows = slice(self._used, self._used + count)
         differences = []
@@ -119,6 +126,11 @@ class ResumedFile:
             raise self._difference(self._compared + row, float(times[row]), place, before, after)
         self._used, self._compared = self._used + count, self._compared + count
         return count
+
+    def _take_piece(self) -> None:
+        """If all rows of a piece of the file are used, take the next one."""
+        while self._used == len(self._piece.times):
+            self._piece, self._used = next(self._pieces, None) or self._too_short(), 0
 
     def _same(self, before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.bool_]:
         """Where two columns have the same values, and the same sign of zero; NaN is NaN."""

@@ -12,7 +12,7 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final, Self
 
@@ -222,6 +222,14 @@ class HostMemory:
         with self._lock:
             self._rung = True
             self._lock.notify_all()
+
+    def begin_at(self, point: int, rings: Iterable[RingPlace]) -> None:
+        """The run begins at this point: of all before it, everything is known, and nothing is waited for."""
+        for place in rings:
+            for counter in (place.counter, place.text_counter):
+                self.counter(counter).raise_to(point // place.step_points)
+        for progress in self.progress.values():
+            progress.raise_to(point)
 
     def begin_again(self) -> None:
         """Of private memory: all counters are 0, as at the start; the rings have their rows."""

@@ -57,6 +57,7 @@ class RowsEnd(NamedTuple):
         layout: the columns that go over the wire, all of numbers.
         rows: how many there are in the whole run.
         lazy: whether nobody steps with them.
+        first: the first one that is sent.
     """
 
     link: int
@@ -65,6 +66,7 @@ class RowsEnd(NamedTuple):
     layout: Layout
     rows: int
     lazy: bool = False
+    first: int = 0
 
     @property
     def pieces(self) -> list[native.Piece]:
@@ -155,7 +157,7 @@ class RowStreams:
         return ctypes.addressof(self._tables[number])
 
     def _table(self, end: StreamEnd, last_point: int) -> native.StreamTable:
-        outgoing = [self._rows(native.OutgoingTable, rows, lazy=rows.lazy) for rows in end.outgoing]
+        outgoing = [self._rows(native.OutgoingTable, rows, lazy=rows.lazy, sent=rows.first) for rows in end.outgoing]
         incoming = [self._rows(native.IncomingTable, rows, most=rows.rows) for rows in end.incoming]
         most = max((rows.row_bytes for rows in chain(outgoing, incoming)), default=0)
         size = max(_BUFFER_BYTES, _HEADER_BYTES + most)

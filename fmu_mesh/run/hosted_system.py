@@ -20,6 +20,7 @@ from ..node.burst_engine import make_engine
 from ..node.engine import Engine
 from ..node.initialization import Initialization
 from ..node.inputs import with_times
+from ..node.runner_states import load_states, set_again
 from ..node.stepping import Runner, connect
 from ..rings import native
 from ..rings.host_memory import HostMemory
@@ -27,6 +28,7 @@ from ..rings.ring import Ring
 from ..system.layout import row_bytes
 from ..system.memory_map import MemoryMap, RingPlace
 from ..system.plan import Plan, make_plan
+from ..system.states import BeginsWith
 from ..variables.value_types import PlainValue
 
 __all__ = ["IN_ONE_NODE", "HostedSystem", "in_one_node"]
@@ -57,6 +59,7 @@ class HostedSystem:
             between steps: several times a second, and not once in each run.
         places: where the rings are in memory, if not as in the plan.
         room: memory of zeros for them; None: memory of its own.
+        begins_with: the states of the first point, if it is not that after Initialization Mode; then it has one run.
 
     Attributes:
         plan: the plan.
@@ -74,6 +77,7 @@ class HostedSystem:
         alone: bool,
         places: tuple[MemoryMap, Mapping[str, RingPlace]] | None = None,
         room: memoryview | None = None,
+        begins_with: BeginsWith | None = None,
     ) -> None:
         self.plan = plan
         self.node = node = plan.nodes[IN_ONE_NODE]
@@ -87,7 +91,8 @@ class HostedSystem:
         self._engine: Engine | None = None
         self._alone = alone
         self._state: ProcessState | None = None
-        self._begins_again, self._names = True, ", ".join(plan.order)
+        self._begins_with = begins_with or BeginsWith()
+        self._begins_again, self._names = begins_with is None, ", ".join(plan.order)
         self._initialization = Initialization(node)
 
     def open(self) -> None:
@@ -115,7 +120,7 @@ class HostedSystem:
         connect(node, self.runners, self.memory, self.memory)
 
     def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:
-        """Initialization Mode, as `Node` does it; then the outputs are those of point 0.
+        """Initialization Mode, as `Node` does it; then the outputs are those of the first point.
 
         Args:
             start_values: by instance and variable, those that are not as in the plan.
@@ -125,6 +130,7 @@ class HostedSystem:
         """
         node, engine = self.node, self._engine
         self._initialization.run(self.runners.values(), start_values, again=engine is not None)
+        load_states(self._begins_with, self.runners)
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)
@@ -132,6 +138,7 @@ class HostedSystem:
             engine.begin_again(self._state)
         for runner in self.runners.values():
             runner.begin()
+        set_again(self._begins_with, self.runners)
         self.memory.grant.raise_to(self.plan.grid.last_point)
         return engine
 

@@ -174,9 +174,8 @@ class InProcessRun:
             return
         self._told = now
         plan, elapsed = self._run.plan, now - self._started
-        rate = point / elapsed if elapsed > 0.0 else 0.0
-        progress = dict.fromkeys(plan.nodes, point)
-        grid = plan.grid
+        grid, progress = plan.grid, dict.fromkeys(plan.nodes, point)
+        rate = (point - grid.first_point) / elapsed if elapsed > 0.0 else 0.0
         status = MeshStatus(
             self._run.mesh, "running", point, grid.last_point, grid.time(point), rate, rate * grid.step_size, progress
         )

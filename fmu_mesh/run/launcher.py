@@ -71,6 +71,7 @@ from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .run_plan import RunPlan
 from .sandbox import Sandboxed
+from .state_file import STATE, again_from_checkpoint
 from .wiring import with_doors
 
 __all__ = ["Elsewhere", "Launcher"]
@@ -185,7 +186,8 @@ class Launcher:
     def _clear_for_next(self) -> None:
         """Remove what the processes of this attempt have left, but for their journals and the note about the mesh."""
         journals = [*self._folder.glob(f"**/*{JOURNAL}")]
-        kept = {*journals, *(file.parent for file in journals), self._folder / "mesh.json"}
+        states = self._folder.glob(f"*{STATE}")
+        kept = {*journals, *states, *(file.parent for file in journals), self._folder / "mesh.json"}
         boxes = [entry for entry in kept if entry.is_dir()]
         for entry in [entry for folder in {self._folder, *boxes} for entry in folder.iterdir()]:
             if entry not in kept:
@@ -198,7 +200,8 @@ class Launcher:
             return None
         seen = max(run.replays_to, last_recorded(run.plan, files), self._states.point)
         rows = tuple(rows for _, rows in files)
-        return replace(run, restarts=run.restarts + 1, rows=rows, replays_to=min(seen, run.plan.grid.last_point))
+        again = replace(run, restarts=run.restarts + 1, rows=rows, replays_to=min(seen, run.plan.grid.last_point))
+        return again_from_checkpoint(again, self._folder, rows) if run.checkpoint_s is not None else again
 
     def _check_reachable(self) -> None:
         """Check that nodes that are started manually on other hosts can reach the master.

@@ -5,19 +5,17 @@ Looks everything up once, before the first step. Knows no other instance but thr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
-
-import msgspec
-from numpy.typing import NDArray
+from typing import NamedTuple
 
 from ..errors import FmuError, InitializationFailed, NotFinite
 from ..instances.call_guard import Guarded
 from ..instances.process_state import floating_point_changed, restore_floating_point
 from ..rings.array_elements import element_of, scaled
 from ..rings.finite import FiniteRows
+from ..rings.packed_member import PackedMember, columns_of, put_columns
 from ..rings.ring import Ring, Rows
 from ..rings.value_change import ValueChange
 from ..simtime import TimeGrid
@@ -27,6 +25,7 @@ from ..system.layout import Layout
 from ..system.plan import Plan
 from ..system.schedule import Course
 from ..system.series_files import courses_of
+from ..text import listed
 from ..variables.value_types import Value
 
 __all__ = ["LocalMember", "SavedMember", "element_at"]
@@ -254,13 +253,15 @@ class LocalMember:
         Raises:
             FmuError: the instance cannot write its state.
         """
-        outputs, inputs = (
-            {name: part[:, columns].tolist() for name, part, columns in _by_column(ring.layout, parts)}
-            for ring, parts in ((self._outputs, saved.outputs), (self._inputs, saved.inputs))
-        )
+        newest = self._newest(saved.step)
+        outputs, inputs = columns_of(self._outputs, saved.outputs, newest), columns_of(self._inputs, saved.inputs, [0])
         state = self.instance.serialize_state(saved.state)
         sent = {name: [*steps] for name, steps in saved.sent.items()}
-        return msgspec.msgpack.encode(_Packed(state, saved.step, saved.set_at, outputs, inputs, sent))
+        return PackedMember(state, saved.step, saved.set_at, outputs, inputs, sent).encoded()
+
+    def _newest(self, step: int) -> list[int]:
+        """The rows that are there after so many own steps."""
+        return [*range(max(0, step + 1 - self._outputs.rows), step + 1)]
 
     def load(self, data: bytes) -> None:
         """Restore a state from the bytes of `packed`.
@@ -270,43 +271,22 @@ class LocalMember:
         Raises:
             FmuError: the instance cannot use its state.
         """
-        try:
-            own, rows = msgspec.msgpack.decode(data, type=_Packed), list[Rows]()
-            for ring, given in ((self._outputs, own.outputs), (self._inputs, own.inputs)):
-                parts = tuple(part.copy() for part in ring.parts)
-                for name, part, columns in _by_column(ring.layout, parts):
-                    if name in given:
-                        part[:, columns] = given[name]
-                rows.append(parts)
-        except (msgspec.MsgspecError, ValueError, TypeError, OverflowError) as error:
-            raise FmuError(f"these rows are not its own: {error}", instance=self.plan.name) from error
+        own = PackedMember.decoded(data, self.plan.name)
+        if own.waits:
+            text = f"values of {listed([*own.waits])} wait for their time, which a program that steps cannot have"
+            raise FmuError(text, instance=self.plan.name, hint="A run can begin with it: `run(state=...)`.")
+        outputs, inputs = (tuple(part.copy() for part in ring.parts) for ring in (self._outputs, self._inputs))
+        newest = self._newest(own.step)
+        others = put_columns(self._outputs, outputs, newest, own.outputs, self.plan.name)
+        put_columns(self._inputs, inputs, [0], own.inputs, self.plan.name)
         state = self.instance.deserialize_state(own.state)
         try:
-            self.restore(SavedMember(state, own.step, own.set_at, rows[0], rows[1], own.sent))
+            self.restore(SavedMember(state, own.step, own.set_at, outputs, inputs, own.sent))
         finally:
             self.instance.free_state(state)
-        if others := [name for name in self._outputs.layout.names if name not in own.outputs]:
-            for name, value in zip(others, self.instance.get_values(others), strict=True):
-                for row in range(self._outputs.rows):
-                    self._outputs.put(row, name, value)
-
-
-def _by_column(layout: Layout, parts: Rows) -> Iterator[tuple[str, NDArray[Any], slice]]:
-    """Each column of rows: its name, the array of its part, and its place there."""
-    for name in layout.names:
-        place = layout.place(name)
-        yield name, parts[place.part], slice(place.first, place.first + place.size)
-
-
-class _Packed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, array_like=True):
-    """A `SavedMember` as it is in a file: rows by column, each a list of rows of elements."""
-
-    state: bytes
-    step: int
-    set_at: int
-    outputs: dict[str, list[list[Any]]]
-    inputs: dict[str, list[list[Any]]]
-    sent: dict[str, list[int]]
+        for name, value in zip(others, self.instance.get_values(others) if others else [], strict=True):
+            for row in newest:
+                self._outputs.put(row, name, value)
 
 
 class _Feed(NamedTuple):

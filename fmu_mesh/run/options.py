@@ -19,6 +19,7 @@ __all__ = [
     "RunOptions",
     "SimulateOptions",
     "StartOptions",
+    "State",
     "VariantOptions",
 ]
 
@@ -46,6 +47,9 @@ Restarts = Annotated[
 Resume = Annotated[
     bool, Option("go on with the run in `recovery.directory`, which was cut off by a power cut or killed", "--resume")
 ]
+State = Annotated[
+    File, Option("begin with this state, which `System.save` or `Run.checkpoint` has written", "--from", "FILE")
+]
 OnProgress = Annotated[Callable[["MeshStatus"], object] | None, Option("called about ten times per second")]
 OnEvent = Annotated[Callable[["Event"], object] | None, Option("called with every event of `fmu_mesh.run.events`")]
 MEMORY_LIMIT = 2**30
@@ -72,7 +76,7 @@ class OpenOptions(VariantOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
-    state: Annotated[File, Option("go on from this state, which `System.save` has written")] = None
+    state: State = None
 
 
 class BatchOptions(VariantOptions, frozen=True):
@@ -114,6 +118,7 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
     scenario: Annotated[
         File | Mapping[str, Any], Option("values over time: a file, or what such a file has", "--scenario", "FILE")
     ] = None
+    state: State = None
     listen: Annotated[Sequence[str] | None, Option(None, "--listen", "ENDPOINT", "zenoh.listen")] = None
     connect: Annotated[Sequence[str] | None, Option(None, "--connect", "ENDPOINT", "zenoh.connect")] = None
     security: Annotated[

@@ -30,6 +30,7 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
         signal: name of the signal by which the process of the master was asked to end, if it was.
         files: each result file, and the number of its rows.
         warnings: what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended.
+        first: the point at which the run began.
     """
 
     state: Literal["done", "failed"]
@@ -44,6 +45,7 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     signal: str | None = None
     files: tuple[tuple[str, int], ...] = ()
     warnings: tuple[str, ...] = ()
+    first: int = 0
 
 
 def last_recorded(plan: Plan, files: Sequence[tuple[str, int]]) -> int:
@@ -74,4 +76,5 @@ def outcome_at(  # noqa: PLR0913  each is a field of its own
         ended_by=ended_by.report() if ended_by is not None else None,
         files=tuple(files),
         warnings=tuple(warnings),
+        first=plan.grid.first_point,
     )

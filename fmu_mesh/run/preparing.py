@@ -8,7 +8,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -43,6 +43,7 @@ from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
 from .sandbox import why_no_sandbox
+from .state_file import StateFile
 
 __all__ = ["KnownModels", "OtherStartValues", "check_reset", "planned", "planned_reset", "without_keys"]
 
@@ -203,7 +204,7 @@ def planned(
         connect=tuple(options.connect or ()),
     )
     obstacles.raise_any(run)
-    return run
+    return StateFile.read(Path(options.state)).begin(run) if options.state is not None else run
 
 
 def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:
@@ -225,9 +226,9 @@ class OtherStartValues:
     """Decides whether start values of a further run, or of a reset, change nothing else of its plan.
 
     That is so if each is a value of a variable that is no structural parameter and has another start value in the plan,
-    and if the plan uses start values for nothing else: no loop is iterated in Initialization Mode, there is no
-    scenario, and the instance has no input with a timeout or a key. The files of the models have to be as they were
-    when the run was planned, unless nothing is loaded again.
+    and if the plan uses start values for nothing else: no loop is iterated in Initialization Mode, there is no scenario
+    and no state to begin with, and the instance has no input with a timeout or a key. The files of the models have to
+    be as they were when the run was planned, unless nothing is loaded again.
 
     Args:
         run: the run.
@@ -249,7 +250,7 @@ class OtherStartValues:
         self._resets: dict[frozenset[str], OtherStartValues] = {}
         items = [item for node in run.plan.nodes.values() for item in node.instances]
         system = run.plan.system
-        is_fixed = run.plan.initialization.loops or system.config.scenario is not None
+        is_fixed = run.plan.initialization.loops or system.config.scenario is not None or run.begins_with is not None
         self._variables: dict[str, tuple[str, Variable, bool]] = {}
         for item in items if not (is_fixed or any(item.scenario for item in items)) else ():
             description, finite = system.instances[item.name].description, item.not_finite == "stop"
@@ -339,20 +340,17 @@ def check_reset(run: RunPlan, again: RunPlan) -> None:
     Raises:
         ConfigurationError: more would change than values.
     """
-    if _without_start_values(again) != _without_start_values(run):
-        text = f"mesh '{run.mesh}' cannot be reset: it would have other sizes, or a file of it has changed"
+    if run.begins_with is not None or _without_start_values(again) != _without_start_values(run):
+        why = "it would have other sizes, or a file of it has changed"
+        text = f"mesh '{run.mesh}' cannot be reset: {why if run.begins_with is None else 'it has begun with a state'}"
         raise ConfigurationError(text, hint="Start it again.")
 
 
 def _without_start_values(run: RunPlan) -> object:
     """What must stay as it is in a reset, because processes and their links have it."""
+    plain: dict[str, Any] = {"start_values": {}, "timeouts": ()}
     return run.contents, {
-        name: replace(
-            node,
-            digest="",
-            records=(),
-            instances=tuple(replace(own, start_values={}, timeouts=()) for own in node.instances),
-        )
+        name: replace(node, digest="", records=(), instances=tuple(replace(own, **plain) for own in node.instances))
         for name, node in run.plan.nodes.items()
     }
 

@@ -220,7 +220,7 @@ class RepeatedRuns:
             return open_instance(replace(opening, content=run.contents.get(name), kept=around.models))
 
         self._slices, self._made_for = _Slices(), (run, files, watch)
-        self._system = HostedSystem(plan, watch, opened, self._log, alone=self._alone)
+        self._system = HostedSystem(plan, watch, opened, self._log, alone=self._alone, begins_with=run.begins_with)
         return self._system
 
     def _log(self, message: LogMessage) -> None:
@@ -291,7 +291,7 @@ class _Run:
     """
 
     def __init__(self, system: HostedSystem, writer: RowWriter, surroundings: _Surroundings, slices: _Slices) -> None:
-        self.point = 0
+        self.point = system.plan.grid.first_point
         self._slices = slices
         self._system, self._plan = system, system.plan
         self._last = self._plan.grid.last_point
@@ -390,7 +390,7 @@ class _Run:
         """Take steps and write rows; rows that are not written yet are never overwritten."""
         writer, window, slices = self.writer, self._plan.window, self._slices
         pacer = Pacer(self._plan, self._plan.system.config.simulation.real_time_factor)
-        pacer.start(0)
+        pacer.start(self.point)
         many = max(1, min(_WRITE_ROWS, window // 2))
         while True:
             self.point = point = engine.point

@@ -48,6 +48,7 @@ from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_directory import Syncing
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
+from .state_file import keep_state, state_bytes
 from .wiring import certified, patient, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
@@ -170,6 +171,7 @@ class _NodeProcess:
                 meeting=self._meeting,
                 strain=partial(strain, plan.process),
                 table=table_of(own),
+                begins_with=run.begins_with,
             )
             gc.collect()  # the memory of the run before a reset is in circles of objects
             if process.interruption.reason is not None:
@@ -288,6 +290,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 paused=run.paused,
                 attempt=run.attempt_of(MASTER),
                 table=table_of(own),
+                as_file=lambda point, states: state_bytes(runs.run, point, states),
+                keep=partial(keep_state, process.folder),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())

@@ -57,7 +57,8 @@ class RowWriter:
         self._files.begin_again(files)
 
     def begin(self, plan: Plan, runners: Mapping[str, Runner]) -> None:
-        """All instances are at point 0."""
+        """All instances are at the first point."""
+        self.written = plan.grid.first_point
         if self._files.in_memory:
             self._flushed = time.monotonic()  # nobody can look into memory: the first row waits for others
         if RECORDER not in plan.nodes or runners is self._runners:

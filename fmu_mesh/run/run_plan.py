@@ -25,6 +25,7 @@ from ..system.attempt import Attempt
 from ..system.layout import row_bytes
 from ..system.plan import RECORDER, NodePlan, Plan
 from ..system.start_values import why_not_settable
+from ..system.states import BeginsWith
 from ..text import counted, did_you_mean, listed, meant, nearest, shown
 from ..variables.model_description import ModelDescription, Variable
 from ..wire.journal import JOURNAL
@@ -80,6 +81,7 @@ class NodeRun(msgspec.Struct, frozen=True):
         security: the certificate of this host.
         launch: identifies the launch, on another host than that of the launcher; None: this is known.
         helper: the process id of the helper of the launcher there.
+        begins_with: the states of its instances at the first point.
     """
 
     config_file: Path
@@ -91,6 +93,7 @@ class NodeRun(msgspec.Struct, frozen=True):
     security: SecurityConfig | None = None
     launch: str | None = None
     helper: int | None = None
+    begins_with: BeginsWith | None = None
 
 
 class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -112,6 +115,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         connect: Zenoh endpoints that an option gives.
         run: name of the run: that of the launcher (`run_name`), or `MANUAL`.
         restarts: how often the run was started before.
+        begins_with: the states of its first point; None: it is that after Initialization Mode.
         max_restarts: how often it may be started again.
         rows: of each result file, how many rows it has from before.
         replays_to: the last point that was seen before: up to it, the run is as it was.
@@ -127,10 +131,16 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     connect: tuple[str, ...] = ()
     run: str = MANUAL
     restarts: int = 0
+    begins_with: BeginsWith | None = None
     max_restarts: int = 0
     rows: tuple[int, ...] = ()
     replays_to: int = 0
     directory: str = ""
+
+    @property
+    def checkpoint_s(self) -> float | None:
+        """How often in s there is a checkpoint for a restart; None: never."""
+        return self.loaded.config.recovery.checkpoint_s if self.restarts < self.max_restarts else None
 
     @property
     def config_file(self) -> Path:
@@ -201,6 +211,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 for item in plan.nodes[name].instances
             },
             security=self.loaded.config.security,
+            begins_with=self.begins_with and self.begins_with.only(item.name for item in plan.nodes[name].instances),
         )
 
     def attempt_of(self, participant: str) -> Attempt:
@@ -269,7 +280,8 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         nodes = {name: encoded(self.node(name)) for name in self.plan.nodes if name != RECORDER}
         file = folder / _FILE_NAME
         try:
-            file.write_bytes(in_parts({**nodes, _RUN: encoded(self)}))
+            lean = replace(self, begins_with=self.begins_with and self.begins_with.only(()))
+            file.write_bytes(in_parts({**nodes, _RUN: encoded(lean)}))
         except OSError as error:
             text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error

@@ -10,20 +10,28 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, Self
+from types import MappingProxyType
+from typing import Final, NamedTuple, Self
 
 import msgspec
+from msgspec.structs import replace
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
-from ..system.states import SavedInstance, differences, saved_instances
+from ..results.formats import required_format
+from ..system.plan import RECORDER
+from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
 from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
 
-__all__ = ["StateFile", "write_state"]
+__all__ = ["STATE", "StateFile", "again_from_checkpoint", "keep_state", "state_bytes", "write_state"]
+
+STATE: Final = ".state"
+"""How the names of checkpoints in the folder of a run end."""
 
 _LETTERS = b"FMUSTATE"
 _VERSION = 1
@@ -110,28 +118,98 @@ class StateFile(NamedTuple):
             raise ConfigurationError(text, findings=tuple(findings), hint=hint)
         return values
 
+    def begin(self, run: RunPlan) -> RunPlan:
+        """The plan of a run that begins here: this point is its first one, and times are as they are.
 
-def write_state(
-    file: Path, run: RunPlan, others: Mapping[str, Mapping[str, PlainValue]], point: int, states: Mapping[str, bytes]
-) -> None:
-    """Write a state of a run at a point into a file, in the place of an older one; see `StateFile`.
+        Raises:
+            ConfigurationError: it cannot begin here; carries all differences.
+        """
+        values, plan, point, findings = self.check(run), run.plan, self.head.point, []
+        for name, own in plan.system.instances.items():
+            if point % own.step_points:
+                text = f"its step is {own.step_points} points, and the state is of point {point}, within one"
+                findings.append(Finding(str(self.file), f"instances.{name}", text, ""))
+        for name, why in stateless(plan.system).items():
+            findings.append(Finding(str(self.file), f"instances.{name}", f"its state cannot be restored: {why}", ""))
+        if findings:
+            text = f"a run cannot begin with the state '{self.file}'"
+            raise ConfigurationError(text, findings=tuple(findings))
+        grid = replace(plan.grid, first_point=point)
+        records = tuple(replace(own, first=own.point_of(own.rows_before(point))) for own in plan.system.records)
+        system = replace(plan.system, grid=grid, records=records, begins_with=str(self.file.absolute()))
+        nodes = {
+            name: replace(node, grid=grid, records=records if name == RECORDER else ())
+            for name, node in plan.nodes.items()
+        }
+        begins_with = BeginsWith(dict(self.states), values)
+        return replace(run, plan=replace(plan, system=system, nodes=nodes), begins_with=begins_with)
+
+
+def state_bytes(
+    run: RunPlan,
+    point: int,
+    states: Mapping[str, bytes],
+    others: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
+) -> bytes:
+    """The content of a state file: the states of a run at a point; see `StateFile`.
 
     ``others`` are the start values that are not as in the plan, by instance and variable.
-
-    Raises:
-        ConfigurationError: the file cannot be written; an older one is as it was.
     """
     grid = run.plan.grid
     blocks = {name: (len(own), hashlib.sha256(own).digest()) for name, own in states.items()}
     instances = saved_instances(run.plan, run.contents, others)
     own = _Head(__version__, run.mesh, point, grid.start_time, grid.step_size, instances, blocks)
     head = msgspec.msgpack.encode(own)
+    start = _START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest())
+    return b"".join((start, head, *states.values()))
+
+
+def keep_state(folder: Path, point: int, data: bytes) -> None:
+    """Keep a checkpoint of a run in its folder, for a restart, and the one before it.
+
+    The errors are those of `write_state`.
+    """
+    write_state(folder / f"{point}{STATE}", data, synced=False)
+    for older in sorted(folder.glob(f"*{STATE}"), key=_point_of)[:-2]:
+        older.unlink(missing_ok=True)
+
+
+def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> RunPlan:
+    """A run that starts again, from its newest checkpoint of which all files have the ``rows`` before it.
+
+    Without one, and where the format of a file cannot go on, it begins where it began.
+    """
+    system = run.plan.system
+    if not all(hasattr(required_format(Path(own.file)), "resume") for own in system.records):
+        return run
+    for file in sorted(folder.glob(f"*{STATE}"), key=_point_of, reverse=True):
+        with suppress(ConfigurationError):  # its writer was killed
+            state = StateFile.read(file)
+            point = state.head.point
+            if all(there >= own.rows_before(point) for there, own in zip(rows, system.records, strict=True)):
+                grid = replace(run.plan.grid, first_point=point)
+                nodes = {name: replace(node, grid=grid) for name, node in run.plan.nodes.items()}
+                plan = replace(run.plan, system=replace(system, grid=grid), nodes=nodes)
+                return replace(run, plan=plan, begins_with=BeginsWith(dict(state.states)))
+    return run
+
+
+def _point_of(file: Path) -> int:
+    return int(file.stem) if file.stem.isdecimal() else -1
+
+
+def write_state(file: Path, data: bytes, *, synced: bool = True) -> None:
+    """Write the content of a state file, in the place of an older one; if ``synced``, it survives a power cut.
+
+    Raises:
+        ConfigurationError: the file cannot be written; an older one is as it was.
+    """
     try:
+        file.parent.mkdir(parents=True, exist_ok=True)
         with files.replaced(file) as draft, draft.open("wb") as target:
-            target.write(_START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest()))
-            for part in (head, *states.values()):
-                target.write(part)
+            target.write(data)
             target.flush()
-            os.fsync(target.fileno())  # else its name could survive a power cut, and its content not
+            if synced:  # else its name could survive a power cut, and its content not
+                os.fsync(target.fileno())
     except OSError as error:
         raise ConfigurationError(f"the state '{file}' cannot be written: {error.strerror}") from error

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ..config.call_options import Option
-from ..run.options import VariantOptions
+from ..run.options import State, VariantOptions
 
 if TYPE_CHECKING:
     from ..api.result import Result
@@ -20,6 +20,7 @@ Own = Callable[["Result"], object]
 class SweepOptions(VariantOptions, frozen=True, kw_only=True):
     """What `fmu_mesh.sweep` takes beside the mesh and what varies."""
 
+    state: State = None
     executor: Annotated[
         Executor | None,
         Option(

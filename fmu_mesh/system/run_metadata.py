@@ -106,6 +106,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
         variables: the recorded variables by column.
         started: when the run was started, in UTC, after ISO 8601.
         host: name of the host that wrote the file.
+        state: the state file with which the run began, absolute; empty: it began at point 0.
     """
 
     format: int
@@ -126,6 +127,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
     variables: dict[str, RecordedVariable]
     started: str
     host: str
+    state: str = ""
 
 
 def metadata_of(
@@ -174,6 +176,7 @@ def metadata_of(
         variables=variables,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         host=socket.gethostname(),
+        state=system.begins_with,
     )
 
 

@@ -6,7 +6,7 @@ Owns no file and no state; those are `fmu_mesh.run.state_file` and the instances
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
 
 import msgspec
@@ -19,7 +19,7 @@ from .plan import Plan
 from .start_values import why_not_settable
 from .system import ResolvedSystem
 
-__all__ = ["SavedInstance", "differences", "saved_instances", "stateless"]
+__all__ = ["BeginsWith", "SavedInstance", "differences", "saved_instances", "stateless"]
 
 _DIGITS = 16
 
@@ -34,6 +34,26 @@ class SavedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     agreed: dict[str, str]
     start_values: dict[str, PlainValue]
+
+
+class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The states with which a run begins, at the first point of its grid.
+
+    Attributes:
+        states: that of each instance.
+        set_again: the start values that are others now, by instance and variable.
+    """
+
+    states: dict[str, bytes] = {}
+    set_again: dict[str, dict[str, PlainValue]] = {}
+
+    def only(self, names: Iterable[str]) -> BeginsWith:
+        """What these instances need."""
+        known = {*names}
+        return BeginsWith(
+            {name: state for name, state in self.states.items() if name in known},
+            {name: values for name, values in self.set_again.items() if name in known},
+        )
 
 
 def stateless(system: ResolvedSystem, *, keys: bool = True) -> dict[str, str]:

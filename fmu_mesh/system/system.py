@@ -84,6 +84,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
         topics: those in ROS.
         recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
+        begins_with: the state file with which it begins, absolute, or nothing.
     """
 
     config: Config
@@ -95,6 +96,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     scenario_files: dict[str, str] = {}
     topics: tuple[MeshTopic, ...] = ()
     recorded_keys: RecordedKeys | None = None
+    begins_with: str = ""
 
     @property
     def keys(self) -> tuple[KeyView, ...]:
@@ -104,10 +106,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
-        """(instance, variable) of the columns of all result files, each once, in their order.
-
-        Each element of an array is a column, as `y[1,2]`.
-        """
+        """(instance, variable) of the columns of all result files, each once; an element of an array is `y[1,2]`."""
         return union_of(self.records)
 
     def base_of(self, instance: str, name: str) -> str:

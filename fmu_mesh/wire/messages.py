@@ -4,7 +4,8 @@ Every message starts with 24 bytes, little endian: kind (u8), three spare bytes,
 four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames`), and in these as JSON: in an ABORT an
 `ErrorReport`, in a RESET a `NewStart`, and for the recorder (`FOR_METADATA`) in a SET a `SetValue`, in a NOTED a
 `Noted`, in a KEYS values that have come by keys, and for the audit in a REFUSED an `AuditEntry`. LAST says that no more
-rows of a link come, because the run has ended early. Every decoder checks sizes before it reads anything, and raises
+rows of a link come, because the run has ended early. SAVE asks the nodes for their states at a point, and a STATE has
+that of one instance, as MessagePack (`InstanceState`). Every decoder checks sizes before it reads anything, and raises
 only `MessageRefused`.
 """
 
@@ -37,16 +38,22 @@ __all__ = [
     "KEYS",
     "LAST",
     "MAX_MESSAGE_SIZE",
+    "MAX_STATE_SIZE",
     "PROGRESS",
     "REFUSED",
     "RESET",
+    "SAVE",
     "SET",
+    "STATE",
+    "InstanceState",
     "NewStart",
     "NodeReport",
     "SetValue",
     "decode_json",
+    "decode_state",
     "encode_json",
     "encode_news",
+    "encode_state",
     "sealed",
 ]
 
@@ -66,9 +73,13 @@ RESET: Final = 11
 KEYS: Final = 12
 NOTED: Final = 13
 REFUSED: Final = 14
+SAVE: Final = 15
+STATE: Final = 16
 FOR_METADATA: Final = (SET, KEYS, NOTED)
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
+MAX_STATE_SIZE: Final = MAX_MESSAGE_SIZE - 2**16
+"""Of the state of an instance in a message, with room for the rest."""
 
 T = TypeVar("T")
 
@@ -108,6 +119,14 @@ class SetValue(msgspec.Struct, frozen=True, omit_defaults=True):
     key: str
     who: str
     by: str = ""
+
+
+class InstanceState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The state of an instance for a checkpoint; an error in its place: it cannot be written."""
+
+    instance: str
+    state: bytes = b""
+    error: ErrorReport | None = None
 
 
 class Noted(msgspec.Struct, frozen=True):
@@ -157,6 +176,25 @@ def encode_news(news: SetValue | AuditEntry | Noted | Sequence[KeyValue]) -> byt
         case Noted():
             return encode_json(NOTED, news, news.point)
     return encode_json(KEYS, news, news[-1][1])
+
+
+def encode_state(state: InstanceState, point: int) -> bytes:
+    """A STATE message of the communication point of the state."""
+    return HEADER.pack(STATE, 0, 0, point) + msgspec.msgpack.encode(state)
+
+
+def decode_state(data: bytes) -> InstanceState:
+    """What a STATE message has.
+
+    Raises:
+        MessageRefused: it is none, or too large.
+    """
+    if len(data) > MAX_MESSAGE_SIZE:
+        raise MessageRefused(f"it has {len(data)} bytes; the limit is {MAX_MESSAGE_SIZE}")
+    try:
+        return msgspec.msgpack.decode(data[HEADER.size :], type=InstanceState)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise MessageRefused(str(error)) from error
 
 
 def decode_json(data: bytes, type_: type[T], most: int = MAX_MESSAGE_SIZE) -> T:

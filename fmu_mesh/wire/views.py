@@ -409,11 +409,12 @@ class Command(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
     Attributes:
         points: for `step` only.
         paced: for `step` and `resume`: whether the real-time factor limits what follows.
-        wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests.
+        wait: for how long in s the answer to `pause` or `step` may wait until the mesh rests, and that to `checkpoint`
+            until it has its file.
         start_values: for `reset` only; by `instance.variable`, as in a configuration file.
     """
 
-    command: Literal["pause", "resume", "step", "stop", "reset"]
+    command: Literal["pause", "resume", "step", "stop", "reset", "checkpoint"]
     points: Annotated[int, msgspec.Meta(le=ENDLESS)] = 1
     paced: bool = True
     wait: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from itertools import pairwise
 from pathlib import Path
@@ -280,3 +281,23 @@ def test_restarts_and_one_process_do_not_go_together(place: Place) -> None:
 
     assert launched.wait() == 2
     assert "`recovery.mode: restart` and --local do not go together" in launched.message
+
+
+@pytest.mark.parametrize("kind", ["chain", "rates", "groups"])
+@pytest.mark.parametrize("victim", ["slow", "master"])
+def test_a_restart_begins_with_the_newest_checkpoint(place: Place, kind: str, victim: str) -> None:
+    if kind == "groups" and victim == "slow":
+        victim = "both"
+    config = written(place, kind, recovery={"mode": "restart", "checkpoint_s": 0.05})
+    launched = place.start("launch", config, "--no-progress")
+    folder = wait_until(lambda: next(iter((place.folder / "run").glob("**/*.state")), None), "a checkpoint").parent
+    states = sorted(int(file.stem) for file in folder.glob("*.state"))
+
+    killed(launched, result := config.with_suffix(".csv"), victim, states[-1] + 200)
+
+    launched.wait_for_error_line("starts again and goes on from point")
+    assert launched.wait() == 0, launched.story()
+    (points,) = re.findall(r"^(\d+) points in", launched.story(), re.MULTILINE)
+    assert 0 < int(points) <= POINTS - states[-1]
+    place.assert_nothing_left()
+    assert result.read_bytes() == undisturbed(config)

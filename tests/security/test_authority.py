@@ -96,7 +96,7 @@ def test_show_tells_who_has_which_role_until_when(lab: Does) -> None:
         "bob",
     ]
     assert msgspec.json.decode(lab("show lab/bob --json"))["role"] == "observer"
-    assert "pause, resume, step, reset and stop" in lab("show lab --table")
+    assert "pause, resume, step, reset, stop, checkpoint" in lab("show lab --table")
 
 
 def test_a_renewed_folder_has_a_new_key_and_the_same_table(lab: Does, tmp_path: Path) -> None:

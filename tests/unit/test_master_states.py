@@ -18,20 +18,12 @@ from fmu_mesh.errors import (
     StepFailed,
     TerminationRequested,
 )
-from fmu_mesh.master.master_states import (
-    Action,
-    AnswerAll,
-    Commanded,
-    EndAll,
-    FollowClock,
-    MasterStates,
-    RaiseGrant,
-    SendToAll,
-)
+from fmu_mesh.master.actions import Action, AnswerAll, Commanded, EndAll, FollowClock, RaiseGrant, SendToAll
+from fmu_mesh.master.master_states import MasterStates
 from fmu_mesh.simtime import ENDLESS
 from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.wire.membership import NodeReady, Registration
-from fmu_mesh.wire.messages import FINISH, GRANT, NodeReport, sealed
+from fmu_mesh.wire.messages import FINISH, GRANT, SAVE, NodeReport, sealed
 from fmu_mesh.wire.views import Command
 from fmu_mesh.wire.ways import Ways
 from tests.helpers import write_config
@@ -609,3 +601,43 @@ def test_a_state_has_at_most_fifteen_attributes(plan: Plan) -> None:
     assert {
         type(item).__name__ for item in (states, states.granting, states.registrations) if len(vars(item)) > 15
     } == set()
+
+
+def test_all_nodes_are_held_at_a_common_point_until_saved(plan: Plan) -> None:
+    run = running(plan)
+    run.at(10)
+    run.decide()
+
+    assert run.states.save(claimed=13, every=4)
+
+    assert (run.states.saves_at, run.states.wanted, run.states.state) == (16, 16, "running")
+    assert SendToAll(SAVE, 16) in run.decide()
+    run.at(16)
+    assert RaiseGrant(LAST) not in run.decide()
+    assert (run.states.granting.grant, run.states.moves) == (16, False)
+    run.now += 100.0  # longer than each deadline of a step: whoever asks for the states looks at the time
+    assert run.decide() == [SendToAll(GRANT, 0)] or run.states.failure is None
+    run.states.saved()
+    run.decide()
+    assert run.states.granting.grant > 16
+
+
+def test_a_pause_before_a_common_point_saves_nothing(plan: Plan) -> None:
+    run = running(plan)
+    run.at(10)
+    run.command("pause", claimed=13)
+
+    assert not run.states.save(claimed=13, every=4)
+
+    assert (run.states.saves_at, run.states.hold) == (None, 13)
+
+
+def test_a_run_does_not_end_before_its_last_point_is_saved(plan: Plan) -> None:
+    run = running(plan)
+    assert run.states.save(claimed=LAST, every=1)
+    run.at(LAST)
+    run.decide()
+    states = [run.states.state]
+    run.states.saved()
+    run.decide()
+    assert [*states, run.states.state] == ["running", "stopping"]

@@ -129,7 +129,7 @@ def _work(node: NodeProfile) -> str:
 
 def summary_of(plan: Plan, profile: MeshProfile, seconds: float) -> dict[str, Any]:
     """The figures of the table as JSON: times in s."""
-    points = plan.grid.last_point
+    points = plan.grid.last_point - plan.grid.first_point
     rate = points / seconds if seconds > 0.0 else 0.0
     return {
         "mesh": plan.system.config.mesh,

@@ -225,11 +225,19 @@ class MeshClient:
 
     def command(self, command: Command, timeout_s: float | None = None) -> CommandAnswer:
         """Pause, resume, step or stop the mesh; the answer comes before the mesh has paused."""
+        return _understood(self._commanded(command, timeout_s), CommandAnswer, self._who)
+
+    def checkpoint(self, timeout_s: float | None = None) -> bytes:
+        """The states of all instances at one point, as the content of a state file; `ConfigurationError` if not."""
+        timeout_s = timeout_s if timeout_s is not None else self._timeout_s
+        command = Command("checkpoint", wait=max(timeout_s - _ANSWER_S, timeout_s / 2))
+        return self._commanded(command, timeout_s).payload.to_bytes()
+
+    def _commanded(self, command: Command, timeout_s: float | None) -> zenoh.Sample:
         self.check_may(f"'{command.command}'")
         payload = msgspec.json.encode(command)
         who, limit_s = encode_origin(None, this_program()), timeout_s or self._timeout_s
-        question = Question(self._command_key, self._who, limit_s, payload, who, once=True)
-        return _understood(self._ask(question)[0], CommandAnswer, self._who)
+        return self._ask(Question(self._command_key, self._who, limit_s, payload, who, once=True))[0]
 
     def check_may(self, what: str, needs: Role = "operator") -> None:
         """Check that the role of this process may do something: what is not allowed would vanish without an answer.

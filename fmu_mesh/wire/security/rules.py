@@ -94,7 +94,13 @@ ACTIONS: Final = (
     Action("read the keys at ends of connections", ROLE_NAMES, _ENDS, _READS, (*_ANSWERS, *_WHO_LISTENS)),
     Action("write the keys at ends of connections", _WHO_ACTS, _ENDS, _ALL, _ALL),
     Action("set inputs and parameters", _WHO_ACTS, ("{mesh}/*/set/@by/{name}/**",), _SENDS, ("reply",)),
-    Action("pause, resume, step, reset and stop", _WHO_ACTS, ("{mesh}/mesh/command/@by/{name}",), _SENDS, ("reply",)),
+    Action(
+        "pause, resume, step, reset, checkpoint and stop",
+        _WHO_ACTS,
+        ("{mesh}/mesh/command/@by/{name}",),
+        _SENDS,
+        ("reply",),
+    ),
     Action("see who listens to settings and commands", _WHO_ACTS, _NAMED, (), _WHO_LISTENS),
     Action("be a part of a run", ("node",), ("{mesh}/**", "{mesh}/@sync/**", *_NAMED), _ALL, _ALL),
 )

@@ -1,0 +1,116 @@
+"""The state of an instance in a node, as bytes that outlive its process, and a run that begins with one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+from msgspec.structs import replace
+
+from ..errors import FmuError
+from ..instances.contract import KeepsState
+from ..rings.packed_member import PackedMember, columns_of, put_columns
+from ..system.states import BeginsWith
+from ..variables.value_conversion import to_value
+from ..wire.messages import MAX_STATE_SIZE, InstanceState, encode_state
+from .inputs import TimedInputs, set_input
+from .stepping import Runner
+
+__all__ = ["load_states", "set_again", "state_messages"]
+
+
+def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
+    """After Initialization Mode, and before an engine is made: bring the runners to their states.
+
+    Raises:
+        FmuError: an instance cannot use its state.
+    """
+    for name, data in begins_with.states.items():
+        _load(runners[name], data)
+
+
+def set_again(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
+    """When there is an engine, and before the first step: set what is another start value now.
+
+    Raises:
+        FmuError: an instance refused it.
+    """
+    for name, values in begins_with.set_again.items():
+        description = runners[name].instance.description
+        variables = {variable.name: variable for variable in description.variables}
+        for own, value in values.items():
+            set_input(runners[name], own, to_value(value, variables[own]), None)
+
+
+def state_messages(runners: Mapping[str, Runner], at: int) -> list[bytes] | None:
+    """The states of all runners at the point of a checkpoint, as messages; None before that point.
+
+    The master cannot go on without an answer: where an instance has no state to send, it gets the reason. After that
+    point the checkpoint was given up, and there are no messages.
+    """
+    points = [runner.point for runner in runners.values()]
+    if min(points) < at:
+        return None
+    messages = []
+    for name, runner in runners.items() if max(points) == at else ():
+        try:
+            own = InstanceState(name, _packed(runner))
+            if (size := len(own.state)) > MAX_STATE_SIZE:
+                raise FmuError(f"its state takes {size} bytes; the limit is {MAX_STATE_SIZE}", instance=name)  # noqa: TRY301  as from an FMU
+        except FmuError as error:
+            own = InstanceState(name, error=error.at(at, runner.grid.time(at)).report())
+        messages.append(encode_state(own, at))
+    return messages
+
+
+def _packed(runner: Runner) -> bytes:
+    """The state of a runner between two steps, at a point at which all instances have an own one.
+
+    So its newest row is the only one that a step may still read.
+
+    Raises:
+        FmuError: the instance cannot write its state.
+    """
+    step, instance = runner.step, cast("KeepsState", runner.instance)
+    if isinstance(runner.instance, TimedInputs):
+        runner.instance.reached(step)
+    state = instance.get_state()
+    try:
+        data = instance.serialize_state(state)
+    finally:
+        instance.free_state(state)
+    known = PackedMember(data, step, -1, {}, {}, {})
+    if isinstance(runner.instance, TimedInputs):
+        own, data = runner.instance.apart(data)
+        known = replace(own, state=data)
+    outputs = columns_of(runner.outputs, runner.outputs.parts, [step])
+    inputs = columns_of(runner.inputs, runner.inputs.parts, [0])
+    return replace(known, outputs=outputs, inputs=inputs).encoded()
+
+
+def _load(runner: Runner, data: bytes) -> None:
+    own, grid, name = PackedMember.decoded(data, runner.name), runner.grid, runner.name
+    if (at := own.step * runner.plan.step_points) != grid.first_point:
+        raise FmuError(f"its state is of point {at}, and the run begins at point {grid.first_point}", instance=name)
+    runner.table.note(step=own.step)
+    for link in runner.out_links:
+        link.begin_at(own.step)
+    runner.bind()
+    if own.over_time and not isinstance(runner.instance, TimedInputs):
+        timed = TimedInputs(runner.instance, "hold")
+        timed.start(grid, runner.plan.step_points, own.step)
+        runner.wrap(timed)
+    instance = cast("KeepsState", runner.instance)
+    together = runner.instance.together(own) if isinstance(runner.instance, TimedInputs) else own.state
+    if isinstance(runner.instance, TimedInputs):
+        runner.instance.skip_before(grid.first_point)
+    state = instance.deserialize_state(together)
+    try:
+        instance.set_state(state)
+    finally:
+        instance.free_state(state)
+    outputs = runner.outputs
+    others = put_columns(outputs, outputs.parts, [own.step], own.outputs, name)
+    put_columns(runner.inputs, runner.inputs.parts, [0], own.inputs, name)
+    for other, value in zip(others, runner.instance.get_values(others) if others else [], strict=True):
+        outputs.put(own.step, other, value)
