@@ -189,7 +189,7 @@ class MasterStates:
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
         last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
-        if self._is_paced and self.is_replaying:
+        if self._is_paced and self.replays_to:  # until the wall clock has begun there
             last_point = min(last_point, self.replays_to)
         return last_point if hold is None else min(hold, last_point)
 

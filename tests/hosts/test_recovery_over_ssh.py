@@ -34,7 +34,8 @@ def kill_after_rows(mesh: MeshOverSsh, launched: Launched, part: str, words: str
     wait_until(lambda: row_count(mesh.result) > before + 50 or not launched.running, "new rows")
     assert launched.running, mesh.story()
     mesh.process(part).kill()
-    launched.wait_for_error_line(words)
+    wait_until(lambda: words in launched.errors or not launched.running, f"'{words}'")
+    assert words in launched.errors, mesh.story()
 
 
 def assert_no_row_is_lost(mesh: MeshOverSsh, code: int) -> None:
