@@ -18,6 +18,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from ..errors import FmuError
+from ..system.attempt import Attempt
 from ..system.live_keys import KeyValue
 from ..system.plan import NodePlan
 from ..wire.inbox import Inbox
@@ -95,6 +96,7 @@ class NodeServer:
         self._declared: dict[str, zenoh.KeyExpr] = {}
         self._searches = False
         self._next_search = 0.0
+        self._replays_to = 0
         self._rows: deque[WaitingRows] = deque()
         self._waiting_rows = 0
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
@@ -121,10 +123,11 @@ class NodeServer:
 
     # --- called by the main thread
 
-    def serve(self, runners: Mapping[str, Runner]) -> None:
-        """From now on values can be read and set, and streams can be subscribed."""
+    def serve(self, runners: Mapping[str, Runner], attempt: Attempt) -> None:
+        """From now on values can be read and set, and streams can be subscribed, in this attempt of the run."""
         self.keys.serve(runners)
-        self._activity.serve(runners, self.keys)
+        self._activity.serve(runners, self.keys, attempt)
+        self._replays_to = attempt.replays_to
         for runner in runners.values():
             changed = partial(self._jobs.put, self._search)
             grid, declared = self._plan.grid, self._declared
@@ -145,7 +148,7 @@ class NodeServer:
     def stepped(self) -> None:
         """Give new rows to the streams that have subscribers, and to keys."""
         if not self.is_live:
-            if any(own.runner.point < self._plan.attempt.replays_to for own in self._streams):
+            if any(own.runner.point < self._replays_to for own in self._streams):
                 return
             self._go_live()
         self.keys.publish_now()

@@ -34,6 +34,7 @@ from ..system.attempt import Attempt
 from ..system.plan import MASTER, RECORDER, Plan
 from ..variables.value_types import PlainValue
 from ..wire.host_processes import ask_outside
+from ..wire.journal import JOURNAL
 from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Stiff
@@ -143,6 +144,9 @@ class _NodeProcess:
         if plan.process.is_private:
             (own_folder := fmu_folder(process.folder) / "work").mkdir(mode=0o700, parents=True)
             os.chdir(own_folder)
+        if not process.is_child and plan.host is not None:  # `launch` may start again, and this process goes on
+            (journals := fmu_folder(process.folder) / "journal").mkdir(mode=0o700, parents=True)
+            self._run = replace(run, plan=replace(plan, attempt=Attempt(journal=str(journals / f"node{JOURNAL}"))))
         root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
         made = patient(ends, plan.timeouts, is_node=True, is_mirrored=run.launch is not None)
@@ -179,6 +183,10 @@ class _NodeProcess:
                 if node.new_start is not None:
                     self._begin_again(node.new_start)
                     continue
+                if node.goes_on and not process.is_child:  # otherwise the launcher starts the next one
+                    log.warning("%s; waiting for the next attempt", error)
+                    self._free_instances()
+                    continue
                 # If there is a launcher, one process shows what happened, and the others only end.
                 # It tells who was interrupted by the exit code, and interrupts those whom a lost master leaves behind.
                 if process.is_child and (node.failure_is_known or isinstance(error, Interrupted)):
@@ -193,10 +201,7 @@ class _NodeProcess:
 
     def _begin_again(self, start: NewStart) -> None:
         """The mesh is reset: free all instances, and take the start values for the next ones."""
-        self._close_instances()
-        self._guarded, self._instances = [], []
-        if self._meeting is not None:
-            self._meeting.close()
+        self._free_instances()
         instances = tuple(
             replace(
                 item,
@@ -210,6 +215,12 @@ class _NodeProcess:
             showing = replace(showing, video=numbered(showing.video, start.resets))
         plan = replace(plan, digest=start.digest, instances=instances, attempt=Attempt())
         self._run = replace(self._first, showing=showing, plan=plan)
+
+    def _free_instances(self) -> None:
+        self._close_instances()
+        self._guarded, self._instances = [], []
+        if self._meeting is not None:
+            self._meeting.close()
 
     def _open(self, name: str) -> Guarded:
         opening = _opening(self._run, name, self._process.folder, self._log)

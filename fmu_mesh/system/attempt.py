@@ -22,5 +22,10 @@ class Attempt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     replays_to: int = 0
     journal: str = ""
 
+    @property
+    def may_be_followed(self) -> bool:
+        """Whether there is another one if a process is lost."""
+        return self.number < self.most
+
     def __str__(self) -> str:
         return f"attempt {self.number} of {self.most}, from point {self.replays_to}" if self.number > 1 else ""

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.helpers import Launched, Place, free_port, on_a_busy_machine, wait_until, write_config
+from tests.helpers import Launched, Place, free_port, on_a_busy_machine, row_count, wait_until, write_config
 from tests.terminal import Terminal
 
 PAIR = {"pendulum": {"fmu": "DampedPendulum"}, "delay": {"fmu": "TransportDelay"}}
@@ -178,3 +178,30 @@ def test_a_node_that_is_lost_early_ends_the_others(there: Place) -> None:
     assert by_hand.wait() == 4, there.story()
     assert "was lost: its process was ended by SIGKILL" in by_hand.errors
     assert there.processes() == []
+
+
+@pytest.mark.parametrize("names", [("delay",), ("pendulum", "delay")], ids=["one node", "two nodes"])
+def test_nodes_go_on_with_the_next_attempt(names: tuple[str, ...], here: Place, there: Place) -> None:
+    file = written(here.folder, *names, simulation={"stop_time": 3.0, "real_time_factor": 1.0})
+    with file.open("a", encoding="utf-8") as text:
+        text.write("recovery: {mode: restart}\n")
+    expected = here.run("launch", file, "--local", "--set-config", "recovery.mode=stop", "--output", "local.csv")
+    assert expected.wait() == 0, here.story()
+    launch, command = launched(here, file)
+    by_hand = there.start("node", *command.split())
+    result = file.with_suffix(".csv")
+
+    for number in (1, 2):
+        before = row_count(result)
+        wait_until(lambda: row_count(result) > before + 50 or not launch.running, "rows")  # noqa: B023  called at once
+        launch.child("master").kill()
+        wait_until(lambda: f"(restart {number} of 3)" in launch.errors or not launch.running, "a restart")  # noqa: B023
+    if len(names) > 1:
+        nodes = {" ".join(process.cmdline()).split()[-1]: process for process in there.processes("node")}
+        wait_until(lambda: row_count(result) > 1300 or not launch.running, "rows")
+        nodes["delay"].kill()
+
+    assert (launch.wait(), by_hand.wait()) == (0, 0), f"{here.story()}\n{there.story()}"
+    assert result.read_bytes() == (here.folder / "local.csv").read_bytes()
+    assert "waiting for the next attempt" in by_hand.errors
+    there.assert_nothing_left(on_a_busy_machine(2.0))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import psutil
 import pytest
 
 from tests.helpers import Launched, row_count, wait_until
@@ -81,16 +82,16 @@ def test_a_host_that_is_back_takes_part_again(pair: SshHosts) -> None:
 
 
 def test_a_host_that_does_not_come_back_ends_the_run(pair: SshHosts) -> None:
-    with mesh_over_ssh(pair, lasts_s=60.0, recovery={"mode": "restart"}, timeouts={"start": 3.0}) as mesh:
+    with mesh_over_ssh(pair, lasts_s=20.0, recovery={"mode": "restart"}, timeouts={"start": 3.0}) as mesh:
         launched = mesh.running(rows=200)
-        daemon = pair.daemons["b"]
-        daemon.signal(19)  # a stopped sshd takes no new connection, and the session there goes on
+        (daemon,) = psutil.Process(pair.daemons["b"].pid).children()
+        daemon.suspend()  # a stopped sshd takes no new connection, and the session there goes on
         try:
             mesh.process("session").kill()
 
             assert launched.wait() == 4, mesh.story()
         finally:
-            daemon.signal(18)
+            daemon.resume()
         assert "b was lost, and was not back within 3 s: no node can be started on b" in launched.message
         assert f"rows) is in '{mesh.result}'" in launched.message or "What was recorded" in launched.message
         mesh.assert_nothing_left()
