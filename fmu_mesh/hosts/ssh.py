@@ -154,7 +154,7 @@ class _Host:
         self.lost: str | None = None
         self._name, self._config, self._run, self._control = name, run.plan.hosts[name], run, control
         self._ssh, self._post, self._tell = self._config.ssh or "", post, tell
-        self._link_s = run.loaded.config.timeouts.link
+        self._link_s = self._limit_s = run.loaded.config.timeouts.link
         self._nodes = {key: node for key, node in run.plan.nodes.items() if node.host == name}
         results = [Path(record.file) for record in run.plan.system.records]
         more = [beside(run.config_file, own) for own in (run.loaded.config.zenoh.config,) if own is not None]
@@ -293,7 +293,8 @@ class _Host:
         who = "the relay to ssh" if code < 0 else "ssh"
         how = f"{who} {how_it_ended(code if not 128 < code < 255 else 128 - code)}"
         if self._is_silent:
-            how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
+            limit = "link" if self._limit_s == self._link_s else "start"
+            how = f"silent for {self._limit_s:g} s, the limit of `timeouts.{limit}`"
         elif self.failure is not None:
             how = self.failure.message
         elif self._said:
@@ -318,6 +319,7 @@ class _Host:
         return ConfigurationError(text, hint=hint)
 
     def _next(self, limit_s: float) -> frames.FromHelper | None:
+        self._limit_s = limit_s
         content = self._frames.next(limit_s)
         return msgspec.msgpack.decode(content, type=frames.FromHelper) if content is not None else None
 

@@ -277,8 +277,7 @@ class Node:
                 raise
             raise self._membership.without_master() from error
         self._heard = self._clock()
-        if welcome.profile:
-            self._profiler = Profiler(self._plan.node, welcome.profile)
+        self._profiler = Profiler(self._plan.node, welcome.profile) if welcome.profile else None
         return welcome
 
     def _connect(self, welcome: Welcome) -> None:
