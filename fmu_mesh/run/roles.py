@@ -150,8 +150,7 @@ class _NodeProcess:
         root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
         made = patient(ends, plan.timeouts, is_node=True, is_mirrored=run.launch is not None)
-        own = replace(made, publishes=f"{root}/**")
-        own = certified(own, run.security, root)
+        own = certified(replace(made, publishes=f"{root}/**"), run.security, root)
         session = open_session(own)
         process.stack.callback(close_session, session)
         limit_process(plan.process)
@@ -180,12 +179,8 @@ class _NodeProcess:
             try:
                 node.run()
             except FmuMeshError as error:
-                if node.new_start is not None:
+                if node.new_start is not None or (node.goes_on and not process.is_child):
                     self._begin_again(node.new_start)
-                    continue
-                if node.goes_on and not process.is_child:  # otherwise the launcher starts the next one
-                    log.warning("%s; waiting for the next attempt", error)
-                    self._free_instances()
                     continue
                 # If there is a launcher, one process shows what happened, and the others only end.
                 # It tells who was interrupted by the exit code, and interrupts those whom a lost master leaves behind.
@@ -199,9 +194,15 @@ class _NodeProcess:
         if self._node is not None:
             self._node.interrupt(reason)
 
-    def _begin_again(self, start: NewStart) -> None:
-        """The mesh is reset: free all instances, and take the start values for the next ones."""
-        self._free_instances()
+    def _begin_again(self, start: NewStart | None) -> None:
+        """The mesh is reset, or starts again: free all instances, and take the start values for the next ones."""
+        self._close_instances()
+        self._guarded, self._instances = [], []
+        if self._meeting is not None:
+            self._meeting.close()
+        if start is None:
+            log.warning("the mesh of node '%s' is lost; waiting for the next attempt", self._first.plan.node)
+            return
         instances = tuple(
             replace(
                 item,
@@ -215,12 +216,6 @@ class _NodeProcess:
             showing = replace(showing, video=numbered(showing.video, start.resets))
         plan = replace(plan, digest=start.digest, instances=instances, attempt=Attempt())
         self._run = replace(self._first, showing=showing, plan=plan)
-
-    def _free_instances(self) -> None:
-        self._close_instances()
-        self._guarded, self._instances = [], []
-        if self._meeting is not None:
-            self._meeting.close()
 
     def _open(self, name: str) -> Guarded:
         opening = _opening(self._run, name, self._process.folder, self._log)

@@ -193,9 +193,9 @@ def test_nodes_go_on_with_the_next_attempt(names: tuple[str, ...], here: Place, 
 
     for number in (1, 2):
         before = row_count(result)
-        wait_until(lambda: row_count(result) > before + 50 or not launch.running, "rows")  # noqa: B023  called at once
+        wait_until(lambda: row_count(result) > before + 50 or not launch.running, "rows")  # noqa: B023  called within the turn
         launch.child("master").kill()
-        wait_until(lambda: f"(restart {number} of 3)" in launch.errors or not launch.running, "a restart")  # noqa: B023
+        wait_until(lambda: f"(restart {number} of 3)" in launch.errors or not launch.running, "a restart")  # noqa: B023  as above
     if len(names) > 1:
         nodes = {" ".join(process.cmdline()).split()[-1]: process for process in there.processes("node")}
         wait_until(lambda: row_count(result) > 1300 or not launch.running, "rows")

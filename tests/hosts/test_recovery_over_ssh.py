@@ -95,6 +95,8 @@ def test_a_host_that_does_not_come_back_ends_the_run(pair: SshHosts) -> None:
         assert "b was lost, and was not back within 3 s: no node can be started on b" in launched.errors
         assert "What was recorded up to then" in launched.errors
         mesh.assert_nothing_left()
+        for folder in (pair["b"].home / ".cache/fmu_mesh/hosts/journals").iterdir():
+            folder.rmdir()  # nobody could tell this host that no attempt follows; nothing was set
 
 
 def test_values_set_on_another_host_are_given_again(pair: SshHosts) -> None:
