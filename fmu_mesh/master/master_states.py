@@ -37,6 +37,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.deadlines import Deadlines
 from ..errors import (
@@ -121,19 +122,24 @@ class Commanded(msgspec.Struct, frozen=True):
     stopped_at: int | None = None
 
 
+class _Course(msgspec.Struct, frozen=True):
+    """Where the mesh pauses; and after a restart, the last point that was seen before, and where it was stopped."""
+
+    hold: int | None
+    replays_to: int
+    stopped_at: int | None
+
+
 class MasterStates:
     """The state of one run, as its master sees it.
 
     Attributes:
         registrations: which nodes have registered. Its methods are events, too.
         granting: the grant, and the progress of the nodes.
-        hold: the point at which all nodes pause.
         reports: how nodes have ended, by name.
         failure: why the run fails.
         ended_by: why the simulation ends before its last point, and not at once.
         warnings: nodes that failed or were lost after their last step.
-        replays_to: after a restart, the last point that was seen before: the wall clock does not limit the grant up to
-            it.
 
     Call sequence: any events, then `decide` and do what it says until it says nothing; then wait for events, for at
     most as long as a heartbeat.
@@ -149,12 +155,8 @@ class MasterStates:
         )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)
-        self.hold = 0 if paused else None
-        self._stop_again: int | None = None
-        if commanded is not None:
-            self.hold, self._stop_again = commanded.hold, commanded.stopped_at
-        self.replays_to = replays_to
-        self._is_paced = plan.system.config.simulation.real_time_factor > 0.0
+        again = commanded or Commanded("", 0 if paused else None)
+        self._course = _Course(again.hold, replays_to, again.stopped_at)
         self.reports: dict[str, NodeReport] = {}
         self.failure: FmuMeshError | None = None
         self.ended_by: TerminationRequested | NotFinite | None = None
@@ -164,6 +166,15 @@ class MasterStates:
         self._moved_at: float | None = None  # when any node has moved; None: since the last decision
         self._slowest_moved_at: float | None = None
         self._sent_at = 0.0
+
+    @property
+    def hold(self) -> int | None:
+        """The point at which all nodes pause."""
+        return self._course.hold
+
+    @hold.setter
+    def hold(self, point: int | None) -> None:
+        self._course = replace(self._course, hold=point)
 
     @property
     def is_over(self) -> bool:
@@ -189,14 +200,14 @@ class MasterStates:
     def wanted(self) -> int:
         """The point that is granted if the wall clock allows it."""
         last_point, hold = self.granting.last_point, self.hold  # once: the recorder asks on its own thread
-        if self._is_paced and self.replays_to:  # until the wall clock has begun there
-            last_point = min(last_point, self.replays_to)
+        if self._course.replays_to and self.plan.system.config.simulation.real_time_factor > 0.0:
+            last_point = min(last_point, self._course.replays_to)  # until the wall clock has begun there
         return last_point if hold is None else min(hold, last_point)
 
     @property
     def is_replaying(self) -> bool:
         """Whether the run has not yet come to where it was before a restart."""
-        return self.replays_to > 0 and self.granting.slowest < self.replays_to
+        return self._course.replays_to > 0 and self.granting.slowest < self._course.replays_to
 
     def silent_s(self, now: float) -> float:
         """For how long there was no progress although there should have been some, in s."""
@@ -364,8 +375,8 @@ class MasterStates:
         if self.granting.slowest >= 0:
             self._enter("running" if self.hold is None else "paused", now)
             self._actions.append(FollowClock(0, paced=not self.is_replaying))
-            if self._stop_again is not None and self.plan.grid.stop_time is None:
-                self._stop(self._stop_again)
+            if self._course.stopped_at is not None and self.plan.grid.stop_time is None:
+                self._stop(self._course.stopped_at)
             self._moved_at = self._slowest_moved_at = now
             return
         missing = [node for node, point in self.granting.progress.items() if point < 0]
@@ -374,11 +385,12 @@ class MasterStates:
 
     def _go_on(self, now: float, paced: int, stopped: Sequence[str]) -> None:
         granting = self.granting
-        if self.replays_to and not self.is_replaying:
-            self.replays_to = 0
+        if self._course.replays_to and not self.is_replaying:
+            self._course = replace(self._course, replays_to=0)
             self._actions.append(FollowClock(granting.reached))
-        if self._stop_again is not None and self.plan.grid.stop_time is not None and not self.is_replaying:
-            self._stop(self._stop_again)
+        stopped_at = self._course.stopped_at if self.plan.grid.stop_time is not None else None
+        if stopped_at is not None and not self.is_replaying:
+            self._stop(stopped_at)
             return
         if granting.slowest >= granting.last_point:
             if isinstance(self.ended_by, NotFinite):

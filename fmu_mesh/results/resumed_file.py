@@ -127,7 +127,8 @@ class ResumedFile:
             same &= np.signbit(before) == np.signbit(after)
             same |= np.isnan(before) & np.isnan(after)
             if self._rounds:
-                same |= after.astype(np.float32) == before
+                with np.errstate(over="ignore"):
+                    same |= after.astype(np.float32) == before
         return same
 
     def _difference(self, row: int, time: float, place: int, before: object, after: object) -> NotDeterministic:

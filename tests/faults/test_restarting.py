@@ -172,8 +172,7 @@ def test_a_component_that_reads_the_clock_is_named(place: Place) -> None:
     assert rows_of(result)
 
 
-@pytest.mark.parametrize("ending", ["parquet", "mcap"])
-@pytest.mark.parametrize("victim", ["slow", "master"])
+@pytest.mark.parametrize(("ending", "victim"), [("parquet", "master"), ("mcap", "slow")])
 def test_other_formats_go_on_with_their_rows(place: Place, ending: str, victim: str) -> None:
     files = [{"file": f"again.{ending}"}, {"file": "again.csv"}]
     config = written(place, record=files)

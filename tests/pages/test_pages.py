@@ -255,7 +255,7 @@ NOT_RUN = [
     (
         "docs/commands.md",
         "$ fmu-mesh launch configs/pendulum_delay.yaml --real-time-factor 1 --restarts 3",
-        "somebody kills a process there; tests/faults/test_lost_processes.py does",
+        "somebody kills a process there; tests/faults/test_restarting.py does",
     ),
     (
         "docs/connections.md",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from msgspec.structs import replace
 
@@ -19,6 +21,7 @@ from fmu_mesh.errors import (
 from fmu_mesh.master.master_states import (
     Action,
     AnswerAll,
+    Commanded,
     EndAll,
     FollowClock,
     MasterStates,
@@ -54,8 +57,16 @@ def endless(tmp_path_factory: pytest.TempPathFactory) -> Plan:
 class Driven:
     """A run whose time and events come from a test, up to the given state."""
 
-    def __init__(self, plan: Plan, *, paused: bool = False, sharing: bool = True) -> None:
-        self.states = MasterStates(plan, paused=paused)
+    def __init__(
+        self,
+        plan: Plan,
+        *,
+        paused: bool = False,
+        sharing: bool = True,
+        replays_to: int = 0,
+        commanded: Commanded | None = None,
+    ) -> None:
+        self.states = MasterStates(plan, paused=paused, replays_to=replays_to, commanded=commanded)
         self.now = 0.0
         self._sharing = sharing
 
@@ -336,6 +347,51 @@ def test_a_stop_without_a_stop_time_is_a_normal_end(endless: Plan) -> None:
 
     run.at(11)
     assert run.decide() == [SendToAll(FINISH, 11)]
+    assert isinstance(run.states.ended_by, TerminationRequested)
+
+
+def back(plan: Plan, commanded: Commanded | None = None) -> Driven:
+    """A run that has started again, and was at point 100 before."""
+    run = Driven(plan, replays_to=100, commanded=commanded)
+    run.register(*ALL)
+    run.ready(*ALL)
+    run.decide()
+    run.at(0)
+    return run
+
+
+def test_a_run_that_comes_back_is_not_paced_until_it_is_there(tmp_path: Path) -> None:
+    run = back(prepare(write_config(tmp_path, simulation={"real_time_factor": 1.0})))
+    assert run.decide() == [FollowClock(0, paced=False), RaiseGrant(100)]
+    assert run.states.is_replaying
+
+    run.at(100)
+
+    assert run.decide(paced=101) == [FollowClock(100), RaiseGrant(101)]
+    assert not run.states.is_replaying
+
+
+def test_a_run_that_comes_back_pauses_where_it_was_paused(plan: Plan) -> None:
+    run = back(plan, Commanded("step", 120))
+
+    assert run.decide() == [FollowClock(0, paced=False), RaiseGrant(120)]
+    assert run.states.state == "paused"
+
+
+def test_a_run_that_comes_back_is_stopped_again(plan: Plan) -> None:
+    run = back(plan, Commanded("stop", None, LAST))
+    run.decide()
+    run.at(100)
+
+    run.fails_with(Interrupted, "stopped by a command before its stop time of 1 s")
+
+
+def test_a_run_without_end_that_comes_back_ends_at_same_point(endless: Plan) -> None:
+    run = back(endless, Commanded("stop", None, 111))
+    run.decide()
+    run.at(111)
+
+    assert run.decide() == [FollowClock(100 + 11), SendToAll(FINISH, 111)]
     assert isinstance(run.states.ended_by, TerminationRequested)
 
 
