@@ -120,7 +120,7 @@ class SshHosts:
         """
         for host in self._hosts.values():
             if host.failure is not None:
-                host.begin_again()
+                host.begin_again(host.failure)
         return all(host.is_ready for host in self._hosts.values())
 
     def start(self, node: NodePlan) -> RemoteProcess | None:
@@ -165,6 +165,7 @@ class _Host:
         self._tried_at, self._until = 0.0, self._clock() + run.loaded.config.timeouts.start
         self._writing = threading.Lock()
         self._sockets: list[Path] = []
+        self._told = ""
         self._said: deque[str] = deque(maxlen=20)
         self._leaving = self._is_silent = self._is_unreachable = False
         if len(os.fsencode(control)) > _CONTROL_BYTES:
@@ -194,19 +195,22 @@ class _Host:
         for thread in self._threads:
             thread.start()
 
-    def begin_again(self) -> None:
-        """Connect again to a host that was lost, if it is time for that.
+    def begin_again(self, failure: FmuMeshError) -> None:
+        """Connect again after a ``failure``, if the host was lost, and it is time for that.
 
         Raises:
-            FmuMeshError: why it has failed; after a restart, only when `timeouts.start` is over.
+            FmuMeshError: the failure; after a restart, only when `timeouts.start` is over.
         """
-        failure, now = self.failure, self._clock()
-        if failure is None or not self._run.restarts or not self._is_unreachable:
-            raise failure or MeshLost(f"{self._name} is lost")
+        now, limit = self._clock(), f"{self._run.loaded.config.timeouts.start:g} s"
+        if not self._run.restarts or not self._is_unreachable:
+            raise failure
         if now > self._until:
-            text = f"{self._name} was lost, and was not back within {self._run.loaded.config.timeouts.start:g} s"
-            raise MeshLost(f"{text}: {failure.message}", hint=failure.hint)
+            text = f"{self._name} was lost, and was not back within {limit}: {failure.message}"
+            raise MeshLost(text, hint=failure.hint)
         if now - self._tried_at > _AGAIN_S:
+            if failure.message != self._told:
+                self._told = failure.message
+                self._tell(f"{failure.message}; this is tried again for {limit}, the limit of `timeouts.start`")
             self.close()
             self.failure = self.lost = None
             self._leaving = self._is_silent = self._is_unreachable = False

@@ -205,3 +205,28 @@ def test_nodes_go_on_with_the_next_attempt(names: tuple[str, ...], here: Place, 
     assert result.read_bytes() == (here.folder / "local.csv").read_bytes()
     assert "waiting for the next attempt" in by_hand.errors
     there.assert_nothing_left(on_a_busy_machine(2.0))
+
+
+def test_what_was_set_at_a_node_is_given_again(here: Place, there: Place) -> None:
+    file = write_config(
+        here.folder,
+        instances={"pendulum": {"fmu": "DampedPendulum"}, "gain": {"fmu": "Gain", "host": "b"}},
+        connections=["pendulum.a -> gain.u"],
+        deploy={"hosts": {"b": {}}},
+        simulation={"stop_time": 3.0, "real_time_factor": 1.0},
+    )
+    launch, command = launched(here, file, "--restarts", "1")
+    by_hand = there.start("node", *command.split())
+    result = file.with_suffix(".csv")
+    wait_until(lambda: row_count(result) > 50 or not launch.running, "rows")
+
+    assert here.run("set", "gain.k", "3.5").wait() == 0
+    before = row_count(result)
+    wait_until(lambda: row_count(result) > before + 50 or not launch.running, "rows with it")
+    launch.child("master").kill()
+
+    # The recorder compares the rows with those before, and the values in the metadata are those of the last attempt.
+    assert (launch.wait(), by_hand.wait()) == (0, 0), f"{here.story()}\n{there.story()}"
+    text = result.with_name(f"{result.name}.json").read_text(encoding="utf-8")
+    assert [value["value"] for value in json.loads(text)["set"]] == [3.5]
+    there.assert_nothing_left(on_a_busy_machine(2.0))

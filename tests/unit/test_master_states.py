@@ -367,6 +367,7 @@ def test_a_run_that_comes_back_is_not_paced_until_it_is_there(tmp_path: Path) ->
 
     run.at(100)
 
+    assert run.states.wanted == 100  # the wall clock that limits more has not begun
     assert run.decide(paced=101) == [FollowClock(100), RaiseGrant(101)]
     assert not run.states.is_replaying
 
