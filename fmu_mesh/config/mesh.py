@@ -383,8 +383,6 @@ class Config(Base, frozen=True, kw_only=True):
     @property
     def why_not_restarted(self) -> str | None:
         """Why `recovery` cannot start this mesh again when a process is lost; None if it can."""
-        if on_hosts := [name for name, own in self.instances.items() if own.host is not None and self.deploy.hosts]:
-            return f"'{on_hosts[0]}' runs on another host, and `recovery` knows one host only"
         for own in self.connections:
             if isinstance(own, KeyInputConfig) and own.wait:
                 return f"the publisher of '{own.key}', for which the run waits (`wait: true`), does not start again"

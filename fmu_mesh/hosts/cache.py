@@ -18,8 +18,10 @@ from typing import Final
 
 from ..files import cache_folder, remove_tree, sha256_of
 
-__all__ = ["Cache"]
+__all__ = ["JOURNALS", "Cache"]
 
+JOURNALS: Final = "journals"
+"""The folder in the cache with what nodes got from outside, for the next attempt of their run."""
 _MOST_BYTES: Final = 1 << 34
 _UNUSED_S: Final = 30 * 86400.0
 _UNLINKED_S: Final = 3600.0
@@ -94,6 +96,22 @@ class Cache:
     def mark(self, terms: str) -> Path:
         """A file that is there for an hour after somebody has made it, to know what was checked."""
         return self._contents / f"checked-{hashlib.sha256(terms.encode()).hexdigest()}"
+
+    def journals(self, name: str, *, are_new: bool) -> Path | None:
+        """The folder for the journals of a run (ADR 87), which outlives this process; None without a name.
+
+        Raises:
+            OSError: there is no room.
+        """
+        (folder := self.folder / JOURNALS).mkdir(mode=0o700, parents=True, exist_ok=True)
+        for other in folder.iterdir():  # that of a run whose end nobody could tell
+            if (other.name == name and are_new) or time.time() - other.stat().st_mtime > _UNUSED_S:
+                remove_tree(other)
+        if not name:
+            return None
+        (own := folder / name).mkdir(mode=0o700, exist_ok=True)
+        os.utime(own)
+        return own
 
     def close(self) -> None:
         """Hold no tree any more, and remove what is not finished."""

@@ -54,7 +54,8 @@ class _Helper:
         self._mesh, self._link_s, self._output = mesh, link_s, output
         self._writing = threading.Lock()
         self._happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._is_over = self._heard = False
+        self._is_over = self._heard = self._forgets = False
+        self._journals: Path | None = None
         self._parent = os.getppid()
         self._children: dict[str, Child] = {}
         self._trees: dict[str, dict[str, str]] = {}
@@ -89,6 +90,8 @@ class _Helper:
         finally:
             self._end()
             self._cache.close()
+            if self._forgets and self._journals is not None:
+                remove_tree(self._journals)
             if folder is not None:
                 remove_tree(folder)
 
@@ -140,8 +143,9 @@ class _Helper:
                 self._say(frames.Missing(self._cache.missing(trees), str(self._folder)))
             case frames.FilePiece(content, data, last):
                 self._cache.take(content, data, last=last)
-            case frames.Prepare(plan, nodes, terms):
+            case frames.Prepare(plan, nodes, terms, journals, is_first):
                 self._cache.make(self._trees)
+                self._journals = self._cache.journals(journals, are_new=is_first)
                 self._file = self._folder / "run.plan"
                 self._file.write_bytes(plan)
                 mark = self._cache.mark(f"{terms} {__version__} {sys.version} {sys.prefix}")
@@ -153,6 +157,8 @@ class _Helper:
                 self._start(node, interpreter)
             case frames.SignalNode(node, number):
                 self._children[node].signal(signal.Signals(number))
+            case frames.Forget():
+                self._forgets = True
 
     @staticmethod
     def _answer_probe(door: socket.socket) -> None:

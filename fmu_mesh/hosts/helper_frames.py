@@ -24,6 +24,7 @@ __all__ = [
     "CannotGoOn",
     "Ended",
     "FilePiece",
+    "Forget",
     "FrameReader",
     "FromHelper",
     "HelperHello",
@@ -93,11 +94,22 @@ class FilePiece(msgspec.Struct, frozen=True, tag=True):
 
 
 class Prepare(msgspec.Struct, frozen=True, tag=True):
-    """All files are there: make the trees, write the run plan, and check the models, once for the same ``terms``."""
+    """All files are there: make the trees, write the run plan, and check the models, once for the same ``terms``.
+
+    Attributes:
+        journals: the folder for the journals of the nodes; empty: they write none.
+        is_first: whether it is that of the first attempt, for which there are none yet.
+    """
 
     plan: bytes
     nodes: tuple[str, ...]
     terms: str
+    journals: str = ""
+    is_first: bool = True
+
+
+class Forget(msgspec.Struct, frozen=True, tag=True):
+    """No other attempt follows: remove the journals at the end."""
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):
@@ -146,7 +158,7 @@ class CannotGoOn(msgspec.Struct, frozen=True, tag=True):
     hint: str
 
 
-ToHelper = OfferTrees | FilePiece | Prepare | StartNode | SignalNode
+ToHelper = OfferTrees | FilePiece | Prepare | StartNode | SignalNode | Forget
 FromHelper = HelperHello | Missing | Ready | Line | Ended | Alive | CannotGoOn
 
 

@@ -36,6 +36,7 @@ import msgspec
 from msgspec.structs import replace
 
 from .. import __version__
+from ..awake import AwakeClock
 from ..config.instance_sections import PhysicsSection
 from ..errors import ConfigurationError, FmuMeshError, MeshLost
 from ..files import beside
@@ -46,7 +47,9 @@ from ..system.plan import MASTER, NodePlan
 from ..wire.runtime import rows_socket, socket_endpoint
 from . import helper_frames as frames
 from . import ssh_relay
+from .cache import JOURNALS
 from .content import Content
+from .remote_process import LOST, RemoteProcess
 
 __all__ = ["SshHosts"]
 
@@ -57,10 +60,11 @@ Post = Callable[[Callable[[], None]], None]
 _CONNECT_S: Final = 10
 _LEAVE_S: Final = 6.0
 """How long a helper may take to end, with ssh."""
+_AGAIN_S: Final = 1.0
+"""How long after one try to connect to a lost host the next one begins, at least."""
 _FORWARD_S: Final = 30.0
 _PIECE_BYTES: Final = 1 << 18
 _CONTROL_BYTES: Final = 90  # the longest path of a control socket: ssh adds 17 bytes to it
-_LOST: Final = -signal.SIGHUP  # the exit code of nodes whose host is lost
 
 _OPTIONS: Final = (
     "IgnoreUnknown=ForkAfterAuthentication,StdinNull,SessionType",  # of versions before 8.7
@@ -116,7 +120,7 @@ class SshHosts:
         """
         for host in self._hosts.values():
             if host.failure is not None:
-                raise host.failure
+                host.begin_again(host.failure)
         return all(host.is_ready for host in self._hosts.values())
 
     def start(self, node: NodePlan) -> RemoteProcess | None:
@@ -127,59 +131,12 @@ class SshHosts:
         """How the process of a node has ended, if that is because its host was lost."""
         return self._hosts[node.host].lost if node.host in self._hosts else None
 
-    def close(self) -> None:
-        """End all connections; the helpers end what is left there."""
+    def close(self, *, goes_on: bool) -> None:
+        """End all connections; the helpers end what is left there, but for journals if the run ``goes_on``."""
         for host in self._hosts.values():
-            host.leave()
+            host.leave(forgets=not goes_on)
         for host in self._hosts.values():
             host.close()
-
-
-class RemoteProcess:
-    """A node on another host, as the launcher sees it; offers what `subprocess.Popen` does.
-
-    Args:
-        send: sends a signal to it.
-    """
-
-    stdin: None = None
-    pid: None = None
-    """No process of this host."""
-
-    def __init__(self, send: Callable[[int], None]) -> None:
-        self._send = send
-        self._code: int | None = None
-        self._ended, self._ending = threading.Event(), threading.Lock()
-        (output, self._output), (errors, self._errors) = os.pipe(), os.pipe()
-        self.stdout, self.stderr = os.fdopen(output, "rb"), os.fdopen(errors, "rb")
-
-    def poll(self) -> int | None:
-        """None if it still runs; otherwise its exit code, as `wait` tells it."""
-        return self._code
-
-    def wait(self, timeout_s: float | None = None) -> int:
-        """Wait until its exit code is known, or its host is lost."""
-        self._ended.wait(timeout_s)
-        return self._code if self._code is not None else _LOST
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal if it still runs."""
-        if self._code is None:
-            self._send(number)
-
-    def take(self, data: bytes, *, error: bool) -> None:
-        """On the thread of its host: it has written a line."""
-        if self._code is None:
-            os.write(self._errors if error else self._output, data)
-
-    def end(self, code: int) -> None:
-        """From any thread: it has ended, unless that is known."""
-        with self._ending:
-            if self._code is None:
-                self._code = code
-                os.close(self._output)
-                os.close(self._errors)
-                self._ended.set()
 
 
 class _Host:
@@ -197,22 +154,27 @@ class _Host:
         self.lost: str | None = None
         self._name, self._config, self._run, self._control = name, run.plan.hosts[name], run, control
         self._ssh, self._post, self._tell = self._config.ssh or "", post, tell
-        self._link_s = run.loaded.config.timeouts.link
+        self._link_s = self._limit_s = run.loaded.config.timeouts.link
         self._nodes = {key: node for key, node in run.plan.nodes.items() if node.host == name}
         results = [Path(record.file) for record in run.plan.system.records]
         more = [beside(run.config_file, own) for own in (run.loaded.config.zenoh.config,) if own is not None]
         self._zenoh = next(map(str, more), None)
         self._content = Content(name, [*self._nodes.values()], more, results)
         self._processes: dict[str, RemoteProcess] = {}
+        self._clock = AwakeClock()
+        self._tried_at, self._until = 0.0, self._clock() + run.loaded.config.timeouts.start
         self._writing = threading.Lock()
+        self._sockets: list[Path] = []
+        self._told = ""
         self._said: deque[str] = deque(maxlen=20)
-        self._leaving = self._is_silent = False
+        self._leaving = self._is_silent = self._is_unreachable = False
         if len(os.fsencode(control)) > _CONTROL_BYTES:
             text = f"'{control}' is too long for a control socket of ssh ({_CONTROL_BYTES} bytes)"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to a shorter path.")
 
     def begin(self) -> None:
         """Connect; `is_ready` or `failure` follows."""
+        self._tried_at = self._clock()
         alive_s = math.ceil(self._link_s / 3)
         more = "ClearAllForwardings=yes", f"ServerAliveInterval={alive_s}", "ServerAliveCountMax=3", "ControlMaster=yes"
         options = [word for option in (*_OPTIONS, *more) for word in ("-o", option)]
@@ -233,16 +195,42 @@ class _Host:
         for thread in self._threads:
             thread.start()
 
+    def begin_again(self, failure: FmuMeshError) -> None:
+        """Connect again after a ``failure``, if the host was lost, and it is time for that.
+
+        Raises:
+            FmuMeshError: the failure; after a restart, only when `timeouts.start` is over.
+        """
+        now, limit = self._clock(), f"{self._run.loaded.config.timeouts.start:g} s"
+        if not self._run.restarts or not self._is_unreachable:
+            raise failure
+        if now > self._until:
+            text = f"{self._name} was lost, and was not back within {limit}: {failure.message}"
+            raise MeshLost(text, hint=failure.hint)
+        if now - self._tried_at > _AGAIN_S:
+            if failure.message != self._told:
+                self._told = failure.message
+                self._tell(f"{failure.message}; this is tried again for {limit}, the limit of `timeouts.start`")
+            self.close()
+            self.failure = self.lost = None
+            self._leaving = self._is_silent = self._is_unreachable = False
+            self._said.clear()
+            for file in (self._control, *self._sockets):
+                file.unlink(missing_ok=True)
+            self.begin()
+
     def start(self, node: str) -> RemoteProcess:
         """Start a node."""
         self._processes[node] = made = RemoteProcess(lambda number: self._say(frames.SignalNode(node, number)))
         self._say(frames.StartNode(node, self._nodes[node].interpreter))
         if self.lost is not None:  # its thread may have ended all others before
-            made.end(_LOST)
+            made.end(LOST)
         return made
 
-    def leave(self) -> None:
-        """Let the helper end."""
+    def leave(self, *, forgets: bool = False) -> None:
+        """Let the helper end; it ``forgets`` the journals if no other attempt follows."""
+        if forgets:
+            self._say(frames.Forget())
         self._leaving = True
         assert self._relay.stdin is not None
         with suppress(OSError):
@@ -285,7 +273,7 @@ class _Host:
             if not self._leaving:
                 self._lose()
             for process in [*self._processes.values()]:
-                process.end(_LOST)
+                process.end(LOST)
             self._post(lambda: None)
 
     def _take(self, message: frames.FromHelper) -> None:
@@ -310,7 +298,8 @@ class _Host:
         who = "the relay to ssh" if code < 0 else "ssh"
         how = f"{who} {how_it_ended(code if not 128 < code < 255 else 128 - code)}"
         if self._is_silent:
-            how = f"silent for {self._link_s:g} s, the limit of `timeouts.link`"
+            limit = "link" if self._limit_s == self._link_s else "start"
+            how = f"silent for {self._limit_s:g} s, the limit of `timeouts.{limit}`"
         elif self.failure is not None:
             how = self.failure.message
         elif self._said:
@@ -319,6 +308,7 @@ class _Host:
             how += ": a signal has ended the helper there"
         self.lost = f"is gone: the ssh connection to {self._name} was lost ({how})"
         if self.failure is None and not self.is_ready:
+            self._is_unreachable = True
             self.failure = self._in_words(code, how)
 
     def _in_words(self, code: int, how: str) -> FmuMeshError:
@@ -334,6 +324,7 @@ class _Host:
         return ConfigurationError(text, hint=hint)
 
     def _next(self, limit_s: float) -> frames.FromHelper | None:
+        self._limit_s = limit_s
         content = self._frames.next(limit_s)
         return msgspec.msgpack.decode(content, type=frames.FromHelper) if content is not None else None
 
@@ -369,16 +360,22 @@ class _Host:
                     self._say(frames.FilePiece(content, data, last := len(data) < _PIECE_BYTES))
                     if last:
                         break
-        plans, launch = {}, launch_of(self._run.run)
+        plans, launch = {}, launch_of(self._run.run) or ""
         rows = (self._config.address or hello.address or None) if self._config.rows == "tcp" else None
         for name in self._nodes:
             own = self._run.node(name)
             zenoh = replace(own.zenoh, config=self._zenoh, rows_address=rows)
-            there = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh)
+            plan, journal = own.plan, own.plan.attempt.journal
+            if journal:  # in the cache, because the folder of the run there ends with the helper
+                journal = str(Path(hello.cache).parent / JOURNALS / launch / Path(journal).name)
+                plan = replace(plan, attempt=replace(plan.attempt, journal=journal))
+            there = replace(own, run=hello.run, launch=launch, helper=hello.pid, zenoh=zenoh, plan=plan)
             plans[name] = self._content.moved(encoded(there), hello.cache)
         terms = [(item.fmu, item.section) for node in self._nodes.values() for item in node.instances]
         checked = encoded((terms, [*self._content.trees], self._run.loaded.config.limits))
-        self._say(frames.Prepare(in_parts(plans), tuple(plans), hashlib.sha256(checked).hexdigest()))
+        digest = hashlib.sha256(checked).hexdigest()
+        journals, is_first = launch if self._run.max_restarts else "", not self._run.restarts
+        self._say(frames.Prepare(in_parts(plans), tuple(plans), digest, journals, is_first))
         try:
             self._mirror(Path(missing.folder))
         except ConfigurationError:
@@ -413,13 +410,14 @@ class _Host:
         peers = {peer for node in inside.values() for peer in node.peers()} - inside.keys()
         by_ssh = self._config.rows == "sockets" and self._run.loaded.config.row_streams
         probe = here / f"{self._control.name}.probe"
-        options = ["-L", f"{probe}:{there / frames.PROBE}"]
+        options, self._sockets = ["-L", f"{probe}:{there / frames.PROBE}"], [probe]
         for option, names in (("-R", [MASTER, *sorted(peers)]), ("-L", [*inside])):
             for name in names:
                 zenoh = Path(socket_endpoint(here, name).partition("/")[2])
                 for own in (zenoh, rows_socket(here, name)) if by_ssh else (zenoh,):
                     other = there / own.name
                     options += [option, f"{other}:{own}" if option == "-R" else f"{own}:{other}"]
+                    self._sockets += [own] if option == "-L" else []
         # The file of the user might forward more.
         command = ["ssh", "-F", os.devnull, "-S", str(self._control), "-O", "forward", *options]
         try:

@@ -55,6 +55,8 @@ def _relay(ssh: subprocess.Popen[bytes]) -> None:
         readable, writable, _ = select.select(sources, sinks, [], max(0.0, beat_at - time.monotonic()))
         if readable:
             if not (data := os.read(0, _PIECE)):
+                with suppress(BlockingIOError):  # the last word of the launcher
+                    os.write(sink, waiting)
                 return
             incoming += data
             while len(incoming) >= len(_BEAT):

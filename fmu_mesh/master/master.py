@@ -56,6 +56,7 @@ from ..errors import (
     TerminationRequested,
 )
 from ..rings.host_memory import HostMemory, can_share
+from ..system.attempt import Attempt
 from ..system.memory_map import STREAMS
 from ..system.plan import MASTER, RECORDER, Plan
 from ..system.round_trip import round_trip_cost
@@ -168,7 +169,8 @@ class Master:
         self._inbox.open(session, keys, MASTER, {keys.progress(node): node for node in plan.nodes})
         self.audit.follow(keys)
         offer = self._memory.offer if self._shares else None
-        own = settings.launch, meeting, settings.table
+        attempt = Attempt() if self._resets else replace(settings.attempt, journal="")
+        own = settings.launch, attempt, meeting, settings.table
         self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
         self._checkpoints = Checkpoints(
@@ -563,7 +565,7 @@ class Master:
         elapsed = self._clock.elapsed()
         rate = (point - first) / elapsed if elapsed > 0 else 0.0
         attempt, failure = self._settings.attempt, states.failure
-        goes_on = type(failure) is MeshLost and attempt.number < attempt.most and not self._resets
+        goes_on = type(failure) is MeshLost and attempt.may_be_followed and not self._resets
         is_again = bool(str(attempt)) and not self._resets and (states.state == "starting" or states.is_replaying)
         state: MeshState = states.state
         if goes_on or (is_again and states.takes_commands):
@@ -573,7 +575,7 @@ class Master:
             state=state,
             restarting=str(attempt) if is_again else "",
             restarts=attempt.number - 1,
-            may_restart=attempt.number < attempt.most and not self._resets,
+            may_restart=attempt.may_be_followed and not self._resets,
             point=point,
             last_point=grid.last_point,
             time=grid.time(point),

@@ -15,6 +15,7 @@ import zenoh
 
 from ..errors import FmuMeshError
 from ..rings.host_memory import Offer
+from ..system.attempt import Attempt
 from ..system.placement import manual_hosts
 from ..system.plan import RECORDER
 from ..wire.host_processes import is_alive, is_stopped
@@ -52,6 +53,7 @@ class Members:
         keys: RunKeys,
         offer: Offer | None,
         launch: str | None,
+        attempt: Attempt,
         meeting: Meeting | None = None,
         table: int = 0,
     ) -> None:
@@ -59,7 +61,7 @@ class Members:
         self._session = session
         self._keys = keys
         self._offer = offer
-        self._launch, self._table = launch, table
+        self._launch, self._table, self._attempt = launch, table, attempt
         self._by_hand = {node for own in manual_hosts(nodes.plan).values() for node in own}
         self._meeting = meeting
         self._waiting: dict[str, zenoh.Query] = {}
@@ -83,7 +85,7 @@ class Members:
                     self._meeting.knows(registration.node, registration.door)
                     door = self._meeting.door_for(registration.node)
                 grants = self._grant_keys[registration.node]
-                admission = Admission(self._keys.run, grants, self._offer, door, self._table)
+                admission = Admission(self._keys.run, grants, self._offer, door, self._table, self._attempt)
                 query.reply(query.key_expr, msgspec.json.encode(admission))
             else:
                 log.info("node_refused", extra={"reason": reason})

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from ..awake import AwakeClock
 from ..errors import FmuMeshError, Interrupted, MeshLost, StepFailed
 from ..instances.call_guard import not_returned
+from ..system.attempt import Attempt
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.stream_keeper import StreamKeeper
@@ -44,6 +45,7 @@ class Activity:
         self._engine: Engine | None = None
         self._keeper: StreamKeeper | None = None
         self._keys: KeyEnds | None = None
+        self._attempt = plan.attempt
         self._under_way: tuple[str, int, float] | None = None
         self._waits: dict[str, tuple[int, float, bool]] = {}  # own step, since when, whether it was told
 
@@ -51,9 +53,9 @@ class Activity:
         """From now on the node is in this state."""
         self.state = state
 
-    def serve(self, runners: Mapping[str, Runner], keys: KeyEnds) -> None:
-        """All instances are loaded; these are the keys at ends of their connections."""
-        self.runners, self._keys = runners, keys
+    def serve(self, runners: Mapping[str, Runner], keys: KeyEnds, attempt: Attempt) -> None:
+        """All instances are loaded; these are the keys at ends of their connections, in this attempt of the run."""
+        self.runners, self._keys, self._attempt = runners, keys, attempt
 
     def steps_with(self, engine: Engine, ways: Ways, keeper: StreamKeeper | None) -> None:
         """The instances are at their first point, and this engine steps them; the keeper is that of its row streams."""
@@ -80,7 +82,7 @@ class Activity:
             time=self._plan.grid.time(step * points),
             step_time=step_time,
             wait_time=engine.waited_s if engine is not None else 0.0,
-            restarts=self._plan.attempt.number - 1,
+            restarts=self._attempt.number - 1,
             refused=self._refusals.count,
             timed_out=late,
             running_time=time.monotonic() - self._started if engine is not None else 0.0,

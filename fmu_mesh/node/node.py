@@ -125,7 +125,8 @@ class Node:
 
     Attributes:
         failure_is_known: whether others know what ended the run: the master knows it, or is gone.
-        new_start: how its process begins again, if a reset has ended the run: with new instances, and a new node.
+        new_start: how its process begins again after a reset, with new instances, and a new node.
+        goes_on: whether another attempt of the run may follow, likewise.
 
     Call `run` once, from the main thread.
     """
@@ -150,14 +151,13 @@ class Node:
         self._open_instance = open_instance
         self._make_engine, self._strain = engine, strain
         self._finish_at: float = math.inf
-        self._token_went = self.failure_is_known = False
+        self._token_went = self.failure_is_known = self.goes_on = False
         self.new_start: NewStart | None = None
         self._clock = AwakeClock()
-        self._heard = self._lazy_sent = self._progress_told_at = 0.0
+        self._heard = self._lazy_sent = self._progress_told_at = self._look_at = 0.0
         self._progress_sent = self._lazy_covered = plan.grid.first_point - 1
         self._begins_with, self._saves_at = begins_with or BeginsWith(), -1
         self._router = router or RouterLink(session)
-        self._look_at = 0.0
         self._runners: dict[str, Runner] = {}
         self._receivers: dict[int, FrameReceiver | Link] = {}
         self._memory = self._own_memory = HostMemory.private(plan.memory, plan.node)
@@ -185,7 +185,7 @@ class Node:
         """Load, initialize and step to the last point, then report to the master.
 
         Raises:
-            FmuMeshError: why the run ended early; it was reported to the master if the master could be reached.
+            FmuMeshError: why the run ended early; it was reported to the master if that could be reached.
         """
         try:
             self._membership.register(self.server.open, self._master_token_went)
@@ -200,8 +200,9 @@ class Node:
             located = self._located(error)
             if isinstance(located, FmuError) and located is error:
                 located.with_hint(self._strain())
-            aborted = isinstance(error, _Aborted)
-            self.new_start = error.new_start if isinstance(error, _Aborted) else None
+            if aborted := isinstance(error, _Aborted):
+                self.new_start = error.new_start
+            self.goes_on = type(located) is MeshLost and self._membership.attempt.may_be_followed
             if aborted or not self._membership.lost_master:  # its token may be gone before its last message arrives
                 self._send_last_rows()
             if aborted:  # after the rows: the master ends when it has the log lines, or a second later
@@ -274,15 +275,14 @@ class Node:
     def _meet(self) -> Welcome:
         """Join the mesh: afterwards all other nodes are ready."""
         try:
-            self.server.serve(self._runners, self._journal.last_point)
+            self.server.serve(self._runners, self._membership.attempt, self._journal.last_point)
             welcome = self._membership.join()
         except MeshLost as error:
             if not self._membership.given_up:
                 raise
             raise self._membership.without_master() from error
         self._heard = self._clock()
-        if welcome.profile:
-            self._profiler = Profiler(self._plan.node, welcome.profile)
+        self._profiler = Profiler(self._plan.node, welcome.profile) if welcome.profile else None
         return welcome
 
     def _connect(self, welcome: Welcome) -> None:

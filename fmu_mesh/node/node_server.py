@@ -18,6 +18,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from ..errors import FmuError
+from ..system.attempt import Attempt
 from ..system.live_keys import KeyValue
 from ..system.plan import NodePlan
 from ..wire.inbox import Inbox
@@ -123,15 +124,15 @@ class NodeServer:
 
     # --- called by the main thread
 
-    def serve(self, runners: Mapping[str, Runner], given_to: int = 0) -> None:
-        """From now on values can be read and set, and streams can be subscribed.
+    def serve(self, runners: Mapping[str, Runner], attempt: Attempt, given_to: int = 0) -> None:
+        """From now on values can be read and set, and streams can be subscribed, in this attempt of the run.
 
         After a restart, nothing is set before all values up to the point ``given_to`` were given again: the order of
         the values of one point is theirs.
         """
-        self._live_from = max(self._plan.attempt.replays_to, given_to)
+        self._live_from = max(attempt.replays_to, given_to)
         self.keys.serve(runners)
-        self._activity.serve(runners, self.keys)
+        self._activity.serve(runners, self.keys, attempt)
         for runner in runners.values():
             changed = partial(self._jobs.put, self._search)
             grid, declared = self._plan.grid, self._declared

@@ -66,12 +66,16 @@ def run_nodes(run: RunPlan, names: Sequence[str], tell: Callable[[str], None]) -
         The exit code: 130 if this process was asked to end, otherwise 0 or that of the failure that says most.
     """
     happened: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-    nodes = _Nodes(tell)
+
+    def start(name: str) -> Child:
+        process = executed("node", file, name, interpreter=run.plan.nodes[name].interpreter)
+        return Child(name, process, happened.put)
+
+    nodes = _Nodes(tell, start, run.loaded.config.recovery.restarts)
     with TemporaryDirectory(prefix="fmu_mesh-") as folder, _signals(lambda: happened.put(nodes.interrupt)):
         file = str(run.write(Path(folder)))
         for name in names:
-            process = executed("node", file, name, interpreter=run.plan.nodes[name].interpreter)
-            nodes.watch(Child(name, process, happened.put))
+            nodes.start(name)
         while nodes.running:
             try:
                 happened.get(timeout=nodes.wait_s)()
@@ -83,18 +87,18 @@ def run_nodes(run: RunPlan, names: Sequence[str], tell: Callable[[str], None]) -
 class _Nodes:
     """The processes of the nodes; all of it is called on one thread."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, tell: Callable[[str], None], start: Callable[[str], Child], restarts: int) -> None:
+        self._tell, self._start, self._restarts = tell, start, restarts
         self._children: dict[str, Child] = {}
         self._codes: dict[str, int] = {}
         self._until: float | None = None
         self._signals: Iterator[signal.Signals] = iter((signal.SIGTERM, signal.SIGKILL))
         self._asked = False
 
-    def watch(self, child: Child) -> None:
-        """Pass on what a node writes, and note its end."""
-        self._children[child.name] = child
-        child.watch(partial(self._line, child.name), self._line, self._ended, limited=True)
+    def start(self, name: str) -> None:
+        """Start a node, pass on what it writes, and note its end."""
+        self._children[name] = child = self._start(name)
+        child.watch(partial(self._line, name), self._line, self._ended, limited=True)
 
     @property
     def running(self) -> bool:
@@ -135,10 +139,15 @@ class _Nodes:
             self._tell(f"{name} | {text}")
 
     def _ended(self, name: str, code: int) -> None:
-        self._codes[name] = code
         self._children[name].close()
-        if code < 0 and not self._asked:
+        is_lost = code < 0 and not self._asked
+        if is_lost:
             self._tell(f"node '{name}' was lost: its process {how_it_ended(code)}")
+        if is_lost and self._restarts and self._until is None:  # for the next attempt, as the others
+            self._restarts -= 1
+            self.start(name)
+            return
+        self._codes[name] = code
         if code != 0 and self._until is None:
             self._until = time.monotonic() + _OTHERS_S
 

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Protocol
 
@@ -34,7 +35,7 @@ from msgspec.structs import replace
 
 from ..awake import AwakeClock
 from ..config.deadlines import Deadlines
-from ..errors import ConfigurationError, Interrupted, MeshLost
+from ..errors import ConfigurationError, FmuMeshError, Interrupted, MeshLost
 from ..files import remove_tree
 from ..results.record_files import rows_left, what_is_kept
 from ..system.placement import manual_hosts, placed
@@ -78,7 +79,7 @@ __all__ = ["Elsewhere", "Launcher"]
 
 
 class Elsewhere(Protocol):
-    """The other hosts of a run: `are_ready` again after each event, until it is true; `start`; `close`."""
+    """The other hosts of a run: `are_ready` after each event, and now and then, until it is true; `start`; `close`."""
 
     def are_ready(self) -> bool:
         """Whether nodes can be started there; raises `FmuMeshError` if that will never be."""
@@ -92,8 +93,8 @@ class Elsewhere(Protocol):
         """How the process of a node has ended, if that is because its host was lost."""
         ...
 
-    def close(self) -> None:
-        """End what is left there."""
+    def close(self, *, goes_on: bool) -> None:
+        """End what is left there; the journals stay there if the run ``goes_on`` with another attempt."""
         ...
 
 
@@ -164,15 +165,22 @@ class Launcher:
             while not self._states.is_ending:
                 self._turn()
             has_run = True
+        except FmuMeshError as error:
+            if self._run.restarts:  # another host is not back
+                plan, files = self._run.plan, self._run.with_earlier(())
+                last = last_recorded(plan, files)
+                error.at(last, plan.grid.time(last)).with_hint(what_is_kept(files))
+                self.outcome = outcome_at(plan, last, files, error)
+            raise
         finally:
             self._do(self._states.end(self._clock()))
             while not self._states.is_over:
                 self._turn()
-            self._close_all()
+            self._close_all(goes_on=has_run and self._goes_on)
             if self._files is None:  # the master could not say it any more
                 self._files = rows_left([record.file for record in self._run.plan.system.records], self._folder)
             self._files = self._run.with_earlier(self._files)
-            self.next = self._next(self._files) if has_run else None
+            self.next = self._next(self._files) if has_run and self._goes_on else None
             if self.next is None:
                 self.clear()
             else:
@@ -193,11 +201,15 @@ class Launcher:
             if entry not in kept:
                 remove_tree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
 
-    def _next(self, files: Sequence[tuple[str, int]]) -> RunPlan | None:
-        """The plan of the next attempt; None if there is none."""
+    @property
+    def _goes_on(self) -> bool:
+        """Whether another attempt follows."""
         run, error = self._run, self._states.error()
-        if type(error) is not MeshLost or run is not self._first or run.restarts >= run.max_restarts:
-            return None
+        return type(error) is MeshLost and run is self._first and run.restarts < run.max_restarts
+
+    def _next(self, files: Sequence[tuple[str, int]]) -> RunPlan:
+        """The plan of the next attempt."""
+        run = self._run
         seen = max(run.replays_to, last_recorded(run.plan, files), self._states.point)
         rows = tuple(rows for _, rows in files)
         again = replace(run, restarts=run.restarts + 1, rows=rows, replays_to=min(seen, run.plan.grid.last_point))
@@ -223,7 +235,8 @@ class Launcher:
         if self._connect is not None:
             self._elsewhere = self._connect(self._run, self._folder, self._happened.put, self._take_word)
             while not self._elsewhere.are_ready():
-                self._happened.get()()
+                with suppress(queue.Empty):
+                    self._happened.get(timeout=self._states.wait_s)()
                 if self._states.is_asked:
                     raise Interrupted("interrupted")
 
@@ -341,9 +354,9 @@ class Launcher:
 
     # --- the end
 
-    def _close_all(self) -> None:
+    def _close_all(self, *, goes_on: bool) -> None:
         if self._elsewhere is not None:
-            self._elsewhere.close()
+            self._elsewhere.close(goes_on=goes_on)
         for process in self._processes.values():
             process.close()
         if self._server is not None:

@@ -34,6 +34,7 @@ from ..system.attempt import Attempt
 from ..system.plan import MASTER, RECORDER, Plan
 from ..variables.value_types import PlainValue
 from ..wire.host_processes import ask_outside
+from ..wire.journal import JOURNAL
 from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Noted
@@ -145,11 +146,13 @@ class _NodeProcess:
         if plan.process.is_private:
             (own_folder := fmu_folder(process.folder) / "work").mkdir(mode=0o700, parents=True)
             os.chdir(own_folder)
+        if not process.is_child and plan.host is not None:  # `launch` may start again, and this process goes on
+            (journals := fmu_folder(process.folder) / "journal").mkdir(mode=0o700, parents=True)
+            self._run = replace(run, plan=replace(plan, attempt=Attempt(journal=str(journals / f"node{JOURNAL}"))))
         root = Keys(plan.key_prefix, plan.mesh).root
         ends = wiring(run.zenoh, run.config_file, process.folder, plan.node, plan.peers())
         made = patient(ends, plan.timeouts, is_node=True, is_mirrored=run.launch is not None)
-        own = replace(made, publishes=f"{root}/**")
-        own = certified(own, run.security, root)
+        own = certified(replace(made, publishes=f"{root}/**"), run.security, root)
         session = open_session(own)
         process.stack.callback(close_session, session)
         limit_process(plan.process)
@@ -179,7 +182,7 @@ class _NodeProcess:
             try:
                 node.run()
             except FmuMeshError as error:
-                if node.new_start is not None:
+                if node.new_start is not None or (node.goes_on and not process.is_child):
                     self._begin_again(node.new_start)
                     continue
                 # If there is a launcher, one process shows what happened, and the others only end.
@@ -194,12 +197,15 @@ class _NodeProcess:
         if self._node is not None:
             self._node.interrupt(reason)
 
-    def _begin_again(self, start: NewStart) -> None:
-        """The mesh is reset: free all instances, and take the start values for the next ones."""
+    def _begin_again(self, start: NewStart | None) -> None:
+        """The mesh is reset, or starts again: free all instances, and take the start values for the next ones."""
         self._close_instances()
         self._guarded, self._instances = [], []
         if self._meeting is not None:
             self._meeting.close()
+        if start is None:
+            log.warning("the mesh of node '%s' is lost; waiting for the next attempt", self._first.plan.node)
+            return
         instances = tuple(
             replace(
                 item,

@@ -23,6 +23,11 @@ class Attempt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     replays_to: int = 0
     journal: str = ""
 
+    @property
+    def may_be_followed(self) -> bool:
+        """Whether there is another one if a process is lost."""
+        return self.number < self.most
+
     def __str__(self) -> str:
         if self.number > 1:
             return f"attempt {self.number} of {self.most}, from point {self.replays_to}"

@@ -28,6 +28,7 @@ from msgspec.structs import replace
 
 from ..errors import DeadlineExceeded, MeshLost, MessageRefused
 from ..rings.host_memory import HostMemory, Offer
+from ..system.attempt import Attempt
 from ..system.plan import MASTER, RECORDER, NodePlan
 from .host_processes import STOPPED, is_alive, is_stopped, opened_of, own_pid
 from .inbox import Inbox
@@ -103,6 +104,7 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         offer: the memory that processes on the master's host share; None if there is none.
         door: where the process reaches the master for a row stream.
         table: number of the table of roles that the master has; 0: it has none of our authority.
+        attempt: which one of the run this is.
     """
 
     run: Annotated[str, msgspec.Meta(pattern=f"^[0-9a-f]{{{2 * RUN_ID_BYTES}}}$")]
@@ -110,6 +112,7 @@ class Admission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offer: Offer | None = None
     door: Door | None = None
     table: int = 0
+    attempt: Attempt = Attempt()
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -232,6 +235,11 @@ class Membership:
             return self._public.run(self._admitted.result(patience_s).run)
         except TimeoutError:
             raise DeadlineExceeded(f"the master did not answer within {patience_s:g} s") from None
+
+    @property
+    def attempt(self) -> Attempt:
+        """Which attempt of the run this is, as the master has said it with the admission."""
+        return self._admitted.result(0).attempt if self.is_admitted else Attempt()
 
     @property
     def is_admitted(self) -> bool:

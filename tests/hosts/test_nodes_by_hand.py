@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.helpers import Launched, Place, free_port, on_a_busy_machine, wait_until, write_config
+from tests.helpers import Launched, Place, free_port, on_a_busy_machine, row_count, wait_until, write_config
 from tests.terminal import Terminal
 
 PAIR = {"pendulum": {"fmu": "DampedPendulum"}, "delay": {"fmu": "TransportDelay"}}
@@ -178,3 +178,55 @@ def test_a_node_that_is_lost_early_ends_the_others(there: Place) -> None:
     assert by_hand.wait() == 4, there.story()
     assert "was lost: its process was ended by SIGKILL" in by_hand.errors
     assert there.processes() == []
+
+
+@pytest.mark.parametrize("names", [("delay",), ("pendulum", "delay")], ids=["one node", "two nodes"])
+def test_nodes_go_on_with_the_next_attempt(names: tuple[str, ...], here: Place, there: Place) -> None:
+    file = written(here.folder, *names, simulation={"stop_time": 3.0, "real_time_factor": 1.0})
+    with file.open("a", encoding="utf-8") as text:
+        text.write("recovery: {mode: restart}\n")
+    expected = here.run("launch", file, "--local", "--set-config", "recovery.mode=stop", "--output", "local.csv")
+    assert expected.wait() == 0, here.story()
+    launch, command = launched(here, file)
+    by_hand = there.start("node", *command.split())
+    result = file.with_suffix(".csv")
+
+    for number in (1, 2):
+        before = row_count(result)
+        wait_until(lambda: row_count(result) > before + 50 or not launch.running, "rows")  # noqa: B023  called within the turn
+        launch.child("master").kill()
+        wait_until(lambda: f"(restart {number} of 3)" in launch.errors or not launch.running, "a restart")  # noqa: B023  as above
+    if len(names) > 1:
+        nodes = {" ".join(process.cmdline()).split()[-1]: process for process in there.processes("node")}
+        wait_until(lambda: row_count(result) > 1300 or not launch.running, "rows")
+        nodes["delay"].kill()
+
+    assert (launch.wait(), by_hand.wait()) == (0, 0), f"{here.story()}\n{there.story()}"
+    assert result.read_bytes() == (here.folder / "local.csv").read_bytes()
+    assert "waiting for the next attempt" in by_hand.errors
+    there.assert_nothing_left(on_a_busy_machine(2.0))
+
+
+def test_what_was_set_at_a_node_is_given_again(here: Place, there: Place) -> None:
+    file = write_config(
+        here.folder,
+        instances={"pendulum": {"fmu": "DampedPendulum"}, "gain": {"fmu": "Gain", "host": "b"}},
+        connections=["pendulum.a -> gain.u"],
+        deploy={"hosts": {"b": {}}},
+        simulation={"stop_time": 3.0, "real_time_factor": 1.0},
+    )
+    launch, command = launched(here, file, "--restarts", "1")
+    by_hand = there.start("node", *command.split())
+    result = file.with_suffix(".csv")
+    wait_until(lambda: row_count(result) > 50 or not launch.running, "rows")
+
+    assert here.run("set", "gain.k", "3.5").wait() == 0
+    before = row_count(result)
+    wait_until(lambda: row_count(result) > before + 50 or not launch.running, "rows with it")
+    launch.child("master").kill()
+
+    # The recorder compares the rows with those before, and the values in the metadata are those of the last attempt.
+    assert (launch.wait(), by_hand.wait()) == (0, 0), f"{here.story()}\n{there.story()}"
+    text = result.with_name(f"{result.name}.json").read_text(encoding="utf-8")
+    assert [value["value"] for value in json.loads(text)["set"]] == [3.5]
+    there.assert_nothing_left(on_a_busy_machine(2.0))
