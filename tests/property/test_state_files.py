@@ -44,6 +44,18 @@ class Noise(fmu_mesh.Component):
         self.word = f"{self.y:.3f}"
 """
 
+FAILING = """
+import fmu_mesh
+
+class Failing(fmu_mesh.Component):
+    y = fmu_mesh.Output(start=0.0)
+
+    def step(self, time, step_size):
+        if time > 0.5:
+            raise ValueError("too late")
+        self.y = time
+"""
+
 WORLD = """
 <mujoco model="world"><option timestep="0.001"/><worldbody><geom type="plane" size="5 5 .1"/>
 <body name="arm" pos="0 0 1"><joint name="swing" type="hinge" axis="0 1 0" damping="0.05"/>
@@ -70,6 +82,7 @@ def everything(tmp_path_factory: pytest.TempPathFactory, event_fmu: Callable[...
     """A mesh of all that has a state: FMUs of all kinds, engines, rates, values over time."""
     folder = tmp_path_factory.mktemp("everything")
     (folder / "noise.py").write_text(COMPONENT, encoding="utf-8")
+    (folder / "failing.py").write_text(FAILING, encoding="utf-8")
     (folder / "world.xml").write_text(WORLD, encoding="utf-8")
     write_network(folder / "network.onnx")
     instances: dict[str, dict[str, Any]] = {path.stem: {"fmu": str(path)} for path in sorted(FMUS.glob("*.fmu"))}
@@ -87,6 +100,7 @@ def everything(tmp_path_factory: pytest.TempPathFactory, event_fmu: Callable[...
         "stairs": {"fmu": str(event_fmu("Stairs", 3)), "start_values": {"period": 0.07}},
         "pid": {"controller": "position_pid", "start_values": {"p": 3.0, "i": 2.0}},
         "noise": {"python": "noise.py:Noise", "step_size": 2 * H},
+        "held": {"python": "failing.py:Failing", "on_failure": "hold"},
         "world": {"mujoco": "world.xml"},
         "network": {"onnx": "network.onnx"},
     }
@@ -129,7 +143,7 @@ def test_a_fresh_process_goes_on_with_the_same_floats(everything: Path, tmp_path
     files, expected = [str(tmp_path / "1.state"), str(tmp_path / "2.state")], []
     with mesh.open() as system:
         for file in files:
-            system.step(drawn.randrange(1, 50))
+            system.step(drawn.randrange(20, 60))
             system.set("Gain.u", drawn.random())
             system.set("fast.k", drawn.random())
             system.step(drawn.randrange(1, 30))

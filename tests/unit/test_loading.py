@@ -273,7 +273,7 @@ TEXTS = [
     pytest.param(
         "- 1\n",
         "mesh.yaml:1: a list; expected a mapping with mesh, simulation, instances, group, connections, initialization, "
-        "record, scenario and 10 more",
+        "record, scenario and 11 more",
         id="a list",
     ),
     pytest.param(
