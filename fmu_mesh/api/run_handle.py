@@ -384,9 +384,9 @@ class Run:
         Example:
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> with mesh.start(record="memory", stop_time=0.1, paused=True) as run:
-            ...     run.step(10).point, run.checkpoint("results/ten.state")
+            ...     run.step(10).point, run.checkpoint("ten.state")
             (10, 10)
-            >>> len(mesh.run(record="memory", stop_time=0.1, state="results/ten.state").times)
+            >>> len(mesh.run(record="memory", stop_time=0.1, state="ten.state").times)
             41
 
         Returns:

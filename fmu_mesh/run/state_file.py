@@ -205,7 +205,6 @@ def write_state(file: Path, data: bytes, *, synced: bool = True) -> None:
         ConfigurationError: the file cannot be written; an older one is as it was.
     """
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
         with files.replaced(file) as draft, draft.open("wb") as target:
             target.write(data)
             target.flush()

@@ -447,6 +447,11 @@ NOT_RUN = [
         "it needs perf and gdb, and may need root; tests/faults/test_fork_server.py attaches py-spy",
     ),
     (
+        "docs/recovery.md",
+        "fmu-mesh checkpoint plant --output at20s.state",
+        "the mesh is yours; tests/property/test_branches.py does it with others",
+    ),
+    (
         "docs/ros-node.md",
         "source /opt/ros/jazzy/setup.bash",
         "it needs a ROS with its commands; tests/ros/test_node.py starts this node and switches it",
