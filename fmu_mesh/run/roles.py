@@ -39,7 +39,7 @@ from ..wire.keys import Keys
 from ..wire.meeting import Meeting, meeting_of
 from ..wire.messages import NewStart, Noted
 from ..wire.router_link import RouterLink
-from ..wire.runtime import fmu_folder, leave_shared, run_folder, share, shared_endpoint, shared_file, write_note
+from ..wire.runtime import fmu_folder, run_folder, share, write_note
 from ..wire.session import Wiring, close_session, open_session, own_endpoints
 from ..wire.views import LogLine, MeshStatus
 from .events import Event, EventWriter, Log, Reachable, Status, WasReset, log_line
@@ -50,7 +50,7 @@ from .process import RunProcess
 from .run_directory import Syncing
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
 from .state_file import keep_state, state_bytes
-from .wiring import certified, patient, table_of, wiring
+from .wiring import certified, patient, shared_with_group, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
     from .preparing import KnownModels
@@ -281,7 +281,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
             own = certified(own, config.security, Keys(config.zenoh.key_prefix, config.mesh).root, config.ends)
-            shared = _shared(run, process, own)
+            shared, leave = shared_with_group(run, process.folder, own)
+            process.stack.callback(leave)
             runs = _MasterRuns(run, process, replace(own, listen=(*own.listen, *shared)))
             for endpoint in shared:
                 share(endpoint)
@@ -333,22 +334,6 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
             raise failure
         master.wait_for_followers()
         return outcome
-
-
-def _shared(run: RunPlan, process: RunProcess, own: Wiring) -> tuple[str, ...]:
-    """Where the members of a group reach the mesh, if it is shared with one.
-
-    Raises:
-        ConfigurationError: it cannot be.
-    """
-    if (group := run.loaded.config.runtime.share_with) is None:
-        return ()
-    if own.mode == "client":
-        text = f"mesh '{run.mesh}' cannot be shared with the group '{group}': its master only connects to a router"
-        raise ConfigurationError(text, hint="With `zenoh.mode: peer`, or started by `launch`, it has a socket.")
-    endpoint = shared_endpoint(process.folder, group)
-    process.stack.callback(leave_shared, shared_file(process.folder, group))
-    return (endpoint,)
 
 
 class _MasterRuns:

@@ -8,9 +8,10 @@ reach the master only at the endpoints of `zenoh.listen`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,14 +23,24 @@ from ..errors import ConfigurationError
 from ..files import beside
 from ..system.plan import MASTER
 from ..wire.keys import LOCAL
-from ..wire.runtime import socket_endpoint
+from ..wire.runtime import leave_shared, shared_endpoint, shared_file, socket_endpoint
 from ..wire.session import Wiring
 from .run_plan import RunPlan
 
 if TYPE_CHECKING:  # as below
     from ..wire.security.identity import Identity
 
-__all__ = ["certified", "identity_of", "name_of", "patient", "table_of", "warnings_of", "wiring", "with_doors"]
+__all__ = [
+    "certified",
+    "identity_of",
+    "name_of",
+    "patient",
+    "shared_with_group",
+    "table_of",
+    "warnings_of",
+    "wiring",
+    "with_doors",
+]
 
 
 _ACCESS: Final = re.compile(r"\b(?:zenoh|ros)\.(?:listen|connect)|^`(?:listen|connect)=|\bruntime\.share_with")
@@ -165,3 +176,17 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool, is_mirrore
     waits = is_node or not all(map(is_socket, (*made.listen, *made.connect)))
     stuck_s = lease_s if waits else made.stuck_s
     return replace(made, lease_s=lease_s, stuck_s=stuck_s, patience_s=timeouts.router)
+
+
+def shared_with_group(run: RunPlan, folder: Path, own: Wiring) -> tuple[tuple[str, ...], Callable[[], None]]:
+    """Where the members of a group reach a mesh that is shared with one, and what leaves that place again.
+
+    Raises:
+        ConfigurationError: it cannot be.
+    """
+    if (group := run.loaded.config.runtime.share_with) is None:
+        return (), lambda: None
+    if own.mode == "client":
+        text = f"mesh '{run.mesh}' cannot be shared with the group '{group}': its master only connects to a router"
+        raise ConfigurationError(text, hint="With `zenoh.mode: peer`, or started by `launch`, it has a socket.")
+    return (shared_endpoint(folder, group),), partial(leave_shared, shared_file(folder, group))
