@@ -614,7 +614,8 @@ def test_all_nodes_are_held_at_a_common_point_until_saved(plan: Plan) -> None:
     assert RaiseGrant(LAST) not in run.decide()
     assert (run.states.granting.grant, run.states.moves) == (16, False)
     run.now += 100.0  # longer than each deadline of a step: whoever asks for the states looks at the time
-    assert run.decide() == [SendToAll(GRANT, 0)] or run.states.failure is None
+    run.decide()
+    assert run.states.failure is None
     run.states.saved()
     run.decide()
     assert run.states.granting.grant > 16
@@ -635,7 +636,7 @@ def test_a_run_does_not_end_before_its_last_point_is_saved(plan: Plan) -> None:
     assert run.states.save(claimed=LAST, every=1)
     run.at(LAST)
     run.decide()
-    assert run.states.state == "running"
+    before = run.states.state
     run.states.saved()
     run.decide()
-    assert run.states.state == "stopping"
+    assert (before, run.states.state) == ("running", "stopping")
