@@ -105,7 +105,9 @@ def test_a_run_is_saved_and_begins_there_in_every_way(tmp_path: Path, event_fmu:
     mesh = cycle(tmp_path, event_fmu("Oscillator", 2), "dopri5")
     whole = mesh.run(record="memory", processes=False)
     running = {name: value for name, value in how.items() if name != "processes"}
-    with mesh.start(record="memory", real_time_factor=40.0, **running) as run:
+    with mesh.start(record="memory", real_time_factor=10.0, paused=True, **running) as run:
+        run.wait_for("paused")
+        run.resume()
         points = [run.checkpoint(tmp_path / f"{number}.state") for number in range(3)]
         run.pause()
         run.step(-run.status.point % 4 or 4)
