@@ -281,8 +281,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
         try:
             own = patient(wiring(zenoh, run.config_file, process.folder, MASTER, ()), config.timeouts, is_node=False)
             own = certified(own, config.security, Keys(config.zenoh.key_prefix, config.mesh).root, config.ends)
-            shared, leave = shared_with_group(run, process.folder, own)
-            process.stack.callback(leave)
+            shared = shared_with_group(run, process.folder, own, process.stack.callback)
             runs = _MasterRuns(run, process, replace(own, listen=(*own.listen, *shared)))
             for endpoint in shared:
                 share(endpoint)

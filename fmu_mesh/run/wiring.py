@@ -178,15 +178,19 @@ def patient(made: Wiring, timeouts: TimeoutsConfig, *, is_node: bool, is_mirrore
     return replace(made, lease_s=lease_s, stuck_s=stuck_s, patience_s=timeouts.router)
 
 
-def shared_with_group(run: RunPlan, folder: Path, own: Wiring) -> tuple[tuple[str, ...], Callable[[], None]]:
-    """Where the members of a group reach a mesh that is shared with one, and what leaves that place again.
+def shared_with_group(
+    run: RunPlan, folder: Path, own: Wiring, at_end: Callable[[Callable[[], None]], object]
+) -> tuple[str, ...]:
+    """Where the members of a group reach a mesh, if it is shared with one; ``at_end`` takes what leaves that place.
 
     Raises:
         ConfigurationError: it cannot be.
     """
     if (group := run.loaded.config.runtime.share_with) is None:
-        return (), lambda: None
+        return ()
     if own.mode == "client":
         text = f"mesh '{run.mesh}' cannot be shared with the group '{group}': its master only connects to a router"
         raise ConfigurationError(text, hint="With `zenoh.mode: peer`, or started by `launch`, it has a socket.")
-    return (shared_endpoint(folder, group),), partial(leave_shared, shared_file(folder, group))
+    endpoint = shared_endpoint(folder, group)
+    at_end(partial(leave_shared, shared_file(folder, group)))
+    return (endpoint,)
