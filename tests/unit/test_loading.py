@@ -196,7 +196,7 @@ STRUCTURE = [
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
         "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, tolerance, "
-        "retry_discarded_steps, start_values, inputs, step_size and 8 more",
+        "retry_discarded_steps, start_values, inputs, step_size and 9 more",
         id="text for a mapping",
     ),
     pytest.param(
