@@ -95,7 +95,7 @@ ACTIONS: Final = (
     Action("write the keys at ends of connections", _WHO_ACTS, _ENDS, _ALL, _ALL),
     Action("set inputs and parameters", _WHO_ACTS, ("{mesh}/*/set/@by/{name}/**",), _SENDS, ("reply",)),
     Action(
-        "pause, resume, step, reset, checkpoint and stop",
+        "pause, resume, step, reset, stop, checkpoint",
         _WHO_ACTS,
         ("{mesh}/mesh/command/@by/{name}",),
         _SENDS,
