@@ -298,9 +298,9 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
         Annotated[float, Meta(gt=0.0)] | None,
         Meta(
             description="Time between two checkpoints in s: a restart begins with the newest one. null: with the first "
-            "point."
+            "point, as with `--restarts` alone."
         ),
-    ] = None
+    ] = 0.2
 
     @property
     def restarts(self) -> int:

@@ -63,8 +63,7 @@ class Checkpoints:
         self._mesh = f"mesh '{mesh}'"
         self._states = states
         self._withdraw, self._settings, self._refusals = withdraw, settings, refusals
-        recovery, attempt = states.plan.system.config.recovery, settings.attempt
-        self._every_s = recovery.checkpoint_s if attempt.number < attempt.most else None
+        self._every_s = settings.checkpoint_s
         self._due_at = self._every_s if self._every_s is not None else math.inf
         self._now = 0.0
         self._waiting: list[tuple[zenoh.Query, float]] = []
@@ -110,8 +109,8 @@ class Checkpoints:
         states, at, found, self._now = self._states, self._states.saves_at, self._found, now
         if at is None:
             if now >= self._due_at and states.state == "running" and not states.is_replaying:
-                self._due_at = math.inf  # without a state of each instance, there will be none
-                with suppress(CallRefused):
+                self._due_at = now + (self._every_s or 0.0)
+                with suppress(CallRefused):  # an instance has no state, or the run is about to pause
                     self._begin()
             return
         if self._stands_since is None and states.granting.reached >= at:

@@ -173,8 +173,9 @@ class Master:
         own = settings.launch, attempt, meeting, settings.table
         self._members = Members(self._states.registrations, session, keys, offer, *own)
         self._resting = Resting(self._keys.mesh, self._states, self._answer)
+        kept = replace(settings, checkpoint_s=None) if self._resets else settings  # after a reset, nothing starts again
         self._checkpoints = Checkpoints(
-            self._keys.mesh, self._states, self._withdrawn_grant, settings, self._inbox.refusals
+            self._keys.mesh, self._states, self._withdrawn_grant, kept, self._inbox.refusals
         )
         self._published: tuple[MeshState, bool] = ("starting", False)
         self._run_token = session.liveliness().declare_token(keys.master)

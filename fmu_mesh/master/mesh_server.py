@@ -60,7 +60,8 @@ class MasterSettings(msgspec.Struct, frozen=True):
         paused: whether the run begins paused at its first point.
         table: number of the table of roles; 0: it has none of our authority.
         as_file: a state file with the states of all instances at a point.
-        keep: gets the checkpoints for a restart, and their points.
+        checkpoint_s: how often in s there is a checkpoint for a restart; None: never.
+        keep: gets these checkpoints, and their points.
         attempt: which attempt of the run this is.
     """
 
@@ -71,6 +72,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
     paused: bool = False
     table: int = 0
     as_file: Callable[[int, Mapping[str, bytes]], bytes] = lambda _point, _states: b""
+    checkpoint_s: float | None = None
     keep: Callable[[int, bytes], None] = lambda _point, _data: None
     attempt: Attempt = Attempt()
 

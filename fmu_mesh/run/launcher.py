@@ -213,7 +213,7 @@ class Launcher:
         seen = max(run.replays_to, last_recorded(run.plan, files), self._states.point)
         rows = tuple(rows for _, rows in files)
         again = replace(run, restarts=run.restarts + 1, rows=rows, replays_to=min(seen, run.plan.grid.last_point))
-        return again_from_checkpoint(again, self._folder, rows) if run.checkpoint_s is not None else again
+        return again_from_checkpoint(again, run.kept_in, rows) if run.checkpoint_s is not None else again
 
     def _check_reachable(self) -> None:
         """Check that nodes that are started manually on other hosts can reach the master.

@@ -49,7 +49,7 @@ from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_directory import Syncing
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
-from .state_file import keep_state, state_bytes
+from .state_file import keeper, state_bytes
 from .wiring import certified, patient, shared_with_group, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
@@ -297,7 +297,8 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 attempt=run.attempt_of(MASTER),
                 table=table_of(own),
                 as_file=lambda point, states: state_bytes(runs.run, point, states),
-                keep=partial(keep_state, process.folder),
+                checkpoint_s=run.checkpoint_s,
+                keep=keeper(run),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())

@@ -1,8 +1,8 @@
 """The directory of `recovery`: what `--resume` needs to go on with a run, also after a power cut.
 
-It has `run`, which says what must agree; `on_disk`, which says what the disk had for sure; and the journals of the
-master and of all nodes. Each line in them has a checksum. The folder of a run has nothing of it: its processes remove
-that folder, also when the launcher was killed.
+It has `run`, which says what must agree; `on_disk`, which says what the disk had for sure; the newest checkpoints; and
+the journals of the master and of all nodes. Each line in them has a checksum. The folder of a run has nothing of it:
+its processes remove that folder, also when the launcher was killed.
 """
 
 # Who meets here (ADR 91). The launcher has an exclusive lock on `lock` as long as it lives: only one run uses the
@@ -41,6 +41,7 @@ from ..text import counted, listed
 from ..wire.journal import IN_USE, JOURNAL, line_of, whole_lines
 from .outcome import last_recorded
 from .run_plan import RunPlan
+from .state_file import STATE, again_from_checkpoint, drop_older
 
 __all__ = ["RunDirectory", "Syncing"]
 
@@ -129,7 +130,8 @@ class RunDirectory:
         for file in self._records:
             with suppress(OSError):
                 _give_to_disk(Path(file))
-        for path in (self._folder / _RUN, self._folder / _ON_DISK, *_journals(self._folder).glob(f"*{JOURNAL}")):
+        states, journals = self._folder.glob(f"*{STATE}"), _journals(self._folder).glob(f"*{JOURNAL}")
+        for path in (self._folder / _RUN, self._folder / _ON_DISK, *states, *journals):
             with suppress(OSError):
                 path.unlink()
 
@@ -179,7 +181,9 @@ class RunDirectory:
                 self.told.append(f"'{file}' had {own.rows} rows and has {rows}: the others are made again")
         seen = min(max(seen, last_recorded(plan.plan, found)), plan.plan.grid.last_point)
         self.told.append(f"the run is resumed, and goes on from point {seen}")
-        return replace(plan, rows=tuple(rows for _, rows in found), replays_to=seen)
+        all_rows = tuple(rows for _, rows in found)
+        again = replace(plan, rows=all_rows, replays_to=seen)
+        return again_from_checkpoint(again, self._folder, all_rows)
 
     def _refused(self, why: str) -> ConfigurationError:
         hint = "Give it the same configuration, models and options as before, or remove the folder to begin anew."
@@ -230,7 +234,7 @@ class Syncing:
 
     def __init__(self, run: RunPlan) -> None:
         self._folder = Path(run.directory)
-        self._records = [record.file for record in run.plan.system.records]
+        self._records = run.plan.system.records
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="sync")
         self._last: Future[None] | None = None
         self._due = 0.0
@@ -249,7 +253,11 @@ class Syncing:
             self._last = None
         if self._last is None and (now := time.monotonic()) >= self._due:
             self._due = now + _EVERY_S
-            self._last = self._worker.submit(_sync, self._folder, self._records, kept)
+            self._last = self._worker.submit(self._sync, kept)
+
+    def _sync(self, kept: Sequence[Kept]) -> None:
+        _sync(self._folder, [record.file for record in self._records], kept)
+        drop_older(self._folder, self._records, [own.rows for own in kept])
 
 
 def _sync(folder: Path, results: Sequence[str], kept: Sequence[Kept]) -> None:

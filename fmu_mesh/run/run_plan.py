@@ -140,7 +140,9 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def checkpoint_s(self) -> float | None:
         """How often in s there is a checkpoint for a restart; None: never."""
-        return self.loaded.config.recovery.checkpoint_s if self.restarts < self.max_restarts else None
+        recovery = self.loaded.config.recovery
+        is_wanted = recovery.mode == "restart" and self.restarts < self.max_restarts
+        return recovery.checkpoint_s if is_wanted or self.directory else None
 
     @property
     def config_file(self) -> Path:

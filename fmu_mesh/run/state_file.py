@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -23,12 +24,13 @@ from .. import __version__, files
 from ..errors import ConfigurationError, Finding
 from ..results.formats import required_format
 from ..system.plan import RECORDER
+from ..system.records import RecordPlan
 from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
 from ..text import short_number
 from ..variables.value_types import PlainValue
 from .run_plan import RunPlan
 
-__all__ = ["STATE", "StateFile", "again_from_checkpoint", "keep_state", "state_bytes", "write_state"]
+__all__ = ["STATE", "StateFile", "again_from_checkpoint", "drop_older", "keeper", "state_bytes", "write_state"]
 
 STATE: Final = ".state"
 """How the names of checkpoints in the folder of a run end."""
@@ -164,14 +166,44 @@ def state_bytes(
     return b"".join((start, head, *states.values()))
 
 
-def keep_state(folder: Path, point: int, data: bytes) -> None:
-    """Keep a checkpoint of a run in its folder, for a restart, and the one before it.
+def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
+    """A function that keeps the checkpoint at a point for a restart of a run, and the one before it.
 
-    The errors are those of `write_state`.
+    With a directory it gives them to the disk, on a thread of its own; a checkpoint that comes meanwhile is left out,
+    and `drop_older` removes them. The errors are those of `write_state`; then, they are of the checkpoint before.
     """
-    write_state(folder / f"{point}{STATE}", data, synced=False)
-    for older in sorted(folder.glob(f"*{STATE}"), key=_point_of)[:-2]:
-        older.unlink(missing_ok=True)
+    folder, worker, last = run.kept_in, ThreadPoolExecutor(1, thread_name_prefix="checkpoints"), list[Future[None]]()
+
+    def keep(point: int, data: bytes) -> None:
+        file = folder / f"{point}{STATE}"
+        if not run.directory:
+            write_state(file, data, synced=False)
+            for older in _newest_first(folder)[2:]:
+                older.unlink(missing_ok=True)
+        elif not last or last[-1].done():
+            if last:
+                last.pop().result()
+            last.append(worker.submit(write_state, file, data))
+
+    return keep
+
+
+def drop_older(folder: Path, records: Sequence[RecordPlan], rows: Sequence[int]) -> None:
+    """Remove the checkpoints before the newest one of which all files have the ``rows`` before it."""
+    states = iter(_newest_first(folder))
+    for file in states:
+        if _has_rows(_point_of(file), records, rows):
+            break
+    for file in states:
+        file.unlink(missing_ok=True)
+
+
+def _has_rows(point: int, records: Sequence[RecordPlan], rows: Sequence[int]) -> bool:
+    return all(there >= own.rows_before(point) for there, own in zip(rows, records, strict=True))
+
+
+def _newest_first(folder: Path) -> list[Path]:
+    return sorted(folder.glob(f"*{STATE}"), key=_point_of, reverse=True)
 
 
 def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> RunPlan:
@@ -182,11 +214,11 @@ def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> Ru
     system = run.plan.system
     if not all(hasattr(required_format(Path(own.file)), "resume") for own in system.records):
         return run
-    for file in sorted(folder.glob(f"*{STATE}"), key=_point_of, reverse=True):
+    for file in _newest_first(folder):
         with suppress(ConfigurationError):  # its writer was killed
             state = StateFile.read(file)
             point = state.head.point
-            if all(there >= own.rows_before(point) for there, own in zip(rows, system.records, strict=True)):
+            if _has_rows(point, system.records, rows):
                 grid = replace(run.plan.grid, first_point=point)
                 nodes = {name: replace(node, grid=grid) for name, node in run.plan.nodes.items()}
                 plan = replace(run.plan, system=replace(system, grid=grid), nodes=nodes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -125,6 +126,32 @@ def test_a_run_that_was_restarted_can_be_resumed(place: Place) -> None:
     assert resumed.wait() == 0, resumed.story()
     wanted = undisturbed(config, place.folder / "other.csv").read_bytes()
     assert config.with_suffix(".csv").read_bytes() == wanted
+
+
+def test_a_run_is_resumed_from_its_newest_whole_checkpoint(place: Place) -> None:
+    config = written(place, recovery={"directory": "kept", "checkpoint_s": 0.05}, connections=["gain.y -> filter.v"])
+    kept, launched = config.with_name("kept"), begun(place, config)
+
+    def usable() -> list[int]:
+        """The points of checkpoints of which the disk has all rows."""
+        rows = on_disk(config)["files"][0][0]
+        return sorted(point for file in kept.glob("*.state") if (point := int(file.stem)) <= rows)
+
+    wait_until(lambda: usable() or not launched.running, "a checkpoint with its rows")
+    cut_off(place, launched)
+    oldest, *others = usable()
+    for point in others:
+        damaged = kept / f"{point}.state"
+        damaged.write_bytes(damaged.read_bytes()[:-1])
+
+    resumed = place.run("launch", config, "--resume", "--no-progress")
+
+    assert resumed.wait() == 0, resumed.story()
+    (points,) = re.findall(r"^(\d+) points in", resumed.story(), re.MULTILINE)
+    assert int(points) == POINTS - oldest < POINTS
+    wanted = undisturbed(config, place.folder / "other.csv").read_bytes()
+    assert config.with_suffix(".csv").read_bytes() == wanted
+    assert not [*kept.glob("*.state")]
 
 
 class CutOff(NamedTuple):
