@@ -298,7 +298,7 @@ class RecoveryConfig(Base, frozen=True, kw_only=True):
         Annotated[float, Meta(gt=0.0)] | None,
         Meta(
             description="Time between two checkpoints in s: a restart begins with the newest one. null: with the first "
-            "point, as with `--restarts` alone."
+            "point."
         ),
     ] = 0.2
 

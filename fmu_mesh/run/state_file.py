@@ -5,6 +5,10 @@ size and the SHA-256 of each block that follows. So a file that was cut or chang
 reaches a model. It is no signature: who can write the file chooses what the models get (ADR 88).
 """
 
+# With a directory for `--resume`, one thread gives the checkpoints of a run to the disk; the master's only hands them
+# over, so it never waits for a disk. The thread that gives rows to the disk removes old ones (ADR 91): a file that is
+# gone meanwhile is no error.
+
 from __future__ import annotations
 
 import hashlib
