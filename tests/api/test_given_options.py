@@ -34,6 +34,7 @@ RIGHT: Mapping[str, Any] = {
     "output": "out.csv",
     "scenario": {"events": []},
     "keys_from": os.devnull,
+    "state": None,
     "listen": ["tcp/127.0.0.1:0"],
     "connect": ["tcp/127.0.0.1:7447"],
     "security": "lab/host",
@@ -108,9 +109,9 @@ OF_ONE_FMU = {
 SHORT = {"stop_time": 0.004, "processes": False}
 CALLS = {
     "check": Call(PlanOptions, lambda mesh, **options: mesh.check(**options).require(), {}),
-    "run": Call(RunOptions, fmu_mesh.Mesh.run, SHORT),
-    "start": Call(RunOptions, started, SHORT),
-    "open": Call(OpenOptions, opened, {}, {**RIGHT, "keys_from": None, "state": None}),
+    "run": Call(RunOptions, fmu_mesh.Mesh.run, SHORT, {**RIGHT, "resume": False}),
+    "start": Call(RunOptions, started, SHORT, {**RIGHT, "resume": False}),
+    "open": Call(OpenOptions, opened, {}, {**RIGHT, "keys_from": None}),
     "simulate": Call(SimulateOptions, simulated, {**SHORT, "step_size": 0.002}, {**RIGHT, **OF_ONE_FMU}),
     "sweep": Call(SweepOptions, swept, {"stop_time": 0.004, "executor": Nowhere()}),
 }
