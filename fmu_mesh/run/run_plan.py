@@ -23,6 +23,7 @@ from ..instances.registry import decode_section
 from ..simtime import ENDLESS
 from ..system.attempt import Attempt
 from ..system.layout import row_bytes
+from ..system.placement import manual_hosts
 from ..system.plan import RECORDER, NodePlan, Plan
 from ..system.start_values import why_not_settable
 from ..system.states import BeginsWith
@@ -139,10 +140,10 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def checkpoint_s(self) -> float | None:
-        """How often in s there is a checkpoint for a restart; None: never."""
+        """How often in s there is a checkpoint for a restart; None: never. Nodes started by hand cannot get states."""
         recovery = self.loaded.config.recovery
         is_wanted = recovery.mode == "restart" and self.restarts < self.max_restarts
-        return recovery.checkpoint_s if is_wanted or self.directory else None
+        return recovery.checkpoint_s if (is_wanted or self.directory) and not manual_hosts(self.plan) else None
 
     @property
     def config_file(self) -> Path:
