@@ -415,6 +415,7 @@ NOT_RUN = [
         "scikit-learn is no requirement here; tests/unit/test_onnx.py reads models of this form",
     ),
     ("docs/performance.md", "make bench", "it takes 20 minutes, and figures of a busy machine mean nothing"),
+    ("docs/performance.md", ".venv/bin/python -m benchmarks.chaos configs/pendulum_delay.yaml", "it takes minutes"),
     (
         "docs/performance.md",
         ".venv/bin/python -m benchmarks.far",
@@ -445,6 +446,11 @@ NOT_RUN = [
         "docs/profiling.md",
         "PID=$(pgrep -f '^fmu-mesh node pendulum$')",
         "it needs perf and gdb, and may need root; tests/faults/test_fork_server.py attaches py-spy",
+    ),
+    (
+        "docs/recovery.md",
+        "$ fmu-mesh launch plant.yaml",
+        "the power is cut in between; tests/faults/test_resuming.py does that",
     ),
     (
         "docs/recovery.md",
