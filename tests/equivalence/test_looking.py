@@ -321,7 +321,7 @@ def test_of_a_long_log_the_newest_messages_are_kept(call: Call, session: zenoh.S
     published = Samples(session, f"{ROOT}/mesh/log")
     line = {"instance": "gain", "status": "warning", "category": "test", "message": "again", "point": 0}
     for _ in range(1100):
-        session.put(f"{ROOT}/gain/log", json.dumps(line))
+        session.put(f"{ROOT}/gain/log", json.dumps(line), congestion_control=zenoh.CongestionControl.BLOCK)
     first = json.loads(published.until(lambda _: True).payload.to_bytes())["number"]
     published.until(lambda sample: json.loads(sample.payload.to_bytes())["number"] >= first + 1099)
 
