@@ -23,7 +23,7 @@ import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.results.formats import read_result
 from fmu_mesh.wire.journal import JOURNAL, whole_lines
-from tests.helpers import FMUS, Launched, Place, assert_readable, row_count, wait_until
+from tests.helpers import FMUS, Launched, Place, assert_readable, examples, row_count, wait_until
 
 POINTS = 1500
 
@@ -185,7 +185,7 @@ def cut() -> Iterator[CutOff]:
         yield CutOff(place, config, files, config.with_suffix(".csv").read_bytes())
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(examples(20)))
 def test_files_cut_at_any_byte_give_no_wrong_row(cut: CutOff, seed: int) -> None:
     chance, (place, config, files, wanted) = random.Random(seed), cut  # noqa: S311  places in files
     results = [config.with_suffix(".csv"), config.with_name("resumed.csv.json")]
