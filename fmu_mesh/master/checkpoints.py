@@ -63,7 +63,7 @@ class Checkpoints:
         self._mesh = f"mesh '{mesh}'"
         self._states = states
         self._withdraw, self._settings, self._refusals = withdraw, settings, refusals
-        self._every_s = settings.checkpoint_s
+        self._every_s = settings.checkpoint_s if not stateless(states.plan.system) else None
         self._due_at = self._every_s if self._every_s is not None else math.inf
         self._now = 0.0
         self._waiting: list[tuple[zenoh.Query, float]] = []
@@ -110,7 +110,7 @@ class Checkpoints:
         if at is None:
             if now >= self._due_at and states.state == "running" and not states.is_replaying:
                 self._due_at = now + (self._every_s or 0.0)
-                with suppress(CallRefused):  # an instance has no state, or the run is about to pause
+                with suppress(CallRefused):  # the run is about to pause, or to end
                     self._begin()
             return
         if self._stands_since is None and states.granting.reached >= at:
