@@ -26,6 +26,7 @@ from .recording import Columns, Recording, ResultFormat, Tail, joined
 __all__ = [
     "check_record",
     "followed",
+    "goes_on",
     "near_hint",
     "read_result",
     "reading",
@@ -74,6 +75,14 @@ def required_format(path: str | Path) -> ResultFormat:
     if (found := result_format(path)) is None:
         raise ConfigurationError(f"no installed package writes the format of '{path}'.")
     return found
+
+
+def goes_on(path: str | Path) -> bool:
+    """Whether a file of this format can be continued by a run that starts again; see `Resumable`.
+
+    The errors are those of `required_format`.
+    """
+    return hasattr(required_format(path), "resume")
 
 
 def result_endings() -> list[str]:

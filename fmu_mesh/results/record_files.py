@@ -29,7 +29,7 @@ from ..system.live_keys import KeyValue
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
-from .formats import reading, required_format
+from .formats import goes_on, reading, required_format
 from .growth import GrowthWatch, ReadColumn
 from .keys_file import KeysFile, keys_beside
 from .recording import Recording, ResultFile
@@ -331,7 +331,7 @@ def rows_after(path: Path, kept: Kept) -> int:
         ConfigurationError: it is damaged, another run writes it, or it cannot be written.
     """
     format_ = required_format(path)
-    if not kept.rows or not hasattr(format_, "resume"):
+    if not kept.rows or not goes_on(path):
         return 0
     growing = format_.growing_file(path)
     with reading(path), open_alone(growing, path):

@@ -38,7 +38,7 @@ from ..results.record_files import rows_after
 from ..system.digest import difference
 from ..system.records import IN_MEMORY
 from ..text import counted, listed
-from ..wire.journal import IN_USE, JOURNAL, line_of, whole_lines
+from ..wire.journal import IN_USE, JOURNAL, JOURNALS, line_of, whole_lines
 from .outcome import last_recorded
 from .run_plan import RunPlan
 from .state_file import STATE, again_from_checkpoint, drop_older
@@ -302,7 +302,7 @@ def _growing(result: str) -> Path:
 
 
 def _journals(folder: Path) -> Path:
-    return folder / "journals"
+    return folder / JOURNALS
 
 
 def _is_device(path: Path) -> bool:

@@ -29,7 +29,7 @@ from ..system.start_values import why_not_settable
 from ..system.states import BeginsWith
 from ..text import counted, did_you_mean, listed, meant, nearest, shown
 from ..variables.model_description import ModelDescription, Variable
-from ..wire.journal import JOURNAL
+from ..wire.journal import JOURNAL, JOURNALS
 from ..wire.runtime import MeshNote, box_of, run_folder
 from .limits import ring_problem
 
@@ -221,7 +221,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Which attempt this is, for a node or the master."""
         number, most, journal = self.restarts + 1, self.max_restarts + 1, ""
         if self.max_restarts or self.directory:
-            folder = self.kept_in / "journals" if self.directory else self.kept_in
+            folder = self.kept_in / JOURNALS if self.directory else self.kept_in
             box = box_of(folder, participant)
             journal = str((box if box.is_dir() else folder) / f"{box.name}{JOURNAL}")
         return Attempt(number, most, self.replays_to, journal)

@@ -26,7 +26,7 @@ from msgspec.structs import replace
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
-from ..results.formats import required_format
+from ..results.formats import goes_on
 from ..system.plan import RECORDER
 from ..system.records import RecordPlan
 from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
@@ -216,7 +216,7 @@ def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> Ru
     Without one, and where the format of a file cannot go on, it begins where it began.
     """
     system = run.plan.system
-    if not all(hasattr(required_format(Path(own.file)), "resume") for own in system.records):
+    if not all(goes_on(own.file) for own in system.records):
         return run
     for file in _newest_first(folder):
         with suppress(ConfigurationError):  # its writer was killed

@@ -21,10 +21,12 @@ from ..errors import ConfigurationError
 from ..system.live_keys import KeyValue
 from .messages import SetValue
 
-__all__ = ["IN_USE", "JOURNAL", "Journal", "NodeJournal", "Whole", "line_of", "whole_lines"]
+__all__ = ["IN_USE", "JOURNAL", "JOURNALS", "Journal", "NodeJournal", "Whole", "line_of", "whole_lines"]
 
 JOURNAL: Final = ".journal"
 """How the names of these files end."""
+JOURNALS: Final = "journals"
+"""A folder for them, where they are not in that of the run."""
 IN_USE: Final = "in_use"
 """A file beside journals; if it is there, each process with a journal has a shared lock on it as long as it lives."""
 
