@@ -24,11 +24,15 @@ from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import PlainValue
 
 __all__ = [
+    "EXTRAPOLATIONS",
     "KIND",
     "ActuatorConfig",
     "Actuators",
     "ControllerConfig",
     "Controllers",
+    "Extrapolation",
+    "ExtrapolationOfInputs",
+    "Feedthrough",
     "FluidDynamics",
     "FluidDynamicsConfig",
     "Group",
@@ -93,6 +97,24 @@ OnFailure = Annotated[
     Meta(
         description="What follows if the instance itself fails in a step (an error, or an output that is not finite). "
         "stop: the run ends; hold: the run goes on with its last outputs; or `disable` with other values of outputs."
+    ),
+]
+Extrapolation = Literal["hold", "linear", "midpoint", "auto"]
+EXTRAPOLATIONS = (
+    "hold: an input is constant during a step; linear: it changes with the slope between the last two values, for "
+    "FMUs that take input derivatives; midpoint: it is constant, with the value of that line in the middle of the "
+    "step; auto: linear where the FMU takes it, else midpoint, and hold for an input that is not continuous."
+)
+"""What the ways of `Extrapolation` are, for descriptions of keys."""
+ExtrapolationOfInputs = Annotated[
+    Extrapolation | None,
+    Meta(description=f"How its connected inputs change within a step. {EXTRAPOLATIONS} null: as `simulation` says."),
+]
+Feedthrough = Annotated[
+    dict[str, dict[str, float]] | None,
+    Meta(
+        description="For `loops: solved`: by how much an output changes with an input at the same point, by output and "
+        "input, as {y: {u: -0.5}}; what is not listed is 0. null: it is measured in Initialization Mode."
     ),
 ]
 Host = Annotated[
@@ -192,7 +214,7 @@ class InstanceSection:
     """Base class of the sections of instances.
 
     A kind derives its section from `Base` and from this class. The field that has the same name as the kind is the path
-    of the model, unless the section overrides `path` and `agreed`. The section has those of the eight common keys that
+    of the model, unless the section overrides `path` and `agreed`. The section has those of the ten common keys that
     make sense for its kind::
 
         class TableConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND, tag="table"):
@@ -204,6 +226,8 @@ class InstanceSection:
             not_finite: NotFinitePolicy = None
             on_failure: OnFailure = "stop"
             process: Process = None
+            extrapolation: ExtrapolationOfInputs = None
+            feedthrough: Feedthrough = None
 
     Attributes:
         start_values: by variable name, as written in the file.
@@ -214,6 +238,8 @@ class InstanceSection:
         not_finite: what an output that is NaN or infinite means; None: what the simulation says.
         on_failure: what follows if the instance itself fails in a step.
         process: what the process of its node may take; None: what the mesh says.
+        extrapolation: how its connected inputs change within a step; None: what the simulation says.
+        feedthrough: the derivatives of its outputs by inputs at the same point; None: they are not known.
         interpolation: how a timed value for an unconnected input is used; None: its time is ignored.
         strict: whether what FMI forbids is an error for this instance; None: as the whole configuration says.
         follows_fmi: whether the rules of FMI apply to the model. If so, a start value that FMI forbids is a warning, or
@@ -232,6 +258,8 @@ class InstanceSection:
     not_finite: Literal["stop", "record"] | None = None
     on_failure: Literal["stop", "hold"] | SubstitutesConfig = "stop"
     process: ProcessConfig | None = None
+    extrapolation: Extrapolation | None = None
+    feedthrough: Mapping[str, Mapping[str, float]] | None = None
     interpolation: Literal["hold", "linear"] | None = None
     strict: bool | None = None
     follows_fmi: ClassVar[bool] = False
@@ -310,6 +338,8 @@ def placed(
         "host": None,
         "not_finite": not_finite,
         "process": process,
+        "extrapolation": None,
+        "feedthrough": None,
     }
     return _replaced(section, common)
 

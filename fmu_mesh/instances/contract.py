@@ -91,6 +91,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
         limits: how large an FMU may be.
         timeouts: how long its calls may take.
         linear_inputs: the inputs that change linearly within a step; only where the description allows it.
+        midpoint_inputs: those that get the middle of the line of their source; not a matter of the kind.
         log: call it with every message of the model, on the thread that calls the instance.
         showing: only given to a kind with `can_be_shown`.
         kept: where an instance may leave what the next one of its name can use again, in a process that runs a mesh
@@ -106,6 +107,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
     limits: LimitsConfig = LimitsConfig()
     timeouts: TimeoutsConfig = TimeoutsConfig()
     linear_inputs: tuple[LinearInput, ...] = ()
+    midpoint_inputs: tuple[LinearInput, ...] = ()
     log: Callable[[LogMessage], None] = lambda _message: None
     showing: Showing = Showing()
     kept: KeptModels | None = None

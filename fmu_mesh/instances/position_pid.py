@@ -18,6 +18,8 @@ from msgspec import Meta
 from ..config.base import Base
 from ..config.instance_sections import (
     KIND,
+    ExtrapolationOfInputs,
+    Feedthrough,
     Group,
     Host,
     Inputs,
@@ -64,6 +66,8 @@ class PidConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     host: Host = None
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None
 
     @property
     def path(self) -> str:

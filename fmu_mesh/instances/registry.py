@@ -25,6 +25,7 @@ from ..text import listed
 from ..variables.model_description import ModelDescription
 from .contract import Instance, Kind, Opening, Showing
 from .held_instance import HeldInstance
+from .midpoint_inputs import MidpointInputs
 
 __all__ = [
     "GROUP",
@@ -150,11 +151,13 @@ def prepare(opening: Opening[Any]) -> None:
 
 
 def open_instance(opening: Opening[Any]) -> Instance:
-    """Open an instance of whatever kind, with what `on_failure` says of it; the caller closes it."""
+    """Open an instance of whatever kind, with its `midpoint` inputs and `on_failure`; the caller closes it."""
     kind = _kind_of(opening.section)
     if opening.showing and not kind.can_be_shown:
         opening = replace(opening, showing=Showing())
     instance = kind.open(opening)
+    if opening.midpoint_inputs:
+        instance = MidpointInputs(instance, opening.midpoint_inputs)
     return instance if opening.section.on_failure == "stop" else HeldInstance(instance, opening)
 
 

@@ -223,11 +223,11 @@ class BurstEngine(Engine):
             outcome=before.outcome,
             by_python=id(by_python),
         )
-        loads = list(chain(*moves))
         if own is not None:
-            made.give(setters=own.setters, getters=own.getters, stores=own.stores)
-            loads += own.loads
-        made.give(gates=[source.gate for source in runner.sources], loads=loads, finite=runner.is_finite.spans)
+            made.give(loads=own.loads, setters=own.setters, getters=own.getters, stores=own.stores)
+            made.follow(own.lines)
+        gates = [source.gate for source in runner.sources]
+        made.give(gates=gates, feeds=list(chain(*moves)), finite=runner.is_finite.spans)
         self._kept[runner.name] = [made, bases, own]  # what the table points to
         ctypes.pointer(before)[0] = made
         self._by_python[runner.name] = by_python  # now the table has no other one any more

@@ -305,7 +305,7 @@ def sources_of(
     runner: Runner, rows: Mapping[str, Sequence[SourceRows]], step_points: Mapping[str, int]
 ) -> Iterator[Source]:
     """The sources of a runner, from the rows and the base points per own step of each instance."""
-    for feed in runner.plan.feeds:
+    for feed in runner.plan.step_feeds:
         for ring, counter, text in rows[feed.source]:
             transfer = Transfer(
                 feed,

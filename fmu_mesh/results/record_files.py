@@ -20,11 +20,13 @@ from typing import Any, TypeVar
 import numpy as np
 from msgspec import to_builtins
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, is_file, open_alone, unwritable
 from ..simtime import TimeGrid
+from ..system.coupling_rule import Consistent
 from ..system.live_keys import KeyValue
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
 from ..system.run_metadata import metadata_of
@@ -150,7 +152,8 @@ class RecordFiles:
         for own, record in zip(self._files, records, strict=True):
             for key in record.variables:
                 if key not in columns:
-                    columns[key] = column_of(*key)
+                    own_sum = record.consistent.get(".".join(key))
+                    columns[key] = column_of(*key) if own_sum is None else _sum(own_sum, column_of)
             own.begin(grid, record, [columns[key] for key in record.variables])
         if self._growth is not None:
             self._growth.begin(columns)
@@ -229,6 +232,20 @@ class RecordFiles:
         for own, error in done:
             if error is not None:
                 raise unwritable(own.file.path, error) from error
+
+
+def _sum(consistent: Consistent, column_of: Callable[[str, str], ReadColumn]) -> ReadColumn:
+    """A function that calculates a consistent output from the columns that it depends on."""
+    terms = [(column_of(term.instance, term.column), term.factor) for term in consistent.terms]
+    (read_first, factor), *others = terms
+
+    def read(first: int, end: int) -> NDArray[Any]:
+        total = read_first(first, end) * factor + consistent.constant
+        for read_one, times in others:
+            total += read_one(first, end) * times
+        return total
+
+    return read
 
 
 class _RecordFile:

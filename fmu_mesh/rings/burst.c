@@ -185,9 +185,10 @@ static int move_values(const Move *move, const char *from, char *to) {
     return 0;
   }
   for (int64_t i = 0; i < move->count; i++, from += from_size, to += to_size) {
-    if (move->change == SCALED || from_type <= F32 || to_type <= F32) {
+    if (move->change == SCALED || move->change == ADDED || from_type <= F32 || to_type <= F32) {
       double value = as_double(from, from_type);
-      if (move->change == SCALED) value = value * move->factor + move->offset;
+      if (move->change == SCALED || move->change == ADDED) value = value * move->factor + move->offset;
+      if (move->change == ADDED) value = as_double(to, to_type) + value;
       if (move->negated) value = -value;
       put_double(to, to_type, value);
       continue;
@@ -215,6 +216,32 @@ static inline int move_all(const Move *moves, int64_t n, char *const *bases) {
     if (status) return status;
   }
   return 0;
+}
+
+enum { JUMP = 16 };
+
+/* Inputs get the middle of the lines of their sources in own step `step`: as `Line` of system/coupling_rule.py. */
+static void follow_lines(Member *member, int64_t step) {
+  const int64_t begin = step * member->points;
+  for (int64_t i = 0; i < member->lines_count; i++) {
+    Line *line = &member->lines[i];
+    const double value = *line->to;
+    int64_t latest = line->delay ? begin : begin + member->points;
+    latest -= latest % line->source_points;
+    if (latest != line->point) {
+      const double change = value - line->value, before = line->change / (double)line->distance;
+      const int64_t distance = latest - line->point;
+      line->jumped = line->point > 0 && __builtin_fabs(change / (double)distance - before) > JUMP * __builtin_fabs(before);
+      line->change = change;
+      line->distance = distance;
+      line->point = latest;
+    }
+    line->value = value;
+    if (!line->jumped) {
+      const double middle = (double)begin + 0.5 * (double)member->points - (double)line->point;
+      *line->to = value + line->change * (middle / (double)line->distance);
+    }
+  }
 }
 
 /* Call a getter or setter; a `size` below 0 is that of a function that takes none. */
@@ -275,6 +302,9 @@ static inline int64_t call_step(Member *member, int64_t step) {
   member->stage = SETTING;
   for (int64_t i = 0; i < member->n_tracks; i++)
     *member->tracks[i].to = member->tracks[i].values[step - member->tracks_from];
+  if ((status = move_all(member->feeds, member->n_feeds, bases)) != 0)
+    return (int64_t)SETTING << STAGE_BITS | status;
+  if (member->lines_count) follow_lines(member, step);
   if ((status = move_all(member->loads, member->n_loads, bases)) != 0)
     return (int64_t)SETTING << STAGE_BITS | status;
   if (!(said->quiet_until > end)) return (int64_t)IN_PYTHON << STAGE_BITS;
@@ -533,7 +563,7 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
         stamp(member, member->step + 1, 0);
         atomic_thread_fence(memory_order_release); /* the cleared stamp comes before the values */
         if (member->kind == BY_PYTHON || member->step >= member->python_at) {
-          if (move_all(member->loads, member->n_loads, member->bases) != 0) {
+          if (move_all(member->feeds, member->n_feeds, member->bases) != 0) {
             member->outcome = (int64_t)SETTING << STAGE_BITS | OUT_OF_RANGE;
             result = STATUS;
           } else {

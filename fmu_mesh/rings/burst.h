@@ -27,7 +27,7 @@ typedef struct { /* one value that somebody waits for */
 enum StepKind { BY_PYTHON, FMI1, FMI2, FMI3, EQUATIONS };                  /* Member.kind */
 enum Stage { WAITING, SETTING, STEPPING, GETTING, IN_PYTHON, STEPPED };    /* Member.stage */
 enum RowBase { FIXED, OUTPUT, WATCHED, FIRST_GATE };                       /* what an offset is relative to: see Move */
-enum Change { UNCHANGED, SCALED, LOOKED_UP };                              /* Move.change */
+enum Change { UNCHANGED, SCALED, LOOKED_UP, ADDED };                       /* Move.change */
 enum NumberType { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH }; /* Move.from_type, Move.to_type, Span.type */
 
 typedef struct { /* the rows of one source, for one delay */
@@ -92,13 +92,21 @@ typedef struct { /* an input with a value for each own step that the burst takes
   double *to; /* in the row of inputs */
 } Track;
 
+typedef struct { /* an input that gets the middle of the line of its source: see `Line` in system/coupling_rule.py */
+  double *to; /* in the row of inputs, where its value is */
+  int64_t delay, source_points;
+  double value, change;
+  int64_t point, distance, jumped;
+} Line;
+
 typedef struct { /* one instance: how it gets its inputs, steps, and gives its outputs */
   Gate *gates;
-  Move *loads;  /* from the rows of the sources into the row of inputs, and from there into buffers */
+  Move *feeds;  /* from the rows of the sources into the row of inputs */
+  Move *loads;  /* from there into buffers */
   Call *setters;
   Call *getters;
   Move *stores; /* from buffers into the own row */
-  int64_t n_gates, n_loads, n_setters, n_getters, n_stores;
+  int64_t n_gates, n_feeds, n_loads, n_setters, n_getters, n_stores;
   int64_t kind;
   void *component, *do_step; /* of EQUATIONS, `do_step` is their table */
   Said *said; /* of an FMU */
@@ -110,6 +118,8 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   Track *tracks;
   int64_t n_tracks;
   int64_t tracks_from; /* the own step of their first values */
+  Line *lines; /* an array that Python has, too */
+  int64_t lines_count;
   Span *finite;
   int64_t n_finite;
   Output outputs[2]; /* the own ring; and outputs that somebody watches */

@@ -41,6 +41,7 @@ __all__ = [
     "IncomingTable",
     "Keep",
     "Last",
+    "LineTable",
     "Lookup",
     "MemberTable",
     "Move",
@@ -102,7 +103,7 @@ class RowBase(IntEnum):
 class Change(IntEnum):
     """What a `Move` makes of a value."""
 
-    UNCHANGED, SCALED, LOOKED_UP = range(3)
+    UNCHANGED, SCALED, LOOKED_UP, ADDED = range(4)
 
 
 class StreamState(IntEnum):
@@ -221,6 +222,11 @@ class Move(Structure):
     """Values that are copied from one base to another, with factor, offset and type, or with a map."""
 
 
+@_declared("Line")
+class LineTable(_Changed):
+    """An input that gets the middle of the line of its source, as `fmu_mesh.system.coupling_rule.Line`."""
+
+
 @_declared("Call")
 class Call(Structure):
     """A getter or a setter of an FMU; ``size`` is -1 where it takes no number of values."""
@@ -278,6 +284,11 @@ class EquationsTable(_WithArrays):
 @_declared("Member")
 class MemberTable(_WithArrays):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
+
+    def follow(self, lines: ctypes.Array[LineTable] | None) -> None:
+        """Its inputs follow these lines, an array that stays where it is."""
+        self.lines = ctypes.addressof(lines) if lines is not None else None
+        self.lines_count = len(lines) if lines is not None else 0
 
 
 @_declared("Unit")
@@ -422,6 +433,7 @@ class NativeStep(NamedTuple):
 
     Attributes:
         loads: from the row of inputs to buffers of other types.
+        lines: the inputs of the row that follow a line; None, if there are none.
         setters: read the row of inputs, or buffers.
         getters: write the rows of `RowBase.OUTPUT` and `RowBase.WATCHED`, or buffers.
         stores: from buffers to these rows.
@@ -437,6 +449,7 @@ class NativeStep(NamedTuple):
     getters: Sequence[Call]
     stores: Sequence[Move]
     kept: Sequence[object]
+    lines: ctypes.Array[LineTable] | None = None
 
 
 def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no type for an array of any structure

@@ -84,7 +84,11 @@ class Transfer:
             self.check_range(step)
         slot = self.rule.row_for(step) & self.source.mask
         for copy in self._copies:
-            copy.part[0, copy.columns] = copy.convert(self.source.parts[copy.source_part][slot][copy.source_columns])
+            values = copy.convert(self.source.parts[copy.source_part][slot][copy.source_columns])
+            if copy.adds:
+                copy.part[0, copy.columns] += values
+            else:
+                copy.part[0, copy.columns] = values
 
     def check_range(self, step: int) -> None:
         """Check the values for own step ``step``: the burst ends where one does not fit, and does not say which one.
@@ -145,6 +149,7 @@ class _Copy(NamedTuple):
     columns: Index
     scale: tuple[Any, Any] | None
     change: ValueChange | None
+    adds: bool
 
     def convert(self, values: NDArray[Any]) -> NDArray[Any]:
         """``values * factor + offset`` in Float64, with one rounding each; for a Float32 the result is rounded again.
@@ -164,28 +169,32 @@ class _Copy(NamedTuple):
 
 
 def _change_of(column: FeedColumn) -> Change:
+    if column.adds:
+        return Change.ADDED
     return Change.UNCHANGED if (column.factor, column.offset) == (1.0, 0.0) else Change.SCALED
 
 
 def _copies(columns: Sequence[FeedColumn], changes: Sequence[ValueChange], source: Ring, inputs: Ring) -> list[_Copy]:
     """Group the columns by part of source and target, and by whether they are scaled; a column with a map is alone.
 
+    So is one that adds, after the group with the value that it is added to; and it keeps its place among such columns.
     An unscaled column is not multiplied by 1.0, so it keeps every bit, also of a NaN.
     """
     groups: dict[tuple[int, int, Change, int], list[tuple[int, int, int, float, float]]] = {}
     for number, column in enumerate(columns):
         have, want = source.layout.place(column.source), inputs.layout.place(column.target)
-        key = (Change.LOOKED_UP, number) if column.map else (_change_of(column), -1)
+        key = (Change.LOOKED_UP, number) if column.map else (_change_of(column), number if column.adds else -1)
         group = groups.setdefault((have.part, want.part, *key), [])
         group.append((have.first, want.first, want.size, column.factor, column.offset))
     copies = []
     for (source_part, target_part, kind, number), group in groups.items():
         have_first, want_first, sizes, factors, offsets = zip(*group, strict=True)
-        scale = (np.repeat(factors, sizes), np.repeat(offsets, sizes)) if kind == Change.SCALED else None
+        is_scaled, adds = kind in {Change.SCALED, Change.ADDED}, kind == Change.ADDED
+        scale = (np.repeat(factors, sizes), np.repeat(offsets, sizes)) if is_scaled else None
         sources, targets = elements_at(have_first, sizes), elements_at(want_first, sizes)
-        change = changes[number] if number >= 0 else None
-        copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale, change))
-    return copies
+        change = changes[number] if kind == Change.LOOKED_UP else None
+        copies.append(_Copy(source_part, sources, inputs.parts[target_part], targets, scale, change, adds))
+    return sorted(copies, key=lambda copy: copy.adds)
 
 
 def elements_at(first: Sequence[int], sizes: Sequence[int]) -> Index:

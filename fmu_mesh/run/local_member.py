@@ -6,7 +6,8 @@ Looks everything up once, before the first step. Knows no other instance but thr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from ..rings.ring import Ring, Rows
 from ..rings.value_change import ValueChange
 from ..simtime import TimeGrid
 from ..system.coupling_rule import CouplingRule
+from ..system.feeds import FeedColumn, consistent_columns, reads_of
 from ..system.input_timeouts import LastValues
 from ..system.layout import Layout
 from ..system.plan import Plan
@@ -42,10 +44,12 @@ class LocalMember:
     def __init__(self, plan: Plan, name: str, instance: Guarded) -> None:
         self.plan = plan.nodes[plan.node_of(name)].instance(name)
         self.connections = [c for c in plan.connections if c.target_instance == name]
+        self._consistent = plan.consistent
         self.instance = instance
         self._inputs = Ring(self.plan.input_row, 1)
         # A slower instance reads values that are as old as its own step.
-        readers = {c.target_instance for c in plan.connections if c.source_instance == name} | {name}
+        reads = reads_of(plan.connections, plan.consistent)
+        readers = {reader for source, _, reader in reads if source == name} | {name}
         oldest = max(plan.system.instances[reader].step_points for reader in readers)
         self._outputs = Ring(self.plan.outputs, 1 << (2 * -(-oldest // self.plan.step_points)).bit_length())
         self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs)
@@ -126,6 +130,10 @@ class LocalMember:
         for c in self.connections:
             if c.initial_only:
                 continue
+            columns = [*consistent_columns(c, self._consistent)]
+            if len(columns) > 1 or (c.source_instance, c.source_name) in self._consistent:
+                self._feed_consistent(columns, members)
+                continue
             read, points = members[c.source_instance].reader(c.source_name)
             lead = CouplingRule(c.delay or 0, points, self._points).lead
             own = ValueChange.of_connection(c)
@@ -135,6 +143,17 @@ class LocalMember:
             elif c.map or own.is_checked(c.source.type):
                 change = own.of
             self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
+
+    def _feed_consistent(
+        self, columns: Sequence[tuple[str, int, FeedColumn]], members: Mapping[str, LocalMember]
+    ) -> None:
+        """Elements of one connection, of which some are consistent outputs: each is the sum of its terms."""
+        for target in dict.fromkeys(column.target for _, _, column in columns):
+            own = [(source, column) for source, _, column in columns if column.target == target]
+            reads = [(members[source].reader(column.source)[0], column.factor, column.offset) for source, column in own]
+            points = members[own[0][0]].plan.step_points  # those of all of them
+            lead = CouplingRule(columns[0][1], points, self._points).lead
+            self._feeds.append(_Feed(partial(_sum, reads), points, lead, None, self._inputs.writer(target)))
 
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
         """See `LocalSystem.reader`."""
@@ -308,6 +327,12 @@ class SavedMember(NamedTuple):
     outputs: Rows
     inputs: Rows
     sent: Mapping[str, Sequence[int]]
+
+
+def _sum(reads: Sequence[tuple[Callable[[int], Value], float, float]], row: int) -> Value:
+    """The sum of the values of this row of several instances, each with its factor and offset."""
+    values = [scaled(read(row), factor, offset) for read, factor, offset in reads]
+    return reduce(add, values)
 
 
 def element_at(value: Value, index: tuple[int, ...]) -> Value:

@@ -39,6 +39,7 @@ from ..variables.value_conversion import ValueRefused, to_plain, to_value
 from ..variables.value_types import PlainValue
 from ..wire.runtime import why_not_shared
 from .allowed_code import check_code
+from .direct_dependence import with_feedthrough
 from .options import PlanOptions
 from .overriding import with_options
 from .run_plan import RunPlan
@@ -188,6 +189,9 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
+    if loaded.config.simulation.loops == "solved":
+        system = with_feedthrough(system, sections, findings, warnings)
+        findings.raise_any()
     _check_host(loaded.config, obstacles, warnings)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)

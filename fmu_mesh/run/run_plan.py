@@ -317,6 +317,7 @@ def opening_in(
         limits=node.limits,
         timeouts=node.timeouts,
         linear_inputs=item.linear_inputs,
+        midpoint_inputs=item.midpoint_inputs,
         log=log,
     )
 

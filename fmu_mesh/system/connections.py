@@ -7,12 +7,12 @@ Owns the names of the ends (the first dot ends the instance name), causality, ty
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
 
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.instance_sections import Extrapolation
 from fmu_mesh.config.key_sections import KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.mesh import ConnectionConfig
 from fmu_mesh.system.value_map import checked_items, resolve_map
@@ -67,7 +67,7 @@ class Connection(msgspec.Struct, frozen=True):
         delay: 0, 1, or None where the algorithm decides; always None for a parameter.
         path: its place in the configuration file, such as `connections[2]`.
         units: the unit conversion in words; empty if there is none.
-        extrapolation: whether the target's input changes linearly within a step.
+        extrapolation: how the target's input changes within a step; None: as the target or the simulation says.
     """
 
     source_instance: str
@@ -78,7 +78,7 @@ class Connection(msgspec.Struct, frozen=True):
     offset: float
     delay: int | None
     path: str
-    extrapolation: Literal["hold", "linear"] = "hold"
+    extrapolation: Extrapolation | None = None
     source_index: tuple[int, ...] = ()
     target_index: tuple[int, ...] = ()
     units: str = ""

@@ -1,4 +1,17 @@
-"""Which row of a source feeds which step of a target (design, section 3).
+"""What a step gets from its sources: which row, what of it over the step, and outputs that are consistent.
+
+The ways of `extrapolation`, for the last value ``v`` of a source and its change ``c`` since the value before:
+
+* hold: the input is ``v`` over the whole step, so the coupling is of order 1.
+* linear: it follows the line through both values, by the derivative that the FMU takes (`LinearInputs`).
+* midpoint: it is constant, with the value of that line in the middle of the step, so the coupling is of order 2
+  (`MidpointInputs`). After a jump of the source it is ``v``.
+
+An output ``y`` that depends directly on an input ``u`` belongs to the input that its last step used, which is a step
+old: FMI does not let a co-simulation evaluate it again. With `loops: solved` whoever reads it gets
+``y + D (u* - u)`` instead, with the derivative ``D``, the input ``u`` that was used, and the consistent input ``u*``,
+which follows from all outputs in the same way (Kuebler and Schiehlen 2000; Arnold and Guenther 2001). As ``D`` is
+constant, that is a sum over values of the rows of one point: `Consistent`. So every process calculates it alone.
 
 Row 0 of an instance holds its outputs after Initialization Mode; row n holds them after its own step n - 1. Everything
 that moves values over a connection follows this rule: feeds within a node, frames between nodes, and the reference
@@ -7,13 +20,17 @@ loop of `--local`.
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CouplingRule"]
+__all__ = ["Consistent", "CouplingRule", "Line", "Term"]
+
+_JUMP: Final = 16.0
+"""A source jumps if its rate of change differs from the one before by more than so many times that one. Near a turning
+point a smooth source does so, too; there the rates are so small that it does not matter which one is used."""
 
 Steps = TypeVar("Steps", int, NDArray[np.intp])
 
@@ -48,3 +65,47 @@ class CouplingRule(msgspec.Struct, frozen=True):
     def row_for(self, step: Steps) -> Steps:
         """The row of the source that feeds own step ``step`` of the target; also for an array of steps."""
         return (step * self.target_points + self.lead) // self.source_points
+
+
+class Line(msgspec.Struct, frozen=True):
+    """The line through the last two rows of a source, which belong to two points. `burst.c` has it, too."""
+
+    value: float  # the last value
+    point: int = 0  # the point of the last value
+    change: float = 0.0  # the last value minus the one before; 0 as long as there is only one
+    distance: int = 1  # points between the two
+    jumped: bool = False  # whether it is no line, because the source has jumped
+
+    def through(self, value: float, point: int) -> Line:
+        """The line with the value of this point, which may be the last one again."""
+        if point == self.point:
+            return Line(value, point, self.change, self.distance, self.jumped)
+        change, distance, before = value - self.value, point - self.point, self.change / self.distance
+        jumped = self.point > 0 and abs(change / distance - before) > _JUMP * abs(before)
+        return Line(value, point, change, distance, jumped)
+
+    def at(self, point: float) -> float:
+        """The value at a point, or between two."""
+        return self.value + self.change * ((point - self.point) / self.distance)
+
+    def middle(self, begin: int, points: int) -> float:
+        """The value in the middle of a step of so many points."""
+        return self.value if self.jumped else self.at(begin + 0.5 * points)
+
+
+class Term(NamedTuple):
+    """A column of the row of an instance, and what it is multiplied by."""
+
+    instance: str
+    column: str
+    factor: float
+
+
+class Consistent(NamedTuple):
+    """A consistent output: the constant and all terms, added in this order. All values belong to one point.
+
+    In every way of running, the first product and the constant are added first: ``factor * value + constant``.
+    """
+
+    constant: float
+    terms: tuple[Term, ...]

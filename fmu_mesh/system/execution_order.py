@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
 from ..config.findings import Findings
 from .connections import Connection
+from .coupling_rule import Consistent
+from .feeds import consistent_columns
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
 
 __all__ = ["ExecutionOrder", "execution_order"]
@@ -24,13 +26,21 @@ class ExecutionOrder(NamedTuple):
 
 
 def execution_order(
-    names: Collection[str], connections: Sequence[Connection], algorithm: str, findings: Findings
+    names: Collection[str],
+    connections: Sequence[Connection],
+    algorithm: str,
+    findings: Findings,
+    consistent: Mapping[tuple[str, str], Consistent] | None = None,
 ) -> ExecutionOrder:
     """The connections between instances with their delays, the order of the instances, and the cycles.
+
+    If outputs are made ``consistent`` (`loops: solved`), all connections of a cycle have a delay of 1.
 
     Raises:
         ConfigurationError: there is one; has all findings.
     """
+    if consistent is not None:
+        connections = _delayed_within(names, connections, findings)
     connections, closing = _with_delays(names, connections, algorithm)
     instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
     loops = [loop for loop in strongly_connected(names, instant) if is_cycle(loop, instant)]
@@ -39,9 +49,29 @@ def execution_order(
     if loops:
         findings.raise_any()
     edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
+    for c in connections if consistent else ():
+        if c.delay == 0:
+            instant += [(source, c.target_instance) for source, _, _ in consistent_columns(c, consistent or {})]
     order = topological_order(names, instant)
     cycles = tuple(tuple(part) for part in strongly_connected(names, edges) if is_cycle(part, edges))
     return ExecutionOrder(connections, closing, tuple(order), cycles)
+
+
+def _delayed_within(
+    names: Collection[str], connections: Sequence[Connection], findings: Findings
+) -> tuple[Connection, ...]:
+    """The connections with a delay of 1 for those within a cycle; a finding for each of them that has another one."""
+    edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
+    parts = [part for part in strongly_connected(names, edges) if is_cycle(part, edges)]
+    of = {name: number for number, part in enumerate(parts) for name in part}
+    found = []
+    for c in connections:
+        number = of.get(c.source_instance)
+        within = number is not None and number == of.get(c.target_instance) and not c.initial_only
+        if within and c.delay == 0:
+            findings.add(f"{c.path}.delay", f"0 for {c}, within a cycle whose loops are solved", "1, or no `delay`")
+        found.append(replace(c, delay=1) if within else c)
+    return tuple(found)
 
 
 def _with_delays(

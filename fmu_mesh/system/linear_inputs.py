@@ -1,51 +1,74 @@
-"""Inputs that change linearly within a step (`extrapolation: linear`): which there are, which kinds support them."""
+"""Which inputs follow the line of their source within a step (`extrapolation`), and which kinds support that.
+
+What they get is `fmu_mesh.system.coupling_rule`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.findings import Findings
+from ..config.instance_sections import Extrapolation
+from ..config.mesh import Config
 from ..variables.model_description import ModelDescription
 from .connections import Connection
 
-__all__ = ["LinearInput", "check_extrapolation"]
+__all__ = ["LinearInput", "with_extrapolation"]
 
 
 class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An input that changes linearly within a step.
+    """An input that follows the line of its source within a step: as a line, or with the value in its middle.
 
     Attributes:
         delay: that of its connection: 0 or 1.
         source_points: base points per step of its source.
+        ends: whether the row of outputs has the input, and gets its value at the end of the step.
     """
 
     name: str
     delay: int
     source_points: int = 1
+    ends: bool = False
 
 
-def check_extrapolation(
+def with_extrapolation(
+    config: Config,
     connections: Sequence[Connection],
     retrying: Collection[str],
     descriptions: Mapping[str, ModelDescription],
     findings: Findings,
-) -> None:
-    """Add a finding for every `extrapolation: linear` whose target cannot take the derivative of an input.
+) -> tuple[Connection, ...]:
+    """The connections with their ways of extrapolation; a finding for every way that a target does not support.
 
-    Discarded steps of the ``retrying`` instances are retried.
+    What is said for an instance or for all holds for the inputs that can change within a step. Discarded steps of the
+    ``retrying`` instances are retried.
     """
-    for connection in connections:
-        if connection.extrapolation == "linear":
-            target = connection.target_instance
-            reason = _cannot_extrapolate(connection, descriptions[target], retries=target in retrying)
-            if reason is not None:
-                found = f"linear for {connection}, but {reason}"
-                findings.add(f"{connection.path}.extrapolation", found, "hold")
+    found = []
+    for c in connections:
+        own, target = c.extrapolation, config.instances[c.target_instance]
+        general, place = target.extrapolation, f"instances.{c.target_instance}.extrapolation"
+        if general is None:
+            general, place = config.simulation.extrapolation, "simulation.extrapolation"
+        wanted: Extrapolation = own or general
+        description = descriptions[c.target_instance]
+        why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=c.target_instance in retrying)
+        way: Extrapolation = wanted
+        if wanted == "auto":
+            way = "hold" if why_held else "midpoint" if why_not_linear else "linear"
+        elif wanted != "hold" and why_held is not None and own is None:
+            way = "hold"
+        elif (why := why_held or (why_not_linear if wanted == "linear" else None)) is not None and wanted != "hold":
+            expected = "hold" if why_held else "hold, midpoint or auto"
+            findings.add(f"{c.path}.extrapolation" if own else place, f"{wanted} for {c}, but {why}", expected)
+        found.append(replace(c, extrapolation=way))
+    return tuple(found)
 
 
-def _cannot_extrapolate(connection: Connection, description: ModelDescription, *, retries: bool) -> str | None:
+def _why_held(connection: Connection) -> str | None:
+    """Why an input cannot change within a step; None if it can."""
     target = connection.target
     if target.type != "Float64" or target.shape or connection.target_index:
         return f"'{target.name}' is no scalar Real input"
@@ -53,9 +76,16 @@ def _cannot_extrapolate(connection: Connection, description: ModelDescription, *
         return f"'{target.name}' is a parameter"
     if target.variability != "continuous":
         return f"'{target.name}' is a {target.variability} input"
+    return None
+
+
+def _why_not_linear(connection: Connection, description: ModelDescription, *, retries: bool) -> str | None:
+    """Why an instance cannot take the derivative of an input; None if it can."""
     if description.kind == "model_exchange":
         return None
-    if description.fmi_version.startswith("3."):
+    if not description.fmi_version:
+        reason = f"'{connection.target_instance}' takes no input derivatives"
+    elif description.fmi_version.startswith("3."):
         reason = "co-simulation in FMI 3.0 takes no input derivatives (it would run as model exchange)"
     elif not description.can_interpolate_inputs:
         reason = f"the FMU of '{connection.target_instance}' does not interpolate inputs (canInterpolateInputs)"

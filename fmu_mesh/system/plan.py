@@ -6,7 +6,7 @@ Owns the synchronization model (docs/architecture.md) as data. The plan is a pur
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import msgspec
@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from ..config.deploy_section import HostConfig
 from ..config.findings import Findings
-from ..config.instance_sections import InstanceSection, ProcessConfig, placed
+from ..config.instance_sections import Extrapolation, InstanceSection, ProcessConfig, placed
 from ..config.key_sections import KEY
 from ..config.mesh import InitializationConfig, LimitsConfig, TimeoutsConfig
 from ..simtime import TimeGrid
@@ -22,13 +22,16 @@ from ..variables.model_description import Variable
 from ..variables.value_conversion import ValueRefused, to_plain
 from ..variables.value_types import PlainValue, is_float
 from .attempt import Attempt
+from .consistent_outputs import consistent_outputs
+from .coupling_rule import Consistent
 from .digest import digest_of
 from .execution_order import execution_order
-from .feeds import Feed, feeds_of
+from .feeds import Feed, feeds_of, reads_of, step_feeds_of
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
+from .links import Link, links_of
 from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .records import RecordPlan, union_of
@@ -50,7 +53,8 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         initialization: the levels of its connected outputs in Initialization Mode, by name.
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
-        linear_inputs: the inputs whose connections are extrapolated.
+        step_feeds: what its steps read: the connections, with what makes outputs consistent.
+        linear_inputs: the inputs that change linearly within a step; ``midpoint_inputs``: those that get the middle.
         row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario and of keys.
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
         initial_inputs: what is set in Initialization Mode: ``inputs``, and the connected parameters.
@@ -68,9 +72,11 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outputs: Layout
     inputs: Layout
     feeds: tuple[Feed, ...]
+    step_feeds: tuple[Feed, ...]
     initialization: dict[str, int]
     section: InstanceSection
     linear_inputs: tuple[LinearInput, ...] = ()
+    midpoint_inputs: tuple[LinearInput, ...] = ()
     scenario: tuple[Schedule, ...] = ()
     row: Layout | None = None
     parameters: tuple[Feed, ...] = ()
@@ -102,27 +108,6 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         if (why := why_not_settable(variable, self.sources.get(variable.name))) is not None:
             raise ValueRefused(why)
-
-
-class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The frames of one instance for one node. Each link has its own columns and is flushed separately.
-
-    Attributes:
-        index: number of the link in the mesh; every frame has it.
-        levels: initialization level of each column, in the order of `layout.names`; -1: not needed in initialization.
-        initial_only: whether it has no frames after Initialization Mode: it has values for parameters, or those of a
-            loop. A node that takes part in the iteration of a loop needs the values of all its torn connections, also
-            of those between other nodes.
-    """
-
-    index: int
-    source: str
-    source_node: str
-    target_node: str
-    step_points: int
-    layout: Layout
-    levels: tuple[int, ...]
-    initial_only: bool = False
 
 
 class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -182,7 +167,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
-        """(instance, variable) of the columns of all result files, each once, if it is the recorder."""
+        """(instance, variable) of what all result files need, each once, if it is the recorder."""
         return union_of(self.records)
 
     def peers(self) -> set[str]:
@@ -209,6 +194,7 @@ class Plan(msgspec.Struct, frozen=True):
         order: instance names in execution order within one point.
         cycles: instance names of every cycle.
         closing: the connections that have a delay of 1 because they close a cycle.
+        consistent: the formula of each output that is made consistent, by instance and name of the output or element.
         nodes: by node name, with the recorder if there is one.
     """
 
@@ -217,6 +203,7 @@ class Plan(msgspec.Struct, frozen=True):
     order: tuple[str, ...]
     cycles: tuple[tuple[str, ...], ...]
     closing: tuple[Connection, ...]
+    consistent: dict[tuple[str, str], Consistent]
     initialization: InitializationPlan
     window: int
     digest: str
@@ -254,13 +241,20 @@ def make_plan(
     """
     findings = Findings(system.config.mesh) if findings is None else findings
     names, how = [*system.instances], system.config.simulation.algorithm
-    connections, closing, order, cycles = execution_order(names, system.connections, how, findings)
+    points = {name: own.step_points for name, own in system.instances.items()}
+    consistent = consistent_outputs(system.connections, system.feedthrough, points, findings)
+    solved = consistent if system.config.simulation.loops == "solved" else None
+    connections, closing, order, cycles = execution_order(names, system.connections, how, findings, solved)
+    system = replace(system, records=tuple(record.with_consistent(consistent) for record in system.records))
     initialization = plan_initialization(system, connections)
     check_loops(initialization, connections, {n: own.description for n, own in system.instances.items()}, findings)
-    outputs = system.output_layouts(connections)
-    points = window_of(system.config.simulation.window if window is None else window, outputs.values())
-    plan = Plan(system, connections, order, cycles, closing, initialization, window=points, digest="", nodes={})
-    nodes = _nodes(plan, outputs)
+    reads = reads_of(connections, consistent)
+    outputs = system.output_layouts(read[:2] for read in reads)
+    window = window_of(system.config.simulation.window if window is None else window, outputs.values())
+    plan = Plan(
+        system, connections, order, cycles, closing, consistent, initialization, window=window, digest="", nodes={}
+    )
+    nodes = _nodes(plan, outputs, links_of(system, reads, initialization))
     digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
 
@@ -290,9 +284,8 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
     return digest_of(agreed, system, contents)
 
 
-def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
+def _nodes(plan: Plan, outputs: Mapping[str, Layout], links: Sequence[Link]) -> dict[str, NodePlan]:
     system, config = plan.system, plan.system.config
-    links = _links(plan)
     recorded = {link.source for link in links if link.target_node == RECORDER}
     windows = dict.fromkeys((instance.node for instance in system.instances.values()), plan.window)
     if system.records:
@@ -378,13 +371,11 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         outputs=outputs,
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
         feeds=feeds_of(stepped),
+        step_feeds=step_feeds_of(stepped, plan.consistent),
         initialization={v: level for (own, v), level in plan.initialization.levels.items() if own == instance.name},
         section=placed(plan.system.config.instances[instance.name], instance.not_finite),
-        linear_inputs=tuple(
-            LinearInput(c.target.name, c.delay or 0, plan.system.instances[c.source_instance].step_points)
-            for c in stepped
-            if c.extrapolation == "linear"
-        ),
+        linear_inputs=_following(plan, stepped, "linear"),
+        midpoint_inputs=_following(plan, stepped, "midpoint"),
         scenario=instance.scenario,
         row=row_of(instance.description, driven, connected),
         parameters=feeds_of(initial),
@@ -399,52 +390,11 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     )
 
 
-def _links(plan: Plan) -> tuple[Link, ...]:
-    """One link per instance and other node that needs its outputs: to the recorder last, then the initial ones."""
-    needed: dict[tuple[str, str], set[str]] = {}
-    for c in plan.connections:
-        target_node = plan.node_of(c.target_instance)
-        if not c.initial_only and target_node != plan.node_of(c.source_instance):
-            needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
-    for name, variable in plan.system.recorded:
-        needed.setdefault((name, RECORDER), set()).add(plan.system.base_of(name, variable))
-    links = []
-    ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
-    initial = _needed_initially(plan, needed)
-    for index, (source, target_node) in enumerate([*ends, *sorted(initial)]):
-        names = needed[source, target_node] if index < len(ends) else initial[source, target_node]
-        instance = plan.system.instances[source]
-        layout = Layout.of(v for v in instance.description.variables if v.name in names)
-        levels = plan.initialization.levels
-        links.append(
-            Link(
-                index=index,
-                source=source,
-                source_node=instance.node,
-                target_node=target_node,
-                step_points=instance.step_points,
-                layout=layout,
-                levels=tuple(
-                    -1 if target_node == RECORDER else levels.get((source, name), -1) for name in layout.names
-                ),
-                initial_only=index >= len(ends),
-            )
-        )
-    return tuple(links)
-
-
-def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
-    """What a node needs for parameters or to iterate a loop and no other link has, by (instance, node)."""
-    initial: dict[tuple[str, str], set[str]] = {}
-    for c in plan.connections:
-        node = plan.node_of(c.target_instance)
-        own = c.source_instance, node
-        if c.initial_only and node != plan.node_of(c.source_instance) and c.source.name not in needed.get(own, ()):
-            initial.setdefault(own, set()).add(c.source.name)
-    for loop in plan.initialization.loops:
-        for node in loop.nodes:
-            for tear in loop.tears:
-                output = plan.system.base_of(tear.source, tear.output)
-                if node != plan.node_of(tear.source) and output not in needed.get((tear.source, node), ()):
-                    initial.setdefault((tear.source, node), set()).add(output)
-    return initial
+def _following(plan: Plan, connections: Sequence[Connection], way: Extrapolation) -> tuple[LinearInput, ...]:
+    """The inputs of these connections that follow the line of their source in one way."""
+    points, ends = plan.system.instances, bool(plan.consistent)
+    return tuple(
+        LinearInput(c.target.name, c.delay or 0, points[c.source_instance].step_points, ends=ends)
+        for c in connections
+        if c.extrapolation == way
+    )

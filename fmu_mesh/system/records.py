@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig
@@ -22,6 +23,7 @@ from ..text import EXPRESSION, is_pattern, listed, matched, nearest, short_numbe
 from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
+from .coupling_rule import Consistent
 
 __all__ = [
     "IN_MEMORY",
@@ -69,12 +71,14 @@ class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             as `y[1,2]`.
         first: point of the first row.
         every: number of points from row to row.
+        consistent: how columns are calculated that are consistent outputs, by `instance.variable`.
     """
 
     file: str
     variables: tuple[tuple[str, str], ...]
     first: int = 0
     every: int = 1
+    consistent: dict[str, Consistent] = {}
 
     def point_of(self, row: int) -> int:
         """The point of a row; rows are counted from 0."""
@@ -84,16 +88,27 @@ class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Number of rows of the points before ``point``."""
         return max(0, -((self.first - point) // self.every))
 
+    def with_consistent(self, consistent: Mapping[tuple[str, str], Consistent]) -> RecordPlan:
+        """The file, with these outputs made consistent."""
+        own = {".".join(key): consistent[key] for key in self.variables if key in consistent}
+        return replace(self, consistent=own)
+
+    @property
+    def read(self) -> tuple[tuple[str, str], ...]:
+        """(instance, variable) of what the columns are, or are calculated from."""
+        terms = (term[:2] for own in self.consistent.values() for term in own.terms)
+        return (*self.variables, *terms) if self.consistent else self.variables
+
     def rows_within(self, first: int, end: int) -> slice:
         """Which ones of the points first to end - 1 have a row, as a slice of arrays with a value for each of them."""
         return slice(self.point_of(self.rows_before(first)) - first, end - first, self.every)
 
 
 def union_of(records: Sequence[RecordPlan]) -> tuple[tuple[str, str], ...]:
-    """(instance, variable) of the columns of all files, each once, in the order of the files."""
-    if len(records) == 1:
+    """(instance, variable) of what all files need, each once, in the order of the files."""
+    if len(records) == 1 and not records[0].consistent:
         return records[0].variables
-    return tuple(dict.fromkeys(column for record in records for column in record.variables))
+    return tuple(dict.fromkeys(column for record in records for column in record.read))
 
 
 CheckRecord = Callable[[RecordPlan, str, Mapping[str, ModelDescription], Findings], None]

@@ -98,6 +98,8 @@ def saved_instances(
             "values over time": _hash([schedule.agreed() for schedule in own.scenario]),
             "timeouts": _hash(own.timeouts),
         }
+        if plan.consistent:
+            agreed["consistent outputs"] = _hash(plan.nodes[own.node].instance(name).step_feeds)
         given = {variable: to_plain(value) for variable, value in own.start_values.items()}
         found[name] = SavedInstance(agreed, given | dict(others.get(name, {})))
     return found

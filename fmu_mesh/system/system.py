@@ -31,7 +31,7 @@ from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
 from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.layout import Layout
-from fmu_mesh.system.linear_inputs import check_extrapolation
+from fmu_mesh.system.linear_inputs import with_extrapolation
 from fmu_mesh.system.live_keys import KeyInput, KeyOutput, RecordedKeys, key_views, resolve_keys
 from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_nodes
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
@@ -85,6 +85,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         topics: those in ROS.
         recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
         begins_with: the state file with which it begins, absolute, or nothing.
+        feedthrough: the derivatives of outputs by inputs at the same point, if outputs are made consistent.
     """
 
     config: Config
@@ -97,6 +98,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     topics: tuple[MeshTopic, ...] = ()
     recorded_keys: RecordedKeys | None = None
     begins_with: str = ""
+    feedthrough: dict[str, dict[str, dict[str, float]]] = {}
 
     @property
     def keys(self) -> tuple[KeyView, ...]:
@@ -106,7 +108,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
-        """(instance, variable) of the columns of all result files, each once; an element of an array is `y[1,2]`."""
+        """(instance, variable) of what all result files need, each once; an element of an array is `y[1,2]`."""
         return union_of(self.records)
 
     def base_of(self, instance: str, name: str) -> str:
@@ -114,16 +116,13 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         variable = self.instances[instance].description.variable_of(name)
         return variable.name if variable is not None else name
 
-    def output_layouts(self, connections: Iterable[Connection]) -> dict[str, Layout]:
-        """What is read of each instance after a step: connected outputs, and what is recorded or goes to keys.
+    def output_layouts(self, reads: Iterable[tuple[str, str]]) -> dict[str, Layout]:
+        """What is read of each instance after a step: what ``reads`` names, what is recorded, and what goes to keys.
 
         In the order of its model description.
         """
         wanted = {name: {sent.variable for sent in own.keys_out} for name, own in self.instances.items()}
-        for c in connections:
-            if not c.initial_only:
-                wanted[c.source_instance].add(c.source.name)
-        for instance, variable in self.recorded:
+        for instance, variable in (*reads, *self.recorded):
             wanted[instance].add(self.base_of(instance, variable))
         return {
             name: Layout.of(variable for variable in own.description.variables if variable.name in wanted[name])
@@ -177,8 +176,8 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     _check_nodes(config, descriptions, claims, collected)
     connections = resolve_connections(config.connections, variables, collected)
     retrying = {name for name, section in config.instances.items() if section.retries_steps}
-    check_extrapolation(connections, retrying, descriptions, collected)
     connections += coupled_connections(config.engines, variables, connections, collected)
+    connections = with_extrapolation(config, connections, retrying, descriptions, collected)
     if obstacles is not None:
         obstacles.explain(collected.places)
     of_files = collected if obstacles is None else obstacles

@@ -17,6 +17,8 @@ from ...config.base import POSITIVE, Base, Sha256
 from ...config.findings import Findings
 from ...config.instance_sections import (
     KIND,
+    ExtrapolationOfInputs,
+    Feedthrough,
     Group,
     Host,
     Inputs,
@@ -110,6 +112,8 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
     process: Process = None
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None
     interpolation: Annotated[
         Literal["hold", "linear"] | None,
         Meta(

@@ -11,6 +11,8 @@ from ...config.instance_sections import (
     KIND,
     Actuators,
     Controllers,
+    ExtrapolationOfInputs,
+    Feedthrough,
     FluidDynamics,
     Group,
     Host,
@@ -48,3 +50,5 @@ class GazeboClassicConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_f
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
     process: Process = None
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None

@@ -11,6 +11,8 @@ from ...config.instance_sections import (
     KIND,
     Actuators,
     Controllers,
+    ExtrapolationOfInputs,
+    Feedthrough,
     FluidDynamics,
     Group,
     Host,
@@ -49,3 +51,5 @@ class MujocoConfig(Base, PhysicsSection, frozen=True, kw_only=True, tag_field=KI
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
     process: Process = None
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None

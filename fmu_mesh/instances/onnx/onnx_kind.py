@@ -17,6 +17,8 @@ from ... import files
 from ...config.base import Base
 from ...config.instance_sections import (
     KIND,
+    ExtrapolationOfInputs,
+    Feedthrough,
     Group,
     Host,
     Inputs,
@@ -48,6 +50,8 @@ class OnnxConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIN
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
     process: Process = None
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None
 
 
 class OnnxKind(Kind[OnnxConfig]):

@@ -11,6 +11,8 @@ from msgspec.structs import replace
 from ...config.base import Base
 from ...config.instance_sections import (
     KIND,
+    ExtrapolationOfInputs,
+    Feedthrough,
     Group,
     Host,
     Inputs,
@@ -84,6 +86,8 @@ class PythonConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=K
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
     process: Process = None
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None
 
     names_code = True
 

@@ -12,6 +12,8 @@ from ...config.base import POSITIVE, Base, Endpoint
 from ...config.findings import Findings
 from ...config.instance_sections import (
     KIND,
+    ExtrapolationOfInputs,
+    Feedthrough,
     Group,
     Host,
     Inputs,
@@ -108,6 +110,8 @@ class RosSimulatorConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_f
     host: Host = None
     not_finite: NotFinitePolicy = None
     on_failure: OnFailure = "stop"
+    extrapolation: ExtrapolationOfInputs = None
+    feedthrough: Feedthrough = None
 
     @property
     def path(self) -> str:

@@ -11,10 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 
-import msgspec
-
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
+from ....system.coupling_rule import Line
 from ....system.layout import Layout
 from ....system.linear_inputs import LinearInput
 from ...instance_wrapper import AroundInstance, of_kind, packed, unpacked
@@ -29,10 +28,12 @@ class LinearInputs(AroundInstance[FmuInstance]):
     def __init__(self, instance: FmuInstance, inputs: Sequence[LinearInput]) -> None:
         super().__init__(instance)
         self._inputs = inputs
-        self._lines: list[_Line] = []
+        self._lines: list[Line] = []
         self._outer = Ring(Layout(), 1)
         self._inner = self._outer
         self._columns: list[int] = []
+        self._told: list[tuple[int, str]] = []  # whose value at the end of the step goes into the row of outputs
+        self._rows: Sequence[Ring] = ()
         self._points = 1
         self._base_step_size = 0.0
 
@@ -46,11 +47,13 @@ class LinearInputs(AroundInstance[FmuInstance]):
         if not self._lines:
             # Before the first step, the FMU has the inputs of Initialization Mode.
             values = cast("list[float]", self._instance.get_values(names))  # only Float64 is linear
-            self._lines = [_Line(value) for value in values]
+            self._lines = [Line(value) for value in values]
         self._outer = inputs
         self._inner = Ring(inputs.layout, 1)
         self._columns = [inputs.layout.place(name).first for name in names]
         self._points, self._base_step_size = points, grid.step_size
+        self._rows, known = outputs[:1], outputs[0].layout
+        self._told = [(n, item.name) for n, item in enumerate(self._inputs) if item.ends and item.name in known]
         self._instance.bind(self._inner, outputs, grid, points, step)
 
     def do_step(self, step: int) -> None:
@@ -74,6 +77,8 @@ class LinearInputs(AroundInstance[FmuInstance]):
             self._lines[number] = line
         self._instance.set_input_derivatives(slopes, continuous=continuous)
         self._instance.do_step(step)
+        for number, name in self._told:
+            self._rows[0].put(step + 1, name, self._lines[number].at(begin + self._points))
 
     def get_state(self) -> object:
         """See `KeepsState`."""
@@ -96,31 +101,12 @@ class LinearInputs(AroundInstance[FmuInstance]):
 
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`."""
-        lines, rest = unpacked(data, tuple[_Line, ...], None)
+        lines, rest = unpacked(data, tuple[Line, ...], None)
         return _LinearState(super().deserialize_state(rest), lines)
-
-
-class _Line(msgspec.Struct, frozen=True):
-    """The line through the last two rows of a source."""
-
-    value: float  # the last value
-    point: int = 0  # the point of the last value
-    change: float = 0.0  # the last value minus the one before; 0 as long as there is only one
-    distance: int = 1  # points between the two
-
-    def through(self, value: float, point: int) -> _Line:
-        """The line with the value of this point, which may be the last one again."""
-        if point == self.point:
-            return _Line(value, point, self.change, self.distance)
-        return _Line(value, point, value - self.value, point - self.point)
-
-    def at(self, point: int) -> float:
-        """The value at a point."""
-        return self.value + self.change * ((point - self.point) / self.distance)
 
 
 class _LinearState(NamedTuple):
     """A state of the inner instance, and the lines."""
 
     inner: object
-    lines: tuple[_Line, ...]
+    lines: tuple[Line, ...]
