@@ -218,7 +218,9 @@ static inline int move_all(const Move *moves, int64_t n, char *const *bases) {
   return 0;
 }
 
-enum { JUMP = 16 };
+static const double JUMP = 4.0, PART = 0.1;
+
+static inline double size_of(double value) { return __builtin_fabs(value); }
 
 /* Inputs get the middle of the lines of their sources in own step `step`: as `Line` of system/coupling_rule.py. */
 static void follow_lines(Member *member, int64_t step) {
@@ -231,7 +233,9 @@ static void follow_lines(Member *member, int64_t step) {
     if (latest != line->point) {
       const double change = value - line->value, before = line->change / (double)line->distance;
       const int64_t distance = latest - line->point;
-      line->jumped = line->point > 0 && __builtin_fabs(change / (double)distance - before) > JUMP * __builtin_fabs(before);
+      const double larger = size_of(value) > size_of(line->value) ? size_of(value) : size_of(line->value);
+      line->jumped = line->point > 0 && size_of(change / (double)distance - before) > JUMP * size_of(before) &&
+                     size_of(change) > PART * larger;
       line->change = change;
       line->distance = distance;
       line->point = latest;

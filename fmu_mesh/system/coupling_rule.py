@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 
 __all__ = ["Consistent", "CouplingRule", "Line", "Term"]
 
-_JUMP: Final = 16.0
-"""A source jumps if its rate of change differs from the one before by more than so many times that one. Near a turning
-point a smooth source does so, too; there the rates are so small that it does not matter which one is used."""
+_JUMP: Final = 4.0
+_PART: Final = 0.1
+"""A source jumps if its rate of change differs from the one before by more than `_JUMP` times that one, and if it changes
+by more than this part of its value. At a turning point, and at the start from rest, a smooth source does the former."""
 
 Steps = TypeVar("Steps", int, NDArray[np.intp])
 
@@ -81,7 +82,8 @@ class Line(msgspec.Struct, frozen=True):
         if point == self.point:
             return Line(value, point, self.change, self.distance, self.jumped)
         change, distance, before = value - self.value, point - self.point, self.change / self.distance
-        jumped = self.point > 0 and abs(change / distance - before) > _JUMP * abs(before)
+        is_sudden = self.point > 0 and abs(change / distance - before) > _JUMP * abs(before)
+        jumped = is_sudden and abs(change) > _PART * max(abs(value), abs(self.value))
         return Line(value, point, change, distance, jumped)
 
     def at(self, point: float) -> float:
