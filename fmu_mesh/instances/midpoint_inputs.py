@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 
-from ..rings.native import CopyCall, LineTable, NativeStep
+from ..rings.native import Changed, CopyCall, NativeStep, declared
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
-from ..system.coupling_rule import Line
+from ..system.coupling_rule import SourceLine
 from ..system.layout import Layout
 from ..system.linear_inputs import LinearInput
 from .contract import Instance, KeepsFiles
@@ -20,11 +20,16 @@ from .instance_wrapper import AroundNativeSteps, of_kind, packed, unpacked
 __all__ = ["MidpointInputs"]
 
 
+@declared("Line")
+class LineTable(Changed):
+    """A `SourceLine`, and where its input is in the row."""
+
+
 class _MidpointState(NamedTuple):
     """A state of the inner instance, and the lines."""
 
     inner: object
-    lines: tuple[Line, ...]
+    lines: tuple[SourceLine, ...]
 
 
 class MidpointInputs(AroundNativeSteps):
@@ -51,7 +56,7 @@ class MidpointInputs(AroundNativeSteps):
         self._columns = [inputs.layout.place(name).first for name in names]
         row = inputs.part("Float64")
         if not self._points:  # before the first step, the instance has the inputs of Initialization Mode
-            self._put([Line(cast("float", value)) for value in self._instance.get_values(names)])
+            self._put([SourceLine(cast("float", value)) for value in self._instance.get_values(names)])
         for line, item, column in zip(self._lines, self._inputs, self._columns, strict=True):
             line.note(to=row.ctypes.data + 8 * column, delay=item.delay, source_points=item.source_points)
         self._points = points
@@ -69,10 +74,10 @@ class MidpointInputs(AroundNativeSteps):
         self._instance.do_step(step)
 
     @property
-    def _known(self) -> list[Line]:
-        return [Line(own.value, own.point, own.change, own.distance, bool(own.jumped)) for own in self._lines]
+    def _known(self) -> list[SourceLine]:
+        return [SourceLine(own.value, own.point, own.change, own.distance, bool(own.jumped)) for own in self._lines]
 
-    def _put(self, lines: Sequence[Line]) -> None:
+    def _put(self, lines: Sequence[SourceLine]) -> None:
         for own, line in zip(self._lines, lines, strict=True):
             own.note(value=line.value, point=line.point, change=line.change, distance=line.distance, jumped=line.jumped)
 
@@ -102,7 +107,7 @@ class MidpointInputs(AroundNativeSteps):
 
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`."""
-        lines, rest = unpacked(data, tuple[Line, ...], None)
+        lines, rest = unpacked(data, tuple[SourceLine, ...], None)
         return _MidpointState(super().deserialize_state(rest), lines)
 
     def state_access(self, state: object) -> CopyCall | None:

@@ -225,7 +225,8 @@ class BurstEngine(Engine):
         )
         if own is not None:
             made.give(loads=own.loads, setters=own.setters, getters=own.getters, stores=own.stores)
-            made.follow(own.lines)
+            if own.lines is not None:
+                made.note(lines=ctypes.addressof(own.lines), lines_count=len(own.lines))
         gates = [source.gate for source in runner.sources]
         made.give(gates=gates, feeds=list(chain(*moves)), finite=runner.is_finite.spans)
         self._kept[runner.name] = [made, bases, own]  # what the table points to

@@ -222,7 +222,7 @@ static const double JUMP = 4.0, PART = 0.1;
 
 static inline double size_of(double value) { return __builtin_fabs(value); }
 
-/* Inputs get the middle of the lines of their sources in own step `step`: as `Line` of system/coupling_rule.py. */
+/* Inputs get the middle of the lines of their sources in own step `step`: as `SourceLine` of system/coupling_rule.py. */
 static void follow_lines(Member *member, int64_t step) {
   const int64_t begin = step * member->points;
   for (int64_t i = 0; i < member->lines_count; i++) {

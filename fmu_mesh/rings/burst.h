@@ -92,7 +92,7 @@ typedef struct { /* an input with a value for each own step that the burst takes
   double *to; /* in the row of inputs */
 } Track;
 
-typedef struct { /* an input that gets the middle of the line of its source: see `Line` in system/coupling_rule.py */
+typedef struct { /* an input that gets the middle of the line of its source: see `SourceLine` in system/coupling_rule.py */
   double *to; /* in the row of inputs, where its value is */
   int64_t delay, source_points;
   double value, change;

@@ -31,6 +31,7 @@ __all__ = [
     "BurstEnd",
     "Call",
     "Change",
+    "Changed",
     "CopyCall",
     "CopyOutput",
     "CopyTable",
@@ -41,7 +42,6 @@ __all__ = [
     "IncomingTable",
     "Keep",
     "Last",
-    "LineTable",
     "Lookup",
     "MemberTable",
     "Move",
@@ -67,6 +67,7 @@ __all__ = [
     "WorkKind",
     "WorkTable",
     "WorkerTable",
+    "declared",
     "library",
     "table",
 ]
@@ -77,7 +78,6 @@ OUT_OF_RANGE: Final = 100
 """The status of a call where a value does not fit into the type of the model."""
 WRONG_ROW: Final = 101
 """The status of a step whose row is not finite."""
-
 
 # The numbers of the enumerations of `burst.h`, as classes for the type checker; a test compares them.
 
@@ -136,14 +136,13 @@ NUMBER_TYPES: Final = cast(
 )
 """The types of `Move`. An Enumeration is 64 bits in a ring."""
 
-
 _KINDS: Final[dict[str, Any]] = {
     "int64_t": c_int64,
     "int32_t": c_int32,
     "double": c_double,
     "uint8_t": c_bool,  # a truth of FMI 3.0
 }
-"""The types of the fields; `_declared` adds each structure."""
+"""The types of the fields; `declared` adds each structure."""
 
 _HEADER: Final = re.sub(r"/\*.*?\*/", "", Path(__file__).with_name("burst.h").read_text("ascii"), flags=re.DOTALL)
 _DECLARED: Final = {name: fields for fields, name in re.findall(r"typedef struct \{(.*?)\} (\w+);", _HEADER, re.DOTALL)}
@@ -151,7 +150,7 @@ _FIELDS: Final = re.compile(r"(?:const |_Atomic )?(\w+) ([^;]+);")
 _FIELD: Final = re.compile(r"(\**)(\w+)(?:\[(\d+)\])?")
 
 
-def _declared(name: str) -> Callable[[type[Structure]], type[Structure]]:
+def declared(name: str) -> Callable[[type[Structure]], type[Structure]]:
     """Give a class the fields of a structure of `burst.h`; one whose name Python needs itself gets `_` behind it."""
 
     def complete(structure: type[Structure]) -> type[Structure]:
@@ -171,7 +170,7 @@ def _declared(name: str) -> Callable[[type[Structure]], type[Structure]]:
     return complete
 
 
-class _Changed(Structure):
+class Changed(Structure):
     """A structure whose fields others change while the library does not use it."""
 
     def note(self, **changed: float | None) -> None:
@@ -180,27 +179,27 @@ class _Changed(Structure):
             setattr(self, name, value)
 
 
-@_declared("Place")
+@declared("Place")
 class Participant(Structure):
     """Which process this is among those of the memory."""
 
 
-@_declared("Wish")
+@declared("Wish")
 class Wish(Structure):
     """One value of a counter that somebody waits for."""
 
 
-@_declared("Gate")
-class Gate(_Changed):
+@declared("Gate")
+class Gate(Changed):
     """The rows of one source, for one delay."""
 
 
-@_declared("Entry")
+@declared("Entry")
 class Entry(Structure):
     """A value of a source, and what its target gets instead; ``large`` adds 2**64 to a negative number."""
 
 
-@_declared("Lookup")
+@declared("Lookup")
 class Lookup(Structure):
     """The map of a connection, and the numbers that its input can be; without items all of its type."""
 
@@ -217,33 +216,28 @@ class Lookup(Structure):
         return cls(table(Entry, entries), table(c_int64, numbers), len(entries), len(numbers))
 
 
-@_declared("Move")
+@declared("Move")
 class Move(Structure):
     """Values that are copied from one base to another, with factor, offset and type, or with a map."""
 
 
-@_declared("Line")
-class LineTable(_Changed):
-    """An input that gets the middle of the line of its source, as `fmu_mesh.system.coupling_rule.Line`."""
-
-
-@_declared("Call")
+@declared("Call")
 class Call(Structure):
     """A getter or a setter of an FMU; ``size`` is -1 where it takes no number of values."""
 
 
-@_declared("Output")
+@declared("Output")
 class OutputTable(Structure):
     """A ring that a member writes."""
 
 
-@_declared("Span")
+@declared("Span")
 class Span(Structure):
     """Floats of a row that have to be finite: ``place`` in bytes, ``type`` as in `NUMBER_TYPES`."""
 
 
-@_declared("Said")
-class Said(_Changed):
+@declared("Said")
+class Said(Changed):
     """What a model says in a step besides its status, and how far it is."""
 
     @property
@@ -262,12 +256,12 @@ class Said(_Changed):
         return bool(self.event_needed or self.terminate or self.early)
 
 
-@_declared("Track")
+@declared("Track")
 class Track(Structure):
     """An input with a value for each own step that the burst takes before `MemberTable.python_at`."""
 
 
-class _WithArrays(_Changed):
+class _WithArrays(Changed):
     def give(self, **arrays: Sequence[Structure]) -> None:
         """Give it arrays, by the names of their fields, and their lengths; it keeps them."""
         kinds: dict[str, Any] = {field: kind for field, kind, *_ in self._fields_}
@@ -276,32 +270,27 @@ class _WithArrays(_Changed):
             setattr(self, f"n_{name}", len(items))
 
 
-@_declared("Equations")
+@declared("Equations")
 class EquationsTable(_WithArrays):
     """The equations of a model-exchange FMU, and their solver."""
 
 
-@_declared("Member")
+@declared("Member")
 class MemberTable(_WithArrays):
     """One instance: how it gets its inputs, steps, and gives its outputs."""
 
-    def follow(self, lines: ctypes.Array[LineTable] | None) -> None:
-        """Its inputs follow these lines, an array that stays where it is."""
-        self.lines = ctypes.addressof(lines) if lines is not None else None
-        self.lines_count = len(lines) if lines is not None else 0
 
-
-@_declared("Unit")
-class UnitTable(_Changed):
+@declared("Unit")
+class UnitTable(Changed):
     """Members that step together."""
 
 
-@_declared("Peer")
+@declared("Peer")
 class Peer(Structure):
     """A process that may be some points behind, and no more."""
 
 
-@_declared("Piece")
+@declared("Piece")
 class Piece(Structure):
     """Bytes of a row that go over the wire, and whether they are Booleans."""
 
@@ -313,7 +302,7 @@ class _Counted(_WithArrays):
         return int(library.counter_value(self.counter)) if library is not None else 0
 
 
-@_declared("Outgoing")
+@declared("Outgoing")
 class OutgoingTable(_Counted):
     """The rows of one link for another process."""
 
@@ -334,7 +323,7 @@ class OutgoingTable(_Counted):
         return goes_on
 
 
-@_declared("Incoming")
+@declared("Incoming")
 class IncomingTable(_Counted):
     """The rows of one link from another process."""
 
@@ -347,17 +336,17 @@ class IncomingTable(_Counted):
         return is_news
 
 
-@_declared("Told")
+@declared("Told")
 class ToldTable(Structure):
     """A counter of this process that another one has, too."""
 
 
-@_declared("Heard")
+@declared("Heard")
 class HeardTable(Structure):
     """A counter of another process."""
 
 
-@_declared("Stream")
+@declared("Stream")
 class StreamTable(_WithArrays):
     """One socket to another process."""
 
@@ -384,7 +373,7 @@ class StreamTable(_WithArrays):
         return not self.sending and bool(self.send_to == self.send_from)
 
 
-@_declared("Streams")
+@declared("Streams")
 class StreamsTable(_WithArrays):
     """All streams of a process."""
 
@@ -393,37 +382,37 @@ class StreamsTable(_WithArrays):
         self.attention = 1
 
 
-@_declared("Node")
-class NodeTable(_Changed):
+@declared("Node")
+class NodeTable(Changed):
     """All units of a process."""
 
 
-@_declared("Copy")
+@declared("Copy")
 class CopyTable(Structure):
     """One of many copies of a system in this process."""
 
 
-@_declared("CopyCall")
+@declared("CopyCall")
 class CopyCall(Structure):
     """A getter or setter of one copy, for one variable."""
 
 
-@_declared("Keep")
+@declared("Keep")
 class Keep(Structure):
     """Memory that each copy has, and what it has to be again."""
 
 
-@_declared("CopyOutput")
+@declared("CopyOutput")
 class CopyOutput(Structure):
     """Where the rows of one copy have an output."""
 
 
-@_declared("Work")
-class WorkTable(_Changed):
+@declared("Work")
+class WorkTable(Changed):
     """What is done with many copies."""
 
 
-@_declared("Worker")
+@declared("Worker")
 class WorkerTable(Structure):
     """A thread of copies."""
 
@@ -449,7 +438,7 @@ class NativeStep(NamedTuple):
     getters: Sequence[Call]
     stores: Sequence[Move]
     kept: Sequence[object]
-    lines: ctypes.Array[LineTable] | None = None
+    lines: ctypes.Array[Any] | None = None
 
 
 def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no type for an array of any structure

@@ -3,6 +3,9 @@
 What the user says (`feedthrough`) counts, else what is measured; where neither says it, a cycle cannot be solved.
 """
 
+# Each model is opened in a child process, some at a time, each by a thread that waits for its answer (ADR 93). The
+# child has a deadline, and ends with this process. The threads meet in `findings` only, whose list each appends to.
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -40,7 +43,12 @@ class _Question(NamedTuple):
 def with_feedthrough(
     system: ResolvedSystem, sections: Mapping[str, InstanceSection], findings: Findings, warnings: Findings
 ) -> ResolvedSystem:
-    """The system with the derivatives of outputs by inputs; a finding where a cycle needs one that is not known."""
+    """The system with the derivatives of outputs by inputs; warns where one is not known.
+
+    Raises:
+        ConfigurationError: a cycle needs one that is not known, or one that is given has a wrong name. It has the
+            ``findings``.
+    """
     questions = _questions(system)
     with ThreadPoolExecutor(_AT_ONCE) as threads:
         answers = threads.map(lambda name: _answer(system, sections, name, questions[name], findings), questions)
@@ -59,6 +67,7 @@ def with_feedthrough(
         around = " -> ".join([*cycle, cycle[0]])
         expected = f"`feedthrough: {{{asked.outputs[0]}: {{{asked.inputs[0]}: ...}}}}` there, or `loops: delayed`"
         findings.add(f"instances.{name}.feedthrough", f"solved loops on the cycle {around}, but {what}", expected)
+    findings.raise_any()
     return replace(system, feedthrough={name: answer.derivatives for name, answer in known.items()})
 
 

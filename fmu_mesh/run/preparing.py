@@ -190,8 +190,7 @@ def planned(
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
     if loaded.config.simulation.loops == "solved":
-        system = with_feedthrough(system, sections, findings, warnings)
-        findings.raise_any()
+        system = with_feedthrough(system, sections, loaded.findings(), warnings)
     _check_host(loaded.config, obstacles, warnings)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)

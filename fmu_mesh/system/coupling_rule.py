@@ -26,12 +26,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Consistent", "CouplingRule", "Line", "Term"]
+__all__ = ["Consistent", "CouplingRule", "SourceLine", "Term"]
 
 _JUMP: Final = 4.0
 _PART: Final = 0.1
-"""A source jumps if its rate of change differs from the one before by more than `_JUMP` times that one, and if it changes
-by more than this part of its value. At a turning point, and at the start from rest, a smooth source does the former."""
+"""A source jumps if its rate of change differs from the one before by more than `_JUMP` times that one, and if it
+changes by more than this part of its value. At a turning point, and at the start from rest, a smooth source does the
+former."""
 
 Steps = TypeVar("Steps", int, NDArray[np.intp])
 
@@ -68,7 +69,7 @@ class CouplingRule(msgspec.Struct, frozen=True):
         return (step * self.target_points + self.lead) // self.source_points
 
 
-class Line(msgspec.Struct, frozen=True):
+class SourceLine(msgspec.Struct, frozen=True):
     """The line through the last two rows of a source, which belong to two points. `burst.c` has it, too."""
 
     value: float  # the last value
@@ -77,14 +78,14 @@ class Line(msgspec.Struct, frozen=True):
     distance: int = 1  # points between the two
     jumped: bool = False  # whether it is no line, because the source has jumped
 
-    def through(self, value: float, point: int) -> Line:
+    def through(self, value: float, point: int) -> SourceLine:
         """The line with the value of this point, which may be the last one again."""
         if point == self.point:
-            return Line(value, point, self.change, self.distance, self.jumped)
+            return SourceLine(value, point, self.change, self.distance, self.jumped)
         change, distance, before = value - self.value, point - self.point, self.change / self.distance
         is_sudden = self.point > 0 and abs(change / distance - before) > _JUMP * abs(before)
         jumped = is_sudden and abs(change) > _PART * max(abs(value), abs(self.value))
-        return Line(value, point, change, distance, jumped)
+        return SourceLine(value, point, change, distance, jumped)
 
     def at(self, point: float) -> float:
         """The value at a point, or between two."""

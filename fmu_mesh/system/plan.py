@@ -31,9 +31,9 @@ from .initialization_plan import InitializationPlan, Loop, check_loops, plan_ini
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
-from .links import Link, links_of
 from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
+from .node_links import Link, links_of
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
 from .start_values import why_not_settable

@@ -13,7 +13,7 @@ from typing import NamedTuple, cast
 
 from ....rings.ring import Ring
 from ....simtime import TimeGrid
-from ....system.coupling_rule import Line
+from ....system.coupling_rule import SourceLine
 from ....system.layout import Layout
 from ....system.linear_inputs import LinearInput
 from ...instance_wrapper import AroundInstance, of_kind, packed, unpacked
@@ -28,7 +28,7 @@ class LinearInputs(AroundInstance[FmuInstance]):
     def __init__(self, instance: FmuInstance, inputs: Sequence[LinearInput]) -> None:
         super().__init__(instance)
         self._inputs = inputs
-        self._lines: list[Line] = []
+        self._lines: list[SourceLine] = []
         self._outer = Ring(Layout(), 1)
         self._inner = self._outer
         self._columns: list[int] = []
@@ -47,7 +47,7 @@ class LinearInputs(AroundInstance[FmuInstance]):
         if not self._lines:
             # Before the first step, the FMU has the inputs of Initialization Mode.
             values = cast("list[float]", self._instance.get_values(names))  # only Float64 is linear
-            self._lines = [Line(value) for value in values]
+            self._lines = [SourceLine(value) for value in values]
         self._outer = inputs
         self._inner = Ring(inputs.layout, 1)
         self._columns = [inputs.layout.place(name).first for name in names]
@@ -101,7 +101,7 @@ class LinearInputs(AroundInstance[FmuInstance]):
 
     def deserialize_state(self, data: bytes) -> object:
         """See `KeepsState`."""
-        lines, rest = unpacked(data, tuple[Line, ...], None)
+        lines, rest = unpacked(data, tuple[SourceLine, ...], None)
         return _LinearState(super().deserialize_state(rest), lines)
 
 
@@ -109,4 +109,4 @@ class _LinearState(NamedTuple):
     """A state of the inner instance, and the lines."""
 
     inner: object
-    lines: tuple[Line, ...]
+    lines: tuple[SourceLine, ...]
