@@ -22,7 +22,7 @@ from tests.fmus.event_fmus import Version, build_event_fmu
 from tests.fmus.helpers import NO_COMPILER, session_folder
 from tests.helpers import FMUS
 
-__all__ = ["FEATURES", "SYSTEMS", "written_system"]
+__all__ = ["FEATURES", "SYSTEMS", "consistent_loop", "written_system"]
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 POINTS: Final = 2000
@@ -91,6 +91,26 @@ def _set(_: Path) -> dict[str, Any]:
     }
 
 
+def consistent_loop(gain: float = -0.5, **simulation: object) -> dict[str, Any]:
+    """A loop of direct dependencies over two FMUs, which a pendulum drives, and an instance behind it."""
+    usual = {"stop_time": 2.0, "step_size": 0.001, "loops": "solved", "extrapolation": "midpoint"}
+    return {
+        "simulation": usual | simulation,
+        "instances": {
+            "pendulum": {"fmu": str(FMUS / "DampedPendulum.fmu"), "start_values": {"a": 1.3}},
+            "sum": {"fmu": str(FMUS / "Adder.fmu")},
+            "gain": {"fmu": str(FMUS / "Gain.fmu"), "start_values": {"k": gain}},
+            "integral": {"fmu": str(FMUS / "Integrator.fmu")},
+        },
+        "connections": [
+            "pendulum.a -> sum.u1",
+            {"from": "gain.y", "to": "sum.u2", "offset": 0.5},
+            "sum.y -> gain.u",
+            "gain.y -> integral.u",
+        ],
+    }
+
+
 def _told(folder: Path) -> dict[str, Any]:
     (folder / "parts.py").write_text(_PARTS, encoding="utf-8")
     return {
@@ -135,6 +155,7 @@ FEATURES: Final[Mapping[str, Callable[[Path], dict[str, Any]]]] = {
     "set": _set,
     "text and arrays": _told,
     "groups": _grouped,
+    "consistent": lambda _: consistent_loop(),
     "rates": lambda _: rates.multi_rate(rates.GAUSS_SEIDEL, rates.MIXED, rates.H),
     "events": _events,
     "types": lambda folder: yaml.safe_load(types.written(folder).read_text(encoding="utf-8")),

@@ -9,6 +9,7 @@ from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
+from ..system.linear_inputs import counted_ways
 from ..system.placement import two_trips
 from ..system.plan import RECORDER, Plan
 from ..system.process_sharing import automatic_nodes
@@ -36,6 +37,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Hosts", _hosts(plan)),
         ("Start values", _start_values(plan, loaded)),
         ("Connections", _connections(plan)),
+        ("Coupling", _coupling(plan)),
         ("Zenoh keys", _keys(plan)),
         ("Execution order within one point", _order(plan)),
         ("Groups", _groups(plan)),
@@ -131,8 +133,28 @@ def _connections(plan: Plan) -> list[str]:
         closing = "closes a cycle" if str(c) in closing_ones else ""
         if c.extrapolation == "linear":
             what = "goes on linearly in the step" if c.delay else "changes linearly in the step"
+        elif c.extrapolation == "midpoint":
+            what = "the middle of its line in the step"
         rows.append([str(c), f"delay {c.delay}", what, _arithmetic(c), closing, c.units])
     return table(rows, indent=2)
+
+
+def _coupling(plan: Plan) -> list[str]:
+    """Of which order the coupling is, what would be better, and which outputs are made consistent."""
+    stepped = [c for c in plan.connections if not c.initial_only]
+    instances, sections = plan.system.instances, plan.system.config.instances
+    ways = [(c, c.extrapolation) for c in stepped if c.extrapolation != "hold"]
+    lines = []
+    if better := counted_ways(stepped, {name: own.description for name, own in instances.items()}, sections):
+        order = "of order 1 for these inputs" if ways else "of order 1: the error halves with the step size"
+        lines.append(f"  {order}; `extrapolation: auto` would be of order 2: {better}")
+    direct = [c for c in stepped if c.source.feedthrough and (c.source_instance, c.source_name) not in plan.consistent]
+    if ways and direct:
+        names = listed([f"{c.source_instance}.{c.source_name}" for c in direct])
+        lines.append(f"  of order 1 behind {names}, which depend directly on inputs, without `loops: solved`")
+    if plan.consistent:
+        lines.append(f"  consistent at each point: {listed(['.'.join(own) for own in plan.consistent])}")
+    return lines
 
 
 def _keys(plan: Plan) -> list[str]:

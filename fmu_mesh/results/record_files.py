@@ -240,9 +240,10 @@ def _sum(consistent: Consistent, column_of: Callable[[str, str], ReadColumn]) ->
     (read_first, factor), *others = terms
 
     def read(first: int, end: int) -> NDArray[Any]:
-        total = read_first(first, end) * factor + consistent.constant
-        for read_one, times in others:
-            total += read_one(first, end) * times
+        with np.errstate(all="ignore"):  # the row that is not finite ends the run
+            total = read_first(first, end) * factor + consistent.constant
+            for read_one, times in others:
+                total += read_one(first, end) * times
         return total
 
     return read

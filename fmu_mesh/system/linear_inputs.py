@@ -11,12 +11,13 @@ import msgspec
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.instance_sections import Extrapolation
+from ..config.instance_sections import Extrapolation, InstanceSection
 from ..config.mesh import Config
+from ..text import listed
 from ..variables.model_description import ModelDescription
 from .connections import Connection
 
-__all__ = ["LinearInput", "with_extrapolation"]
+__all__ = ["LinearInput", "counted_ways", "with_extrapolation"]
 
 
 class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -57,7 +58,7 @@ def with_extrapolation(
         why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=c.target_instance in retrying)
         way: Extrapolation = wanted
         if wanted == "auto":
-            way = "hold" if why_held else "midpoint" if why_not_linear else "linear"
+            way = _auto(why_held, why_not_linear)
         elif wanted != "hold" and why_held is not None and own is None:
             way = "hold"
         elif (why := why_held or (why_not_linear if wanted == "linear" else None)) is not None and wanted != "hold":
@@ -65,6 +66,27 @@ def with_extrapolation(
             findings.add(f"{c.path}.extrapolation" if own else place, f"{wanted} for {c}, but {why}", expected)
         found.append(replace(c, extrapolation=way))
     return tuple(found)
+
+
+def counted_ways(
+    connections: Sequence[Connection],
+    descriptions: Mapping[str, ModelDescription],
+    sections: Mapping[str, InstanceSection],
+) -> str:
+    """In words what `auto` would be for the inputs that are held now; empty, if it would hold them, too."""
+    found: dict[Extrapolation, list[str]] = {"linear": [], "midpoint": []}
+    for c in connections:
+        retries = sections[c.target_instance].retries_steps
+        way = _auto(_why_held(c), _why_not_linear(c, descriptions[c.target_instance], retries=retries))
+        if c.extrapolation == "hold" and way in found:
+            found[way].append(f"{c.target_instance}.{c.target_name}")
+    return ", ".join(f"{way} for {listed(names)}" for way, names in found.items() if names)
+
+
+def _auto(why_held: str | None, why_not_linear: str | None) -> Extrapolation:
+    if why_held is not None:
+        return "hold"
+    return "linear" if why_not_linear is None else "midpoint"
 
 
 def _why_held(connection: Connection) -> str | None:

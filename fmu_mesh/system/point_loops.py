@@ -26,14 +26,16 @@ Edges = dict[tuple[Vertex, Vertex], Connection | None]
 
 
 def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
-    """Add a warning for each loop at every point, and one for all outputs that may close one."""
-    declared, assumed = _edges(plan.connections) if plan.cycles else ({}, {})
+    """Add a warning for each loop at every point, and one for outputs that may close one; none if they are solved."""
+    is_delayed = plan.system.config.simulation.loops == "delayed"
+    declared, assumed = _edges(plan.connections) if plan.cycles and is_delayed else ({}, {})
     for loop, inside in _loops(declared):
         walk, more = _walk(loop, inside)
         found = (
             f"a loop at every point: {listed([*map(str, walk)])}{more}. Each of these outputs depends directly on the "
             f"input before it. The delay of 1 at {listed([str(c) for c in walk if c.delay])} makes this a fixed-point "
-            "iteration in time, one sweep per point, which may be unstable: compare with a smaller step size"
+            "iteration in time, one sweep per point, which may be unstable: compare with a smaller step size, or solve "
+            "it by `loops: solved` in `simulation`"
         )
         findings.add(walk[0].path, found, "")
     both = declared | assumed
