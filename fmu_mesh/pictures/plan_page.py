@@ -146,12 +146,11 @@ def _coupling(plan: Plan) -> list[str]:
     ways = [(c, c.extrapolation) for c in stepped if c.extrapolation != "hold"]
     lines = []
     if better := counted_ways(stepped, {name: own.description for name, own in instances.items()}, sections):
-        order = "of order 1 for these inputs" if ways else "of order 1: the error halves with the step size"
-        lines.append(f"  {order}; `extrapolation: auto` would be of order 2: {better}")
+        lines.append(f"  order 1, because inputs are held; `extrapolation: auto` has order 2: {better}")
     direct = [c for c in stepped if c.source.feedthrough and (c.source_instance, c.source_name) not in plan.consistent]
     if ways and direct:
         names = listed([f"{c.source_instance}.{c.source_name}" for c in direct])
-        lines.append(f"  of order 1 behind {names}, which depend directly on inputs, without `loops: solved`")
+        lines.append(f"  order 1 behind {names}, which depend directly on inputs, without `loops: solved`")
     if plan.consistent:
         lines.append(f"  consistent at each point: {listed(['.'.join(own) for own in plan.consistent])}")
     return lines

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from ..config.findings import Findings
 from ..config.instance_sections import Extrapolation, InstanceSection
 from ..config.mesh import Config
-from ..text import listed
+from ..text import counted
 from ..variables.model_description import ModelDescription
 from .connections import Connection
 
@@ -74,13 +74,13 @@ def counted_ways(
     sections: Mapping[str, InstanceSection],
 ) -> str:
     """In words what `auto` would be for the inputs that are held now; empty, if it would hold them, too."""
-    found: dict[Extrapolation, list[str]] = {"linear": [], "midpoint": []}
+    found: dict[Extrapolation, int] = {"linear": 0, "midpoint": 0}
     for c in connections:
         retries = sections[c.target_instance].retries_steps
         way = _auto(_why_held(c), _why_not_linear(c, descriptions[c.target_instance], retries=retries))
         if c.extrapolation == "hold" and way in found:
-            found[way].append(f"{c.target_instance}.{c.target_name}")
-    return ", ".join(f"{way} for {listed(names)}" for way, names in found.items() if names)
+            found[way] += 1
+    return ", ".join(f"{way} for {counted(number, 'input')}" for way, number in found.items() if number)
 
 
 def _auto(why_held: str | None, why_not_linear: str | None) -> Extrapolation:

@@ -72,6 +72,9 @@ Connections
   sum.y -> inner.u      delay 0  value at the end of the step    u = y + 2
   inner.y -> outer.u    delay 1  value at the start of the step
 
+Coupling
+  order 1, because inputs are held; `extrapolation: auto` has order 2: midpoint for 5 inputs
+
 Execution order within one point
   pendulum -> sum -> loop -> inner -> outer
   cycle: sum, loop
@@ -130,6 +133,9 @@ Instances
 
 Connections
   a.y -> b.u  delay 1  value at the start of the step
+
+Coupling
+  order 1, because inputs are held; `extrapolation: auto` has order 2: midpoint for 1 input
 
 Execution order within one point
   a, b  (at the same time)
