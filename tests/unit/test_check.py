@@ -95,7 +95,7 @@ Recorded
   into results/loop.csv
 
 Warnings
-  mesh.yaml:11: connections[1]: a loop at every point: sum.y -> loop.u, loop.y -> sum.u2. Each of these outputs depends directly on the input before it. The delay of 1 at loop.y -> sum.u2 makes this a fixed-point iteration in time, one sweep per point, which may be unstable: compare with a smaller step size
+  mesh.yaml:11: connections[1]: a loop at every point: sum.y -> loop.u, loop.y -> sum.u2. Each of these outputs depends directly on the input before it. The delay of 1 at loop.y -> sum.u2 makes this a fixed-point iteration in time, one sweep per point, which may be unstable: compare with a smaller step size, or solve it by `loops: solved` in `simulation`
 
 OK: mesh.yaml can run.
 """  # noqa: E501 a line of the page is as long as it is

@@ -146,7 +146,7 @@ def test_a_loop_at_every_point_is_a_warning_with_its_delays(
     assert warning == (
         "connections[0]: a loop at every point: a.y -> b.u, b.y -> a.u. Each of these outputs depends directly on the "
         f"input before it. The delay of 1 at {delayed} makes this a fixed-point iteration in time, one sweep per "
-        "point, which may be unstable: compare with a smaller step size"
+        "point, which may be unstable: compare with a smaller step size, or solve it by `loops: solved` in `simulation`"
     )
 
 
