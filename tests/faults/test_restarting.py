@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import yaml
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.results.formats import read_result
 from tests.helpers import BY_ZENOH, FMUS, Launched, Place, row_count, rows_of, wait_until
 from tests.key_meshes import client, key_lines, put_values
@@ -23,7 +25,10 @@ POINTS = 4000
 
 PARTS = """
 import time
+from pathlib import Path
+
 import fmu_mesh
+from fmu_mesh.errors import TerminationRequested
 
 class Slow(fmu_mesh.Component):
     \"\"\"Takes its time, so that a test can kill at a point; its text changes with its value.\"\"\"
@@ -34,6 +39,17 @@ class Slow(fmu_mesh.Component):
     def step(self, now, step_size):
         self.y = 0.5 * self.y + 0.1 * self.u + 0.1 * self.v + 0.1
         time.sleep(0.0003)
+
+class Landing(fmu_mesh.Component):
+    \"\"\"Ends the simulation in a step that takes longer than it is until the next checkpoint.\"\"\"
+    y = fmu_mesh.Output()
+
+    def step(self, now, step_size):
+        if now > 0.3005:
+            Path("lands").touch()
+            time.sleep(1.0)
+            raise TerminationRequested("landed")
+        self.y = now
 
 class Clock(fmu_mesh.Component):
     y = fmu_mesh.Output()
@@ -65,6 +81,9 @@ def written(place: Place, kind: str = "chain", **sections: Any) -> Path:  # noqa
     elif kind == "clock":
         instances["slow"] = {"python": "parts.py:Clock"}
         connections = ["slow.y -> gain.u"]
+    elif kind == "landing":
+        instances["slow"] = {"python": "parts.py:Landing"}
+        connections = []
     simulation = {"stop_time": POINTS * 0.001, "step_size": 0.001, **sections.pop("simulation", {})}
     content = {
         "mesh": "again",
@@ -290,14 +309,28 @@ def test_a_restart_begins_with_the_newest_checkpoint(place: Place, kind: str, vi
         victim = "both"
     config = written(place, kind, recovery={"mode": "restart", "checkpoint_s": 0.05})
     launched = place.start("launch", config, "--no-progress")
-    folder = wait_until(lambda: next(iter((place.folder / "run").glob("**/*.state")), None), "a checkpoint").parent
-    states = sorted(int(file.stem) for file in folder.glob("*.state"))
+    newest = wait_until(place.checkpoints, "a checkpoint")[-1]
 
-    killed(launched, result := config.with_suffix(".csv"), victim, states[-1] + 200)
+    killed(launched, result := config.with_suffix(".csv"), victim, newest + 200)
 
     launched.wait_for_error_line("starts again and goes on from point")
     assert launched.wait() == 0, launched.story()
     (points,) = re.findall(r"^(\d+) points in", launched.story(), re.MULTILINE)
-    assert 0 < int(points) <= POINTS - states[-1]
+    assert 0 < int(points) <= POINTS - newest
     place.assert_nothing_left()
     assert result.read_bytes() == undisturbed(config)
+
+
+@pytest.mark.parametrize("asks", [True, False])
+def test_a_simulation_may_end_while_a_checkpoint_is_under_way(place: Place, asks: bool) -> None:  # noqa: FBT001  a parameter
+    config = written(place, "landing", recovery={"mode": "restart", "checkpoint_s": None if asks else 0.05})
+    launched = place.start("launch", config, "--no-progress")
+    with fmu_mesh.attach("again", connect=place.note().endpoints[0]) as run:
+        wait_until((place.folder / "lands").exists, "the last step")
+        with pytest.raises(ConfigurationError, match="no checkpoint any more") if asks else nullcontext():
+            _ = asks and run.checkpoint(place.folder / "late.state", timeout=30.0)
+
+    assert launched.wait(30.0) == 0, launched.story()
+    assert "landed" in launched.errors
+    assert row_count(config.with_suffix(".csv")) == 302
+    place.assert_nothing_left()
