@@ -45,12 +45,12 @@ class Sample:
 
 
 def soak(config: str, points: int, options: Sequence[str], file: Path | None) -> int:
-    """Run a mesh for so many points with `--restarts 3`, and print the table; 1 if it fails, or something grows.
+    """Run a mesh for so many points, and print the table; 1 if it fails, or something grows.
 
     Args:
         config: a file; `all`: a chain of four, of which the last output is recorded.
         points: steps of the mesh.
-        options: more of `launch`.
+        options: more of `launch`, such as those of `recovering`.
         file: gets all samples as JSON.
     """
     samples: list[Sample] = []
@@ -66,7 +66,7 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
         end = time.monotonic() + _MOST_S
         begun = time.monotonic()
         launched = place.start(
-            *("launch", source, "--no-progress", "--restarts", "3", "--stop-time", str(stop_time)),
+            *("launch", source, "--no-progress", "--stop-time", str(stop_time)),
             *("--real-time-factor", "0", "--output", result, *options),
         )
         never = threading.Event()

@@ -415,9 +415,10 @@ class _MasterRuns:
         return recorder
 
     def _on_flush(self) -> Callable[[Sequence[Kept]], None]:
-        if self.resets or not (self.run.directory or self.run.checkpoint_s is not None):
+        run = self.run
+        if self.resets or not (run.directory or run.checkpoint_s is not None):
             return lambda _kept: None
-        return Syncing(self.run).flushed if self.run.directory else partial(drop_older, self.run)
+        return Syncing(run).flushed if run.directory else partial(drop_older, run.kept_in, run.plan.system.records)
 
 
 def _opened_results(run: RunPlan) -> Sequence[ResultFile]:

@@ -233,7 +233,8 @@ class Syncing:
     """Gives the rows of a run with a directory, and its journals, to the disk: every few seconds, on its own thread."""
 
     def __init__(self, run: RunPlan) -> None:
-        self._run, self._folder = run, Path(run.directory)
+        self._folder = Path(run.directory)
+        self._records = run.plan.system.records
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="sync")
         self._last: Future[None] | None = None
         self._due = 0.0
@@ -255,8 +256,8 @@ class Syncing:
             self._last = self._worker.submit(self._sync, kept)
 
     def _sync(self, kept: Sequence[Kept]) -> None:
-        _sync(self._folder, [record.file for record in self._run.plan.system.records], kept)
-        drop_older(self._run, kept)
+        _sync(self._folder, [record.file for record in self._records], kept)
+        drop_older(self._folder, self._records, kept)
 
 
 def _sync(folder: Path, results: Sequence[str], kept: Sequence[Kept]) -> None:

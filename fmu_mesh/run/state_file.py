@@ -183,7 +183,7 @@ def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
         if not run.directory:
             write_state(file, data, synced=False)
             if not run.plan.system.records:  # nobody writes rows
-                drop_older(run, ())
+                drop_older(folder, (), ())
         elif not last or last[-1].done():
             if last:
                 last.pop().result()
@@ -192,15 +192,15 @@ def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
     return keep
 
 
-def drop_older(run: RunPlan, kept: Sequence[Kept]) -> None:
+def drop_older(folder: Path, records: Sequence[RecordPlan], kept: Sequence[Kept]) -> None:
     """Remove the checkpoints before the newest one of which the files have all rows before it.
 
     ``kept`` is what they have. How far they are behind the steps is up to the disk, so there may be any number of newer
     checkpoints that cannot be used yet.
     """
-    states = iter(_newest_first(run.kept_in))
+    states = iter(_newest_first(folder))
     for file in states:
-        if _has_rows(_point_of(file), run.plan.system.records, [own.rows for own in kept]):
+        if _has_rows(_point_of(file), records, [own.rows for own in kept]):
             break
     for file in states:
         file.unlink(missing_ok=True)
