@@ -40,6 +40,24 @@ class Slow(fmu_mesh.Component):
         self.y = 0.5 * self.y + 0.1 * self.u + 0.1 * self.v + 0.1
         time.sleep(0.0003)
 
+class Saving(fmu_mesh.Component):
+    \"\"\"Takes its time to give its state, so that a test can kill meanwhile.\"\"\"
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output()
+
+    def step(self, now, step_size):
+        self.y = 0.5 * self.y + 0.1 * self.u
+        time.sleep(0.0003)
+
+    def get_state(self):
+        if not Path(\"saves\").exists():
+            Path(\"saves\").touch()
+            time.sleep(1.0)
+        return {}
+
+    def set_state(self, state):
+        pass
+
 class Landing(fmu_mesh.Component):
     \"\"\"Ends the simulation in a step that takes longer than it is until the next checkpoint.\"\"\"
     y = fmu_mesh.Output()
@@ -81,6 +99,8 @@ def written(place: Place, kind: str = "chain", **sections: Any) -> Path:  # noqa
     elif kind == "clock":
         instances["slow"] = {"python": "parts.py:Clock"}
         connections = ["slow.y -> gain.u"]
+    elif kind == "saving":
+        instances["slow"] = {"python": "parts.py:Saving"}
     elif kind == "landing":
         instances["slow"] = {"python": "parts.py:Landing"}
         connections = []
@@ -319,6 +339,20 @@ def test_a_restart_begins_with_the_newest_checkpoint(place: Place, kind: str, vi
     assert 0 < int(points) <= POINTS - newest
     place.assert_nothing_left()
     assert result.read_bytes() == undisturbed(config)
+
+
+@pytest.mark.parametrize("victim", ["slow", "gain", "master", "fork"])
+def test_a_process_may_be_killed_while_states_are_saved(place: Place, victim: str) -> None:
+    config = written(place, "saving", recovery={"mode": "restart", "checkpoint_s": 0.05})
+    launched = place.start("launch", config, "--no-progress")
+    wait_until((place.folder / "saves").exists, "a checkpoint under way")
+
+    launched.child(victim).kill()
+
+    launched.wait_for_error_line("restart 1 of 3")
+    assert launched.wait() == 0, launched.story()
+    place.assert_nothing_left()
+    assert config.with_suffix(".csv").read_bytes() == undisturbed(config)
 
 
 @pytest.mark.parametrize("asks", [True, False])
