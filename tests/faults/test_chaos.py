@@ -60,7 +60,7 @@ def test_a_short_soak_shows_what_a_run_has(
     shown = capsys.readouterr().out
     assert code == 0 or "has grown" in shown or "too short" in shown, shown
     assert "300000 points in" in shown
-    assert "| at, s | memory (PSS), MB | open files | files of the run, MB | result, MB |" in shown
+    assert "| at, s | memory (PSS), MB | open files | files of the run, MB | result, MB | checkpoint |" in shown
 
 
 def test_a_mesh_that_is_not_deterministic_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
