@@ -46,7 +46,7 @@ FAULTS: Final = ("kill", "stop", "delay")
 """What is done to a process."""
 
 RESUME: Final = "resume"
-"""The kind of a fault that kills everything at once, `launch` as well; then `launch --resume` goes on."""
+"""The kind of a fault that kills `launch`, with all others or alone; then `launch --resume` goes on."""
 
 ROLES: Final = ("node", "master", "fork")
 """Of processes that each run has; `fork` is the fork server."""
@@ -56,6 +56,9 @@ GATEWAY: Final = "gateway"
 
 EVERYBODY: Final = "all"
 """All processes of a run at once, but `launch` itself."""
+
+_LAUNCH: Final = "launch"
+"""`launch` alone: the others end by themselves."""
 
 MOST_RESTARTS: Final = 50
 """More than one run needs; a mesh that is lost again and again meets its deadline first."""
@@ -88,7 +91,7 @@ class Fault:
 
     Attributes:
         kind: one of `FAULTS`, or `RESUME`.
-        role: one of `ROLES`.
+        role: one of `ROLES`; of `RESUME`, who is killed with `launch`.
         which: which process of this role, from 0 to 1.
         after: the part of all rows that the file has before; less than 0: at the start, before the first one.
         later_s: how much later, in s.
@@ -187,7 +190,7 @@ def drawn_faults(
     faults = []
     for after in sorted(chance.uniform(-0.05, 1.0) for _ in range(count)):
         kind, role = chance.choice(kinds), chance.choice(roles)
-        role = EVERYBODY if kind == RESUME else role
+        role = chance.choice((EVERYBODY, _LAUNCH)) if kind == RESUME else role
         lasts_s = chance.uniform(*(_STOPPED_S if kind == "stop" else _DELAYED_S))
         again = []
         while kind == "kill" and len(again) < _AGAIN and chance.random() < while_coming_back:
@@ -338,7 +341,7 @@ class Run:
             case "kill":
                 self._kill(victims, fault, label, row, told)
             case "resume":
-                self._resume(victims, label, row, told)
+                self._resume(victims if fault.role == EVERYBODY else (), label, row, told)
             case "stop":
                 _signal(victims, signal.SIGSTOP)
                 self.let_pass(fault.lasts_s)
@@ -384,7 +387,7 @@ class Run:
             label = f"kill {fault.role}, {'coming back' if self.file.rows <= kept else 'again'}"
 
     def _resume(self, victims: Sequence[psutil.Process], label: str, row: int, told: Disturbed) -> None:
-        """Kill processes with `launch` itself, and start it again."""
+        """Kill `launch` with these processes, and start it again: it waits for the others."""
         assert self._again is not None
         everything, begun = [psutil.Process(self.launched.pid), *victims], time.monotonic()
         _signal(everything, signal.SIGKILL)
@@ -410,17 +413,18 @@ class Run:
     def _found(self, fault: Fault, old: Sequence[int], kept: int | None = None) -> list[psutil.Process]:
         """Those that get a fault, as soon as they are there; nobody if the run has ended, or goes on again."""
         there: list[psutil.Process] = []
+        is_of_all = fault.role in {EVERYBODY, _LAUNCH}
 
         def look() -> bool:
             there[:] = [
                 one
                 for one, words in self._processes()
-                if one.pid not in old and (fault.role == EVERYBODY or words[:1] == [fault.role])
+                if one.pid not in old and (is_of_all or words[:1] == [fault.role])
             ]
             return bool(there) or (kept is not None and self.file.rows > kept)
 
         self.wait(look, f"a process of the role {fault.role}")
-        return there if fault.role == EVERYBODY else there[int(fault.which * len(there)) :][:1]
+        return there if is_of_all else there[int(fault.which * len(there)) :][:1]
 
     def _processes(self) -> list[tuple[psutil.Process, list[str]]]:
         """Those that it has started, with the words of their titles, in the order of these."""

@@ -41,14 +41,15 @@ def test_three_kills_of_a_small_mesh_change_nothing(tmp_path: Path, capsys: pyte
     assert all(f"| {one['label']} |" in shown for one in given)
 
 
-def test_a_mesh_is_resumed_after_everything_was_killed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    few = ["--faults", "resume", "--lasts", "2", "--kills", "2", "--seed", "1", "--checkpoints", "0.2"]
+def test_a_mesh_is_resumed_after_its_launcher_was_killed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--faults", "resume", "--lasts", "2", "--per-run", "2", "--seed", "22", "--checkpoints", "0.2"]
 
-    code = main([str(write_config(tmp_path)), *few])
+    code = main([str(write_config(tmp_path)), "--kills", "2", *few])
 
     shown = capsys.readouterr().out
     assert code == 0, shown
-    assert "| resume all | 2 | 2 | 0 | 0 |" in shown
+    assert "| resume all | 1 | 1 | 0 | 0 |" in shown
+    assert "| resume launch | 1 | 1 | 0 | 0 |" in shown
 
 
 @pytest.mark.parametrize("options", [[], ["--checkpoints", "0.05"]], ids=["restarts", "checkpoints"])
