@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="+",
         choices=(*FAULTS, RESUME, CUT),
         default=(*FAULTS, RESUME, CUT),
-        help="what is done (all of them); resume: everything is killed at once, and `launch --resume` goes on",
+        help="what is done (all of them); resume: `launch` is killed, alone or with all, and resumed",
     )
     parser.add_argument("--per-run", type=int, default=3, metavar="N", help="faults in one run (3)")
     parser.add_argument(

@@ -389,10 +389,11 @@ class Run:
     def _resume(self, victims: Sequence[psutil.Process], label: str, row: int, told: Disturbed) -> None:
         """Kill `launch` with these processes, and start it again: it waits for the others."""
         assert self._again is not None
-        everything, begun = [psutil.Process(self.launched.pid), *victims], time.monotonic()
-        _signal(everything, signal.SIGKILL)
+        begun = time.monotonic()
+        self.launched.signal(signal.SIGKILL)
+        _signal(victims, signal.SIGKILL)
         self.launched.close()
-        self.wait(lambda: not any(map(_is_there, everything)), "the end of all processes", _LEFT_S)
+        self.wait(lambda: not any(map(_is_there, victims)), "the end of all processes", _LEFT_S)
         kept = self.file.recounted()
         self.launched = self._again()
         told.given.append(self.next_row(label, row, kept, begun))
@@ -413,18 +414,18 @@ class Run:
     def _found(self, fault: Fault, old: Sequence[int], kept: int | None = None) -> list[psutil.Process]:
         """Those that get a fault, as soon as they are there; nobody if the run has ended, or goes on again."""
         there: list[psutil.Process] = []
-        is_of_all = fault.role in {EVERYBODY, _LAUNCH}
+        any_role = fault.role in {EVERYBODY, _LAUNCH}
 
         def look() -> bool:
             there[:] = [
                 one
                 for one, words in self._processes()
-                if one.pid not in old and (is_of_all or words[:1] == [fault.role])
+                if one.pid not in old and (any_role or words[:1] == [fault.role])
             ]
             return bool(there) or (kept is not None and self.file.rows > kept)
 
         self.wait(look, f"a process of the role {fault.role}")
-        return there if is_of_all else there[int(fault.which * len(there)) :][:1]
+        return there if any_role else there[int(fault.which * len(there)) :][:1]
 
     def _processes(self) -> list[tuple[psutil.Process, list[str]]]:
         """Those that it has started, with the words of their titles, in the order of these."""

@@ -50,8 +50,8 @@ class Saving(fmu_mesh.Component):
         time.sleep(0.0003)
 
     def get_state(self):
-        if not Path(\"saves\").exists():
-            Path(\"saves\").touch()
+        if not Path("saves").exists():
+            Path("saves").touch()
             time.sleep(1.0)
         return {}
 
