@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import time
 from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +19,17 @@ import fmu_mesh
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.results.formats import read_result
-from tests.helpers import BY_ZENOH, FMUS, Launched, Place, row_count, rows_of, wait_until
+from tests.helpers import (
+    BY_ZENOH,
+    FMUS,
+    Launched,
+    Place,
+    on_a_busy_machine,
+    row_count,
+    rows_of,
+    wait_until,
+    write_config,
+)
 from tests.key_meshes import client, key_lines, put_values
 
 POINTS = 4000
@@ -339,6 +350,18 @@ def test_a_restart_begins_with_the_newest_checkpoint(place: Place, kind: str, vi
     assert 0 < int(points) <= POINTS - newest
     place.assert_nothing_left()
     assert result.read_bytes() == undisturbed(config)
+
+
+def test_a_checkpoint_does_not_wait_for_a_sleeping_node(place: Place) -> None:
+    took: list[float] = []
+    with fmu_mesh.load(write_config(place.folder, stop_time=1e6)).start(output=place.folder / "own.csv") as run:
+        run.wait_for("running")
+        for _ in range(21):
+            began = time.perf_counter()
+            run.checkpoint(place.folder / "own.state", timeout=30.0)
+            took.append(time.perf_counter() - began)
+
+    assert sorted(took)[10] < on_a_busy_machine(0.1), took
 
 
 @pytest.mark.parametrize("victim", ["slow", "gain", "master", "fork"])
