@@ -1,10 +1,10 @@
 """Kills, stops and delays processes of a mesh at random, and compares what comes out with the undisturbed result.
 
 Run it with `python -m benchmarks.chaos CONFIG`, or with `all` for one mesh of each kind. The mesh runs once
-undisturbed, and then again and again with `--restarts`, until so many faults were given. Every result has to have the
-bytes of the undisturbed one. Each row of the table is one kind of fault. A time is that from the fault to the first row
-beyond those that the file had when the recorder was gone (of a stop or a delay: from its end). It is also given as a
-multiple of the time from the command to the first row of the same run.
+undisturbed, and then again and again with `--restarts`, or with checkpoints, until so many faults were given. Every
+result has to have the bytes of the undisturbed one. Each row of the table is one kind of fault. A time is that from the
+fault to the first row beyond those that the file had when the recorder was gone (of a stop or a delay: from its end).
+It is also given as a multiple of the time from the command to the first row of the same run.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ from benchmarks.disturbing import (
     EVERYBODY,
     FAULTS,
     GATEWAY,
+    RESUME,
     ROLES,
     Disturbed,
     Given,
     Undisturbed,
     disturbed,
     drawn_faults,
+    recovering,
     undisturbed,
 )
 from benchmarks.publishing import markdown_table
@@ -40,6 +42,7 @@ from benchmarks.soak import soak
 
 __all__ = ["main"]
 
+_SOAK_RESTARTS = 3
 _IN_VAIN = 10
 """So many runs in a row may end before any of their faults; then the mesh is too short for them."""
 
@@ -58,7 +61,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="what is disturbed; fork: the fork server",
     )
     parser.add_argument(
-        "--faults", nargs="+", choices=(*FAULTS, CUT), default=(*FAULTS, CUT), help="what is done (all of them)"
+        "--faults",
+        nargs="+",
+        choices=(*FAULTS, RESUME, CUT),
+        default=(*FAULTS, RESUME, CUT),
+        help="what is done (all of them); resume: `launch` is killed, alone or with all, and resumed",
     )
     parser.add_argument("--per-run", type=int, default=3, metavar="N", help="faults in one run (3)")
     parser.add_argument(
@@ -70,6 +77,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--with", action="append", default=[], dest="values", metavar="KEY=VALUE", help="`--set-config` of all runs"
     )
+    parser.add_argument(
+        "--checkpoints",
+        type=float,
+        metavar="S",
+        help="begin again from checkpoints, one every S seconds (from the first point)",
+    )
     parser.add_argument("--soak", type=int, metavar="POINTS", help="instead: one run of so many points, undisturbed")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all runs and faults to this file")
     options = parser.parse_args(arguments)
@@ -77,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="chaos-") as folder, _ended_by_sigterm():
         try:
             if options.soak:
-                return soak(options.config, options.soak, values, options.json)
+                own = [*recovering(_SOAK_RESTARTS, options.checkpoints), *values]
+                return soak(options.config, options.soak, own, options.json)
             runs = _runs(options, values, Path(folder))
         except KeyboardInterrupt:
             return 130
@@ -121,7 +135,7 @@ def _runs(options: argparse.Namespace, values: Sequence[str], folder: Path) -> l
         else:
             own_kinds = [kind for kind in kinds if kind != CUT]
             faults = drawn_faults(chance, count, own_kinds, options.roles, options.while_coming_back)
-            run = disturbed(mesh, own, expected, faults, number)
+            run = disturbed(mesh, own, expected, faults, number, options.checkpoints)
         runs.append(run)
         left -= len(run.given)
         in_vain = 0 if run.given or run.problem else in_vain + 1

@@ -27,6 +27,7 @@ __all__ = [
     "EVERYBODY",
     "FAULTS",
     "GATEWAY",
+    "RESUME",
     "ROLES",
     "RUN_S",
     "Disturbed",
@@ -37,11 +38,15 @@ __all__ = [
     "disturbed",
     "drawn_faults",
     "factor",
+    "recovering",
     "undisturbed",
 ]
 
 FAULTS: Final = ("kill", "stop", "delay")
 """What is done to a process."""
+
+RESUME: Final = "resume"
+"""The kind of a fault that kills `launch`, with all others or alone; then `launch --resume` goes on."""
 
 ROLES: Final = ("node", "master", "fork")
 """Of processes that each run has; `fork` is the fork server."""
@@ -51,6 +56,9 @@ GATEWAY: Final = "gateway"
 
 EVERYBODY: Final = "all"
 """All processes of a run at once, but `launch` itself."""
+
+_LAUNCH: Final = "launch"
+"""`launch` alone: the others end by themselves."""
 
 MOST_RESTARTS: Final = 50
 """More than one run needs; a mesh that is lost again and again meets its deadline first."""
@@ -70,6 +78,9 @@ _LOOK_S: Final = 0.002
 _LEFT_S: Final = 5.0
 """So long after the end of `launch` something of its run may still be there: what was killed with its parent."""
 
+_KEPT: Final = "kept"
+"""The directory of `recovery`, in the folder of a run."""
+
 _AGAIN: Final = 3
 """At most so often a run is killed again before it has come back."""
 
@@ -79,8 +90,8 @@ class Fault:
     """What is done to a process.
 
     Attributes:
-        kind: one of `FAULTS`.
-        role: one of `ROLES`.
+        kind: one of `FAULTS`, or `RESUME`.
+        role: one of `ROLES`; of `RESUME`, who is killed with `launch`.
         which: which process of this role, from 0 to 1.
         after: the part of all rows that the file has before; less than 0: at the start, before the first one.
         later_s: how much later, in s.
@@ -172,13 +183,14 @@ def drawn_faults(
     Args:
         chance: what decides.
         count: of the faults, without those that follow a kill.
-        kinds: some of `FAULTS`.
+        kinds: some of `FAULTS`, and `RESUME`.
         roles: some of `ROLES`.
         while_coming_back: the probability that a kill is followed by another one, and that one again.
     """
     faults = []
     for after in sorted(chance.uniform(-0.05, 1.0) for _ in range(count)):
         kind, role = chance.choice(kinds), chance.choice(roles)
+        role = chance.choice((EVERYBODY, _LAUNCH)) if kind == RESUME else role
         lasts_s = chance.uniform(*(_STOPPED_S if kind == "stop" else _DELAYED_S))
         again = []
         while kind == "kill" and len(again) < _AGAIN and chance.random() < while_coming_back:
@@ -205,14 +217,21 @@ def undisturbed(mesh: Mesh, options: Sequence[str]) -> Undisturbed:
         return Undisturbed(run.file.path.read_bytes(), first_row_s, seconds, _values(mesh))
 
 
-def disturbed(
-    mesh: Mesh, options: Sequence[str], expected: Undisturbed, faults: Sequence[Fault], number: int
+def disturbed(  # noqa: PLR0913, PLR0917  one run and its faults
+    mesh: Mesh,
+    options: Sequence[str],
+    expected: Undisturbed,
+    faults: Sequence[Fault],
+    number: int,
+    checkpoint_s: float | None = None,
 ) -> Disturbed:
-    """Run a mesh with faults, until it has ended."""
+    """Run a mesh with faults, until it has ended; it begins again as `recovering` says."""
     told = Disturbed(mesh.name, number, options, expected.first_row_s)
-    pace = ["--real-time-factor", str(factor(mesh, expected)), "--restarts", str(MOST_RESTARTS)]
+    own = [*options, "--real-time-factor", str(factor(mesh, expected)), *recovering(MOST_RESTARTS, checkpoint_s)]
     with Place() as place:
-        run = _started(place, mesh, [*options, *pace], RUN_S + expected.seconds + mesh.lasts_s)
+        if any(fault.kind == RESUME for fault in faults):
+            own += ["--set-config", f"recovery.directory={place.folder / _KEPT}"]
+        run = _started(place, mesh, own, RUN_S + expected.seconds + mesh.lasts_s)
         try:
             for fault in faults:
                 run.give(fault, expected.rows, told)
@@ -230,6 +249,14 @@ def disturbed(
     return told
 
 
+def recovering(most: int, checkpoint_s: float | None) -> list[str]:
+    """Options of `launch`: it starts again so often at ``most``, from checkpoints, or None: from its first point."""
+    if checkpoint_s is None:
+        return ["--restarts", str(most)]
+    values = {"mode": "restart", "max_restarts": most, "checkpoint_s": checkpoint_s}
+    return [part for key, value in values.items() for part in ("--set-config", f"recovery.{key}={value}")]
+
+
 def factor(mesh: Mesh, expected: Undisturbed) -> float:
     """The real-time factor of a mesh whose runs last as long as they should; 0: as fast as possible."""
     return expected.time_span_s / mesh.lasts_s if mesh.lasts_s else 0.0
@@ -240,8 +267,13 @@ def _started(place: Place, mesh: Mesh, options: Sequence[str], most_s: float) ->
         mesh.config.with_name(name).unlink(missing_ok=True)
     file = mesh.config.with_name(mesh.files[0]) if mesh.files else place.folder / "result.csv"
     output = [] if mesh.files else ["--output", str(file)]
-    launched = place.start("launch", mesh.config, "--no-progress", *output, *options)
-    return Run(launched, GrowingFile(file), most_s)
+    command = ["launch", mesh.config, "--no-progress", *output, *options]
+
+    def again() -> Launched:
+        """Where there is nothing to resume, it was killed before its beginning, or after its end."""
+        return place.start(*command, *(["--resume"] if (place.folder / _KEPT / "run").exists() else []))
+
+    return Run(place.start(*command), GrowingFile(file), most_s, again)
 
 
 def _values(mesh: Mesh) -> dict[str, dict[str, bytes]]:
@@ -260,15 +292,18 @@ class Run:
         launched: its command, or that of its master.
         file: its result.
         most_s: its deadline.
+        again: starts the command again, after all was killed.
 
     Attributes:
-        launched: as above.
+        launched: as above, the newest.
         file: as above.
         begun: when it was started.
     """
 
-    def __init__(self, launched: Launched, file: GrowingFile, most_s: float) -> None:
-        self.launched = launched
+    def __init__(
+        self, launched: Launched, file: GrowingFile, most_s: float, again: Callable[[], Launched] | None = None
+    ) -> None:
+        self.launched, self._again = launched, again
         self.file = file
         self.begun = time.monotonic()
         self._end = self.begun + most_s
@@ -305,6 +340,8 @@ class Run:
         match fault.kind:
             case "kill":
                 self._kill(victims, fault, label, row, told)
+            case "resume":
+                self._resume(victims if fault.role == EVERYBODY else (), label, row, told)
             case "stop":
                 _signal(victims, signal.SIGSTOP)
                 self.let_pass(fault.lasts_s)
@@ -349,6 +386,18 @@ class Run:
                 return
             label = f"kill {fault.role}, {'coming back' if self.file.rows <= kept else 'again'}"
 
+    def _resume(self, victims: Sequence[psutil.Process], label: str, row: int, told: Disturbed) -> None:
+        """Kill `launch` with these processes, and start it again: it waits for the others."""
+        assert self._again is not None
+        begun = time.monotonic()
+        self.launched.signal(signal.SIGKILL)
+        _signal(victims, signal.SIGKILL)
+        self.launched.close()
+        self.wait(lambda: not any(map(_is_there, victims)), "the end of all processes", _LEFT_S)
+        kept = self.file.recounted()
+        self.launched = self._again()
+        told.given.append(self.next_row(label, row, kept, begun))
+
     def next_row(self, label: str, row: int, kept: int, begun: float | None = None) -> Given:
         """A fault given at ``row``, after the first row beyond ``kept``; its time begins at ``begun``, or now."""
         begun = begun or time.monotonic()
@@ -365,17 +414,18 @@ class Run:
     def _found(self, fault: Fault, old: Sequence[int], kept: int | None = None) -> list[psutil.Process]:
         """Those that get a fault, as soon as they are there; nobody if the run has ended, or goes on again."""
         there: list[psutil.Process] = []
+        any_role = fault.role in {EVERYBODY, _LAUNCH}
 
         def look() -> bool:
             there[:] = [
                 one
                 for one, words in self._processes()
-                if one.pid not in old and (fault.role == EVERYBODY or words[:1] == [fault.role])
+                if one.pid not in old and (any_role or words[:1] == [fault.role])
             ]
             return bool(there) or (kept is not None and self.file.rows > kept)
 
         self.wait(look, f"a process of the role {fault.role}")
-        return there if fault.role == EVERYBODY else there[int(fault.which * len(there)) :][:1]
+        return there if any_role else there[int(fault.which * len(there)) :][:1]
 
     def _processes(self) -> list[tuple[psutil.Process, list[str]]]:
         """Those that it has started, with the words of their titles, in the order of these."""

@@ -18,6 +18,7 @@ import yaml
 
 from benchmarks.chaos_meshes import chain
 from benchmarks.publishing import markdown_table
+from fmu_mesh.run.state_file import STATE
 from tests.helpers import Place
 
 __all__ = ["Sample", "has_grown", "soak"]
@@ -35,22 +36,26 @@ _ROOM: Final = (8.0, 2.0, 0.5)
 
 @dataclass(frozen=True)
 class Sample:
-    """What a run has at one time: seconds since the command, PSS, open files, files of the run, and its result."""
+    """What a run has at one time: seconds since the command, PSS, open files, files of the run, and its result.
+
+    And the point of its newest checkpoint; 0 without one.
+    """
 
     at_s: float
     memory_mb: float
     open_files: float
     folder_mb: float
     result_mb: float
+    checkpoint: int = 0
 
 
 def soak(config: str, points: int, options: Sequence[str], file: Path | None) -> int:
-    """Run a mesh for so many points with `--restarts 3`, and print the table; 1 if it fails, or something grows.
+    """Run a mesh for so many points, and print the table; 1 if it fails, or something grows.
 
     Args:
         config: a file; `all`: a chain of four, of which the last output is recorded.
         points: steps of the mesh.
-        options: more of `launch`.
+        options: more of `launch`, such as those of `recovering`.
         file: gets all samples as JSON.
     """
     samples: list[Sample] = []
@@ -66,7 +71,7 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
         end = time.monotonic() + _MOST_S
         begun = time.monotonic()
         launched = place.start(
-            *("launch", source, "--no-progress", "--restarts", "3", "--stop-time", str(stop_time)),
+            *("launch", source, "--no-progress", "--stop-time", str(stop_time)),
             *("--real-time-factor", "0", "--output", result, *options),
         )
         never = threading.Event()
@@ -82,9 +87,12 @@ def soak(config: str, points: int, options: Sequence[str], file: Path | None) ->
         print(launched.output)
     grown = has_grown(samples)
     shown = samples[:: max(1, len(samples) // _SHOWN)]
-    header = ["at, s", "memory (PSS), MB", "open files", "files of the run, MB", "result, MB"]
+    header = ["at, s", "memory (PSS), MB", "open files", "files of the run, MB", "result, MB", "checkpoint"]
     rows = [
-        (f"{s.at_s:.1f}", f"{s.memory_mb:.1f}", f"{s.open_files:g}", f"{s.folder_mb:.2f}", f"{s.result_mb:.0f}")
+        (
+            *(f"{s.at_s:.1f}", f"{s.memory_mb:.1f}", f"{s.open_files:g}", f"{s.folder_mb:.2f}", f"{s.result_mb:.0f}"),
+            f"{s.checkpoint}",
+        )
         for s in shown
     ]
     print(markdown_table(header, rows, texts=0))
@@ -118,10 +126,11 @@ def _sample(pid: int, folders: Sequence[Path], result: Path, begun: float) -> Sa
             with suppress(psutil.Error):
                 memory += process.memory_full_info().pss
                 files += process.num_fds()
-    size = sum(  # unlike `Path.rglob`, `os.walk` bears with folders that are removed meanwhile
-        _size(Path(parent, name)) for folder in folders for parent, _, names in os.walk(folder) for name in names
-    )
-    return Sample(time.monotonic() - begun, memory / _MB, files, size / _MB, _size(result) / _MB)
+    # Unlike `Path.rglob`, `os.walk` bears with folders that are removed meanwhile.
+    there = [Path(parent, name) for folder in folders for parent, _, names in os.walk(folder) for name in names]
+    size = sum(map(_size, there))
+    checkpoint = max((int(own.stem) for own in there if own.suffix == STATE and own.stem.isdecimal()), default=0)
+    return Sample(time.monotonic() - begun, memory / _MB, files, size / _MB, _size(result) / _MB, checkpoint)
 
 
 def _size(path: Path) -> int:

@@ -28,6 +28,7 @@ import psutil
 import yaml
 import zenoh
 
+from fmu_mesh.run.state_file import STATE
 from fmu_mesh.wire.runtime import MeshNote
 
 __all__ = [
@@ -327,6 +328,10 @@ class Place:
     def extracted(self) -> list[Path]:
         """The folders of extracted FMUs."""
         return [path.parent for path in _within(self.folder) if path.name == "modelDescription.xml"]
+
+    def checkpoints(self) -> list[int]:
+        """The points of all checkpoints, in ascending order, without those that are being written."""
+        return sorted(int(path.stem) for path in _within(self.folder) if path.suffix == STATE and path.stem.isdecimal())
 
     def sockets(self) -> list[Path]:
         """The sockets of processes that listen for others."""

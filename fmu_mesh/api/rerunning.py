@@ -134,9 +134,10 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
     sections = data.get("record") or {}
     section = sections[metadata.section] if isinstance(sections, list) else sections
     data["record"] = {**section, "file": str(output.absolute())}
-    last_point = _last_point(metadata, first)
-    if last_point is not None:  # an instance may have been ahead of the rows that were left
-        values = [value for value in values if value.point < last_point]
+    last_row, last_point = _last_points(metadata, first)
+    # An instance may have been ahead of the rows that were left, or at its last point, and in a rerun the mesh ends
+    # there before it gets its value. No row depends on these values.
+    values = [value for value in values if value.point < last_row]
     mesh = Mesh.from_configuration(PlainConfig(data, Path(metadata.file), foreign=f"the result '{path}'"))
     plan = mesh.plan(
         real_time_factor=0.0,
@@ -167,13 +168,14 @@ def _metadata_of(path: Path, result: Result) -> tuple[RunMetadata, list[SetValue
         raise ConfigurationError(f"what '{path}' says about its run is not understood: {error}") from error
 
 
-def _last_point(metadata: RunMetadata, result: Result) -> int | None:
-    """The point of the last row; None if it is the last one of the run."""
+def _last_points(metadata: RunMetadata, result: Result) -> tuple[int, int | None]:
+    """The point of the last row, and the one at which a rerun is stopped; None: it runs to its end."""
     if not len(result.times):
         raise ConfigurationError(f"'{result.file}' has no rows", hint="There is nothing to compare a rerun with.")
-    if metadata.stop_time is not None and metadata.stop_time - result.times[-1] < metadata.step_size / 2:
-        return None
-    return round((float(result.times[-1]) - metadata.start_time) / metadata.step_size)
+    last_time, stop_time = float(result.times[-1]), metadata.stop_time
+    point = round((last_time - metadata.start_time) / metadata.step_size)
+    ends_there = stop_time is not None and stop_time - last_time < metadata.step_size / 2
+    return point, None if ends_there else point
 
 
 def _check_models(path: Path, metadata: RunMetadata, plan: RunPlan) -> None:

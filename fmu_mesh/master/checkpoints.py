@@ -5,7 +5,8 @@ Owns the states that have come so far and the commands that wait for them. `Mast
 
 # All of it runs on the main thread of the master. What may go wrong: a node does not answer (its process is gone, and
 # the run ends; or a message is lost, and after the deadline the run goes on without a checkpoint), an instance cannot
-# write its state, or another command comes meanwhile. In each case the grant goes on, and who has asked is told why.
+# write its state, another command comes meanwhile, or an FMU ends the simulation before that point. In each case the
+# grant goes on, and who has asked is told why.
 # A state that comes too late has another point than the present checkpoint, and is dropped (ADR 90).
 
 from __future__ import annotations
@@ -118,8 +119,9 @@ class Checkpoints:
         missing = states.plan.system.instances.keys() - found.keys()
         failed = [own.error for own in found.values() if own.error is not None]
         limit_s = states.deadlines.silence
-        if not states.takes_commands:
-            self.give_up(MeshLost(f"{self._mesh} is {states.state}, and there is no checkpoint any more"))
+        if not states.takes_commands or states.ended_by is not None:  # then nobody may come to that point
+            state = states.state if states.ended_by is None else "ending"
+            self.give_up(MeshLost(f"{self._mesh} is {state}, and there is no checkpoint any more"))
         elif failed:
             self.give_up(from_report(failed[0]))
         elif not missing:

@@ -389,7 +389,8 @@ class Node:
             try:
                 has_more, saves = self._inbox.is_direct or self._inbox.has_posted, self._saves_at >= 0
                 wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
-                stepped = engine.run(wait_s, eager=eager or saves, quiet=quiet and self.server.is_unfollowed)
+                unseen = quiet and not saves and self.server.is_unfollowed  # else it sleeps on, also if it is eager
+                stepped = engine.run(wait_s, eager=eager or saves, quiet=unseen)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)

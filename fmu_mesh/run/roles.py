@@ -20,6 +20,7 @@ from setproctitle import setproctitle
 
 from ..config.access_sections import is_socket
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
+from ..files import Kept
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
@@ -49,7 +50,7 @@ from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
 from .run_directory import Syncing
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
-from .state_file import keeper, state_bytes
+from .state_file import drop_older, keeper, state_bytes
 from .wiring import certified, patient, shared_with_group, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
@@ -407,11 +408,17 @@ class _MasterRuns:
             memory=master.memory_for(RECORDER),
             mirror_of=streams.mirror if streams is not None else lambda _link: None,
             audit=lambda: (master.audit.changes, master.audit.view()),
-            **({"on_flush": Syncing(self.run).flushed} if self.run.directory and not self.resets else {}),
+            on_flush=self._on_flush(),
         )
         if streams is not None:
             streams.tell_last(recorder.note_last)
         return recorder
+
+    def _on_flush(self) -> Callable[[Sequence[Kept]], None]:
+        run = self.run
+        if self.resets or not (run.directory or run.checkpoint_s is not None):
+            return lambda _kept: None
+        return Syncing(run).flushed if run.directory else partial(drop_older, run.kept_in, run.plan.system.records)
 
 
 def _opened_results(run: RunPlan) -> Sequence[ResultFile]:

@@ -257,7 +257,7 @@ class Syncing:
 
     def _sync(self, kept: Sequence[Kept]) -> None:
         _sync(self._folder, [record.file for record in self._records], kept)
-        drop_older(self._folder, self._records, [own.rows for own in kept])
+        drop_older(self._folder, self._records, kept)
 
 
 def _sync(folder: Path, results: Sequence[str], kept: Sequence[Kept]) -> None:

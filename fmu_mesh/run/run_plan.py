@@ -20,6 +20,7 @@ from ..config.mesh import ZenohConfig
 from ..errors import ConfigurationError, UnknownName
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
+from ..results.formats import goes_on
 from ..simtime import ENDLESS
 from ..system.attempt import Attempt
 from ..system.layout import row_bytes
@@ -140,10 +141,14 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def checkpoint_s(self) -> float | None:
-        """How often in s there is a checkpoint for a restart; None: never. Nodes started by hand cannot get states."""
+        """How often in s there is a checkpoint for a restart; None: never.
+
+        Nodes started by hand cannot get states, and a file that cannot go on has its first rows from the first point.
+        """
         recovery = self.loaded.config.recovery
-        is_wanted = recovery.mode == "restart" and self.restarts < self.max_restarts
-        return recovery.checkpoint_s if (is_wanted or self.directory) and not manual_hosts(self.plan) else None
+        is_wanted = self.directory or (recovery.mode == "restart" and self.restarts < self.max_restarts)
+        can = not manual_hosts(self.plan) and all(goes_on(own.file) for own in self.plan.system.records)
+        return recovery.checkpoint_s if is_wanted and can else None
 
     @property
     def config_file(self) -> Path:

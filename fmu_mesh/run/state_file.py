@@ -26,7 +26,7 @@ from msgspec.structs import replace
 
 from .. import __version__, files
 from ..errors import ConfigurationError, Finding
-from ..results.formats import goes_on
+from ..files import Kept
 from ..system.plan import RECORDER
 from ..system.records import RecordPlan
 from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
@@ -171,10 +171,10 @@ def state_bytes(
 
 
 def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
-    """A function that keeps the checkpoint at a point for a restart of a run, and the one before it.
+    """A function that keeps the checkpoint at a point for a restart of a run; `drop_older` removes those before.
 
-    With a directory it gives them to the disk, on a thread of its own; a checkpoint that comes meanwhile is left out,
-    and `drop_older` removes them. The errors are those of `write_state`; then, they are of the checkpoint before.
+    With a directory it gives them to the disk, on a thread of its own; a checkpoint that comes meanwhile is left out.
+    The errors are those of `write_state`; with a directory, they are of the checkpoint before.
     """
     folder, worker, last = run.kept_in, ThreadPoolExecutor(1, thread_name_prefix="checkpoints"), list[Future[None]]()
 
@@ -182,8 +182,8 @@ def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
         file = folder / f"{point}{STATE}"
         if not run.directory:
             write_state(file, data, synced=False)
-            for older in _newest_first(folder)[2:]:
-                older.unlink(missing_ok=True)
+            if not run.plan.system.records:  # nobody writes rows
+                drop_older(folder, (), ())
         elif not last or last[-1].done():
             if last:
                 last.pop().result()
@@ -192,11 +192,15 @@ def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
     return keep
 
 
-def drop_older(folder: Path, records: Sequence[RecordPlan], rows: Sequence[int]) -> None:
-    """Remove the checkpoints before the newest one of which all files have the ``rows`` before it."""
+def drop_older(folder: Path, records: Sequence[RecordPlan], kept: Sequence[Kept]) -> None:
+    """Remove the checkpoints before the newest one of which the files have all rows before it.
+
+    ``kept`` is what they have. How far they are behind the steps is up to the disk, so there may be any number of newer
+    checkpoints that cannot be used yet.
+    """
     states = iter(_newest_first(folder))
     for file in states:
-        if _has_rows(_point_of(file), records, rows):
+        if _has_rows(_point_of(file), records, [own.rows for own in kept]):
             break
     for file in states:
         file.unlink(missing_ok=True)
@@ -207,17 +211,16 @@ def _has_rows(point: int, records: Sequence[RecordPlan], rows: Sequence[int]) ->
 
 
 def _newest_first(folder: Path) -> list[Path]:
-    return sorted(folder.glob(f"*{STATE}"), key=_point_of, reverse=True)
+    """The checkpoints in a folder, without those that are being written."""
+    return sorted((own for own in folder.glob(f"*{STATE}") if own.stem.isdecimal()), key=_point_of, reverse=True)
 
 
 def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> RunPlan:
     """A run that starts again, from its newest checkpoint of which all files have the ``rows`` before it.
 
-    Without one, and where the format of a file cannot go on, it begins where it began.
+    Without one, it begins where it began.
     """
     system = run.plan.system
-    if not all(goes_on(own.file) for own in system.records):
-        return run
     for file in _newest_first(folder):
         with suppress(ConfigurationError):  # its writer was killed
             state = StateFile.read(file)
@@ -231,7 +234,7 @@ def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> Ru
 
 
 def _point_of(file: Path) -> int:
-    return int(file.stem) if file.stem.isdecimal() else -1
+    return int(file.stem)
 
 
 def write_state(file: Path, data: bytes, *, synced: bool = True) -> None:

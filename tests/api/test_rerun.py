@@ -13,6 +13,7 @@ import msgspec
 import pytest
 
 import fmu_mesh
+from fmu_mesh.api.rerunning import planned_rerun
 from fmu_mesh.config.loading import PlainConfig
 from fmu_mesh.instances.configuration import examine_data
 from fmu_mesh.system.run_metadata import configuration_of
@@ -114,6 +115,41 @@ def test_what_a_killed_run_has_kept_is_run_again(place: Place, folder: Path, win
     assert len(metadata_of(folder / "pair.csv")["set"]) == 1
     assert first.count(b"\n") > 2000
     assert again == first
+
+
+WAITS = """
+import threading
+from pathlib import Path
+
+import fmu_mesh
+
+class Waits(fmu_mesh.Component):
+    y = fmu_mesh.Output()
+
+    def step(self, now, step_size):
+        waiter, go = threading.Event(), Path(__file__).with_name("go")
+        while now > 0.0985 and not go.exists():
+            waiter.wait(0.001)
+        self.y = now
+"""
+
+
+def test_a_value_set_at_a_last_point_is_not_set_again(folder: Path) -> None:
+    (folder / "waits.py").write_text(WAITS, encoding="utf-8")
+    instances = {"free": {"fmu": "Gain"}, "waits": {"python": "waits.py:Waits"}}
+    config = write_config(folder, instances=instances, connections=(), stop_time=0.1)
+    with fmu_mesh.load(config).start() as run:
+        run.set("free.k", 2.5, at=0.05)
+        wait_until(lambda: run.instance_status("free").point == 100, "the last point of one instance")
+        run.set("free.u", 3.0)
+        (folder / "go").touch()
+        first = run.wait(DEADLINE_S)
+
+    again = planned_rerun("pair.csv", output="again.csv", allow_code=True)
+
+    assert [value["variable"] for value in first.metadata["set"] if value["point"] == 100][-1] == "u"
+    assert not [value for value in again.values if value.point == 100]
+    assert again.run().compare(first).equal
 
 
 def test_a_value_of_an_unknown_program_is_noted_under_its_key(place: Place, folder: Path) -> None:

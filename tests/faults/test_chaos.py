@@ -41,6 +41,29 @@ def test_three_kills_of_a_small_mesh_change_nothing(tmp_path: Path, capsys: pyte
     assert all(f"| {one['label']} |" in shown for one in given)
 
 
+def test_a_mesh_is_resumed_after_its_launcher_was_killed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--faults", "resume", "--lasts", "2", "--per-run", "2", "--seed", "22", "--checkpoints", "0.2"]
+
+    code = main([str(write_config(tmp_path)), "--kills", "2", *few])
+
+    shown = capsys.readouterr().out
+    assert code == 0, shown
+    assert "| resume all | 1 | 1 | 0 | 0 |" in shown
+    assert "| resume launch | 1 | 1 | 0 | 0 |" in shown
+
+
+@pytest.mark.parametrize("options", [[], ["--checkpoints", "0.05"]], ids=["restarts", "checkpoints"])
+def test_a_short_soak_shows_what_a_run_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    code = main([str(write_config(tmp_path)), "--soak", "300000", *options])
+
+    shown = capsys.readouterr().out
+    assert code == 0 or "has grown" in shown or "too short" in shown, shown
+    assert "300000 points in" in shown
+    assert "| at, s | memory (PSS), MB | open files | files of the run, MB | result, MB | checkpoint |" in shown
+
+
 def test_a_mesh_that_is_not_deterministic_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "unsteady.py").write_text(UNSTEADY, encoding="utf-8")
     config = write_config(tmp_path, instances={"own": {"python": "unsteady.py:Unsteady"}}, connections=())

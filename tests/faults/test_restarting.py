@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import time
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,15 +17,29 @@ import yaml
 
 import fmu_mesh
 from fmu_mesh.cli.main import main
+from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.results.formats import read_result
-from tests.helpers import BY_ZENOH, FMUS, Launched, Place, row_count, rows_of, wait_until
+from tests.helpers import (
+    BY_ZENOH,
+    FMUS,
+    Launched,
+    Place,
+    on_a_busy_machine,
+    row_count,
+    rows_of,
+    wait_until,
+    write_config,
+)
 from tests.key_meshes import client, key_lines, put_values
 
 POINTS = 4000
 
 PARTS = """
 import time
+from pathlib import Path
+
 import fmu_mesh
+from fmu_mesh.errors import TerminationRequested
 
 class Slow(fmu_mesh.Component):
     \"\"\"Takes its time, so that a test can kill at a point; its text changes with its value.\"\"\"
@@ -34,6 +50,35 @@ class Slow(fmu_mesh.Component):
     def step(self, now, step_size):
         self.y = 0.5 * self.y + 0.1 * self.u + 0.1 * self.v + 0.1
         time.sleep(0.0003)
+
+class Saving(fmu_mesh.Component):
+    \"\"\"Takes its time to give its state, so that a test can kill meanwhile.\"\"\"
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output()
+
+    def step(self, now, step_size):
+        self.y = 0.5 * self.y + 0.1 * self.u
+        time.sleep(0.0003)
+
+    def get_state(self):
+        if not Path("saves").exists():
+            Path("saves").touch()
+            time.sleep(1.0)
+        return {}
+
+    def set_state(self, state):
+        pass
+
+class Landing(fmu_mesh.Component):
+    \"\"\"Ends the simulation in a step that takes longer than it is until the next checkpoint.\"\"\"
+    y = fmu_mesh.Output()
+
+    def step(self, now, step_size):
+        if now > 0.3005:
+            Path("lands").touch()
+            time.sleep(1.0)
+            raise TerminationRequested("landed")
+        self.y = now
 
 class Clock(fmu_mesh.Component):
     y = fmu_mesh.Output()
@@ -65,6 +110,11 @@ def written(place: Place, kind: str = "chain", **sections: Any) -> Path:  # noqa
     elif kind == "clock":
         instances["slow"] = {"python": "parts.py:Clock"}
         connections = ["slow.y -> gain.u"]
+    elif kind == "saving":
+        instances["slow"] = {"python": "parts.py:Saving"}
+    elif kind == "landing":
+        instances["slow"] = {"python": "parts.py:Landing"}
+        connections = []
     simulation = {"stop_time": POINTS * 0.001, "step_size": 0.001, **sections.pop("simulation", {})}
     content = {
         "mesh": "again",
@@ -290,14 +340,54 @@ def test_a_restart_begins_with_the_newest_checkpoint(place: Place, kind: str, vi
         victim = "both"
     config = written(place, kind, recovery={"mode": "restart", "checkpoint_s": 0.05})
     launched = place.start("launch", config, "--no-progress")
-    folder = wait_until(lambda: next(iter((place.folder / "run").glob("**/*.state")), None), "a checkpoint").parent
-    states = sorted(int(file.stem) for file in folder.glob("*.state"))
+    newest = wait_until(place.checkpoints, "a checkpoint")[-1]
 
-    killed(launched, result := config.with_suffix(".csv"), victim, states[-1] + 200)
+    killed(launched, result := config.with_suffix(".csv"), victim, newest + 200)
 
     launched.wait_for_error_line("starts again and goes on from point")
     assert launched.wait() == 0, launched.story()
     (points,) = re.findall(r"^(\d+) points in", launched.story(), re.MULTILINE)
-    assert 0 < int(points) <= POINTS - states[-1]
+    assert 0 < int(points) <= POINTS - newest
     place.assert_nothing_left()
     assert result.read_bytes() == undisturbed(config)
+
+
+def test_a_checkpoint_does_not_wait_for_a_sleeping_node(place: Place) -> None:
+    took: list[float] = []
+    with fmu_mesh.load(write_config(place.folder, stop_time=1e6)).start(output=place.folder / "own.csv") as run:
+        run.wait_for("running")
+        for _ in range(21):
+            began = time.perf_counter()
+            run.checkpoint(place.folder / "own.state", timeout=30.0)
+            took.append(time.perf_counter() - began)
+
+    assert sorted(took)[10] < on_a_busy_machine(0.1), took
+
+
+@pytest.mark.parametrize("victim", ["slow", "gain", "master", "fork"])
+def test_a_process_may_be_killed_while_states_are_saved(place: Place, victim: str) -> None:
+    config = written(place, "saving", recovery={"mode": "restart", "checkpoint_s": 0.05})
+    launched = place.start("launch", config, "--no-progress")
+    wait_until((place.folder / "saves").exists, "a checkpoint under way")
+
+    launched.child(victim).kill()
+
+    launched.wait_for_error_line("restart 1 of 3")
+    assert launched.wait() == 0, launched.story()
+    place.assert_nothing_left()
+    assert config.with_suffix(".csv").read_bytes() == undisturbed(config)
+
+
+@pytest.mark.parametrize("asks", [True, False])
+def test_a_simulation_may_end_while_a_checkpoint_is_under_way(place: Place, asks: bool) -> None:  # noqa: FBT001  a parameter
+    config = written(place, "landing", recovery={"mode": "restart", "checkpoint_s": None if asks else 0.05})
+    launched = place.start("launch", config, "--no-progress")
+    with fmu_mesh.attach("again", connect=place.note().endpoints[0]) as run:
+        wait_until((place.folder / "lands").exists, "the last step")
+        with pytest.raises(ConfigurationError, match="no checkpoint any more") if asks else nullcontext():
+            _ = asks and run.checkpoint(place.folder / "late.state", timeout=30.0)
+
+    assert launched.wait(30.0) == 0, launched.story()
+    assert "landed" in launched.errors
+    assert row_count(config.with_suffix(".csv")) == 302
+    place.assert_nothing_left()

@@ -135,7 +135,7 @@ def test_a_run_is_resumed_from_its_newest_whole_checkpoint(place: Place) -> None
     def usable() -> list[int]:
         """The points of checkpoints of which the disk has all rows."""
         rows = on_disk(config)["files"][0][0]
-        return sorted(point for file in kept.glob("*.state") if (point := int(file.stem)) <= rows)
+        return [point for point in place.checkpoints() if point <= rows]
 
     wait_until(lambda: usable() or not launched.running, "a checkpoint with its rows")
     cut_off(place, launched)
