@@ -27,6 +27,9 @@ def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
     """
     for name, data in begins_with.states.items():
         _load(runners[name], data)
+    for name in begins_with.anew.keys() & runners.keys():
+        if isinstance(timed := runners[name].instance, TimedInputs):
+            timed.last.count_from(runners[name].step)
 
 
 def set_again(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
@@ -92,9 +95,7 @@ def _load(runner: Runner, data: bytes) -> None:
     own, grid, name = PackedMember.decoded(data, runner.name), runner.grid, runner.name
     if (at := own.step * runner.plan.step_points) != grid.first_point:
         raise FmuError(f"its state is of point {at}, and the run begins at point {grid.first_point}", instance=name)
-    runner.table.note(step=own.step)
-    for link in runner.out_links:
-        link.begin_at(own.step)
+    runner.begin_at(own.step)
     runner.bind()
     if own.over_time and not isinstance(runner.instance, TimedInputs):
         timed = TimedInputs(runner.instance, "hold")

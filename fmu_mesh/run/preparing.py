@@ -204,7 +204,8 @@ def planned(
         connect=tuple(options.connect or ()),
     )
     obstacles.raise_any(run)
-    return StateFile.read(Path(options.state)).begin(run) if options.state is not None else run
+    state = StateFile.of(options)
+    return state.begin(run, options.replaced) if state is not None else run
 
 
 def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:

@@ -84,7 +84,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
         topics: those in ROS.
         recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
-        begins_with: the state file with which it begins, absolute, or nothing.
+        begins_with: the state file with which it begins, absolute, or nothing; the ``replaced`` begin anew there.
     """
 
     config: Config
@@ -97,6 +97,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     topics: tuple[MeshTopic, ...] = ()
     recorded_keys: RecordedKeys | None = None
     begins_with: str = ""
+    replaced: tuple[str, ...] = ()
 
     @property
     def keys(self) -> tuple[KeyView, ...]:
