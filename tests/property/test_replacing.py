@@ -176,8 +176,8 @@ def test_without_being_asked_for_another_model_is_refused_with_a_way_out(tmp_pat
         other.run(state=state, replaced=["first"])
     with pytest.raises(ConfigurationError, match="connections: "):
         gain.run(state=state, replaced=["second"])
-    with pytest.raises(ConfigurationError, match=r"(?s)no such instance.*Did you mean 'second'"):
-        gain.open(state=state, replaced=["secnd"])
+    with pytest.raises(ConfigurationError, match=r"(?s)no such instance.*Did you mean 'first'"):
+        gain.open(state=state, replaced=["first1"])
     with pytest.raises(CallRefused, match="needs a state"):
         gain.run(replaced=["second"])
 
