@@ -78,11 +78,7 @@ class BeginOptions(VariantOptions, frozen=True, kw_only=True):
     state: State = None
     replaced: Annotated[
         Sequence[str],
-        Option(
-            "begin this instance anew at the point of the state, such as with another model of the same interface",
-            "--replace",
-            "INSTANCE",
-        ),
+        Option("begin this instance anew in that state, also with another model", "--replace", "INSTANCE"),
     ] = ()
 
 

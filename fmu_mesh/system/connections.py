@@ -91,11 +91,6 @@ class Connection(msgspec.Struct, frozen=True):
         return self.target.causality == "parameter"
 
     @property
-    def ends(self) -> tuple[tuple[str, Variable], tuple[str, Variable]]:
-        """Its two ends: instance and variable."""
-        return (self.source_instance, self.source), (self.target_instance, self.target)
-
-    @property
     def source_name(self) -> str:
         """The name of the source, as `y` or `y[2]`."""
         return element_name(self.source.name, self.source_index) if self.source_index else self.source.name

@@ -13,7 +13,6 @@ import msgspec
 
 from ..config.instance_sections import placed
 from ..text import counted, listed, shown
-from ..variables.model_description import Variable
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .plan import Plan
@@ -86,6 +85,8 @@ def saved_instances(
     ``contents`` is the SHA-256 of each model, and ``others`` are the start values that are not as in the plan.
     """
     found = {}
+    ends = [(c.source_instance, c.source.name) for c in plan.connections]
+    ends += [(c.target_instance, c.target.name) for c in plan.connections]
     for name, own in plan.system.instances.items():
         described = own.description
         fed = [
@@ -93,8 +94,7 @@ def saved_instances(
             for c in plan.connections
             if c.target_instance == name
         ]
-        used = {variable.name for c in plan.connections for end, variable in c.ends if end == name}
-        used |= {schedule.variable for schedule in own.scenario}
+        used = {schedule.variable for schedule in own.scenario} | {variable for end, variable in ends if end == name}
         agreed = {
             "kind": f"{described.kind} {described.fmi_version}".strip(),
             "step": counted(own.step_points, "point"),
@@ -105,7 +105,11 @@ def saved_instances(
             "values over time": _hash([schedule.agreed() for schedule in own.scenario]),
             "timeouts": _hash(own.timeouts),
         }
-        agreed |= {f"variable '{v.name}'": _in_words(v) for v in described.variables if v.name in used}
+        agreed |= {
+            f"variable '{v.name}'": f"{v.type}{[*v.shape] if v.shape else ''} {v.causality}"
+            for v in described.variables
+            if v.name in used
+        }
         given = {variable: to_plain(value) for variable, value in own.start_values.items()}
         found[name] = SavedInstance(agreed, given | dict(others.get(name, {})))
     return found
@@ -157,10 +161,6 @@ def _start_values(
         why = why_not_settable(variable, sources.get(variable.name))
         why = "has values over time" if variable.name in prescribed else why
         yield variable.name, now, f"'{variable.name}' is {shown(now)}, was {shown(was)}, and {why}" if why else ""
-
-
-def _in_words(variable: Variable) -> str:
-    return f"{variable.type}{[*variable.shape] if variable.shape else ''} {variable.causality}"
 
 
 def _hash(value: object) -> str:
