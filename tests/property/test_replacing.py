@@ -163,6 +163,66 @@ def stepped_ends(mesh: fmu_mesh.Mesh, state: Path) -> list[Any]:
         return [system.get("gain.y"), system.get("line.y")]
 
 
+TALK = """
+import numpy as np
+import fmu_mesh
+
+class Talker(fmu_mesh.Component):
+    k = fmu_mesh.Parameter(3.0)
+    word = fmu_mesh.Output(type="String", start="")
+    wide = fmu_mesh.Output(shape=(2,), start=np.zeros(2))
+
+    def step(self, time, step_size):
+        self.word, self.wide = f"{time:.1f}", np.array([time, -time])
+
+class Listener(fmu_mesh.Component):
+    k = fmu_mesh.Parameter(1.0)
+    word = fmu_mesh.Input(type="String", start="")
+    wide = fmu_mesh.Input(shape=(2,), start=np.zeros(2))
+    y = fmu_mesh.Output(start=0.0)
+
+    def initialize(self):
+        self.step(0.0, 0.0)
+
+    def step(self, time, step_size):
+        self.y = self.k * (self.wide[0] - 2 * self.wide[1]) + float(self.word or 0)
+"""
+
+
+def test_text_arrays_and_parameters_come_from_the_states_too(tmp_path: Path, event_fmu: Callable[..., Path]) -> None:
+    (tmp_path / "talk.py").write_text(TALK, encoding="utf-8")
+    cvode = {"kind": "model_exchange", "solver": {"name": "cvode"}}  # has no state that can be written
+    config = write_config(
+        tmp_path,
+        instances={
+            "talker": {"python": "talk.py:Talker", "start_values": {"k": 5.0}},
+            "listener": {"python": "talk.py:Listener"},
+            "model": {"fmu": str(event_fmu("Oscillator", 2)), "kind": "co_simulation"},
+        },
+        connections=[
+            "talker.word -> listener.word",
+            "talker.wide -> listener.wide",
+            "talker.k -> listener.k",
+            "listener.y -> model.u",
+        ],
+        simulation={"step_size": H},
+        stop_time=40.0,
+    )
+    mesh = fmu_mesh.load(config)
+    state, whole = saved(mesh, tmp_path / "a.state"), alone(mesh)
+    data: Any = mesh.configuration.data
+    data["instances"]["model"] |= cvode
+    other = fmu_mesh.Mesh.from_configuration(mesh.configuration)
+    runs = [alone(other, state=state, replaced=["listener", "model"], processes=own) for own in (False, True)]
+    for found in runs:
+        time = whole["talker.wide[1]"][AT]
+        assert found["listener.y"][0] == pytest.approx(5.0 * 3.0 * time + float(f"{time:.1f}"))
+        assert np.asarray(found["model.x"]).tobytes() == np.asarray(runs[0]["model.x"]).tobytes()
+    expected = stepped(other, ["model.x", "listener.y"], state=state, replaced=["listener", "model"])
+    for name, values in expected.items():
+        assert runs[0][name].tobytes() == np.asarray(values).tobytes()
+
+
 def test_without_being_asked_for_another_model_is_refused_with_a_way_out(tmp_path: Path) -> None:
     state = saved(chain(tmp_path, LINE, LINE), tmp_path / "a.state")
     other = chain(
