@@ -636,16 +636,17 @@ class Mesh:
         from ..run.state_file import StateFile  # noqa: PLC0415  only this needs it
         from .open_system import System  # noqa: PLC0415  as above
 
-        state = StateFile.read(Path(options.state)) if options.state is not None else None
+        state = StateFile.of(options)
         run, given = self._opened(options), options.given()
-        given.pop("state", None)
+        for own in ("state", "replaced"):
+            given.pop(own, None)
         values, known = deepcopy(self._plain._replace(file=self._shown_file)), KnownModels.of(run)
 
         def plan_again(start_values: Mapping[str, Any]) -> RunPlan:
             own = PlanOptions(**given | {"start_values": given.get("start_values", {}) | start_values})
             return without_keys(planned(values, own, own.on_notice or log.info, known))
 
-        return System(run, plan_again, state)
+        return System(run, plan_again, state, options.replaced)
 
     @takes(BatchOptions)
     def batch(self, copies: int, options: BatchOptions) -> Batch:
@@ -682,7 +683,7 @@ class Mesh:
         if options.keys_from is not None:
             raise CallRefused("`keys_from` for a system that a program steps", hint="Set the inputs with `set`.")
         given = options.given()
-        for own in ("state", "threads", "processes", "memory_limit"):
+        for own in ("state", "replaced", "threads", "processes", "memory_limit"):
             given.pop(own, None)
         return without_keys(self.plan(**given))
 

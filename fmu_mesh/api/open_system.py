@@ -11,7 +11,7 @@ import shutil
 import tempfile
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -24,18 +24,17 @@ from msgspec.structs import replace
 from ..errors import CallRefused, ErrorReport, FmuError, FmuMeshError, TerminationRequested, UnknownName
 from ..instances.call_guard import Guarded, Unwatched
 from ..instances.kept_models import KeptModels
-from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..run.local_system import LocalSystem, SavedSystem, forwarded, opening_of
 from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
 from ..run.preparing import OtherStartValues
 from ..run.run_plan import RunPlan
-from ..run.state_file import StateFile, state_bytes, write_state
+from ..run.state_file import StateFile, state_bytes, with_replaced, write_state
 from ..simtime import ENDLESS
 from ..system.states import stateless
 from ..text import listed, option_text, shown
-from ..variables.value_conversion import ValueRefused, checker, to_value
+from ..variables.value_conversion import ValueRefused, checker
 from ..variables.value_types import DTYPES, PlainValue
 from .system_state import SystemState
 
@@ -74,6 +73,7 @@ class System:
         run: the plan of the run.
         plan_again: plans it again for a reset, with these start values besides; None: from its configuration.
         state: where it begins; None: at point 0.
+        replaced: the instances that begin anew there.
 
     Raises:
         ConfigurationError: the state is not one of this mesh.
@@ -86,8 +86,10 @@ class System:
         run: RunPlan,
         plan_again: Callable[[Mapping[str, Any]], RunPlan] | None = None,
         state: StateFile | None = None,
+        replaced: Sequence[str] = (),
     ) -> None:
-        set_again = state.check(run) if state is not None else {}
+        first = with_replaced(run, replaced)
+        begins_with, point = (state.check(first), state.head.point) if state is not None else (None, 0)
         self._resets = OtherStartValues(run, plan_again, loads=False)
         self._plan = plan = run.plan
         OneProcess().check(plan, run.contents)
@@ -109,13 +111,7 @@ class System:
         self._local = local = LocalSystem(plan, self._models)
         self._release = weakref.finalize(self, _release, local, folder, self._thread)
         try:
-            local.start(self._opened)
-            if state is not None:
-                with kept_state():
-                    local.load(state.head.point, state.states)
-                    for name, values in set_again.items():
-                        variables = {v.name: v for v in plan.system.instances[name].description.variables}
-                        local.set(name, {own: to_value(value, variables[own]) for own, value in values.items()})
+            local.start(self._opened, first.plan, begins_with=begins_with, point=point)
         except BaseException:
             self.close()
             raise

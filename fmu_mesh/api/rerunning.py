@@ -144,6 +144,7 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
         paused=bool(values) or last_point is not None,
         keys_from=path.parent / keys if keys is not None else os.devnull,
         state=metadata.state or None,
+        replaced=metadata.replaced,
         allow_code=allow_code,
         on_notice=on_notice,
     )

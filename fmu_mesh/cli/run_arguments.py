@@ -119,7 +119,7 @@ def _add_nodes(parser: argparse._ActionsContainer) -> None:
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
-        options("state", "paused", "view", "video", "profile", "processes", "restarts", "resume"),
+        options("state", "replaced", "paused", "view", "video", "profile", "processes", "restarts", "resume"),
         _PLOT,
         *_OUTPUT,
         _OUTCOME,
@@ -229,7 +229,7 @@ PARSERS: Parsers = {
             "instead of what CONFIG says, for all runs",
             options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
         ),
-        options("state", "keys_from", "allow_code"),
+        options("state", "replaced", "keys_from", "allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
     ),

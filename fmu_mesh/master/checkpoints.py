@@ -28,7 +28,7 @@ from ..errors import (
     from_report,
 )
 from ..system.states import stateless
-from ..wire.messages import InstanceState, decode_state
+from ..wire.messages import MAX_STATES_SIZE, InstanceState, decode_state
 from ..wire.refusals import Refusals
 from .master_states import MasterStates
 from .mesh_server import MasterSettings
@@ -69,6 +69,7 @@ class Checkpoints:
         self._now = 0.0
         self._waiting: list[tuple[zenoh.Query, float]] = []
         self._found: dict[str, InstanceState] = {}
+        self._came: dict[str, bytearray] = {}
         self._stands_since: float | None = None
         self._complete: tuple[int, Mapping[str, bytes]] | None = None
 
@@ -85,6 +86,7 @@ class Checkpoints:
         for name, why in stateless(self._states.plan.system).items():
             raise CallRefused(f"its state cannot be written to a file: {why}.", instance=name)
         self._found.clear()
+        self._came.clear()
         self._stands_since, states = None, self._states
         every = math.lcm(*(own.step_points for own in states.plan.system.instances.values()))
         if not states.save(self._withdraw(), every):
@@ -94,7 +96,7 @@ class Checkpoints:
             raise CallRefused(text, hint=f"`step` it by {-hold % every}." if hold is not None else None)
 
     def take(self, node: str, point: int, data: bytes) -> None:
-        """A node has sent the state of an instance.
+        """A node has sent the state of an instance, or a part of it.
 
         Raises:
             MessageRefused: it is none of its instances.
@@ -103,7 +105,14 @@ class Checkpoints:
         if own.instance not in [item.name for item in self._states.plan.nodes[node].instances]:
             raise MessageRefused(f"'{own.instance}' is no instance of it")
         if point == self._states.saves_at:
-            self._found[own.instance] = own
+            self._came.setdefault(own.instance, bytearray()).extend(own.state)
+            if sum(map(len, self._came.values())) > MAX_STATES_SIZE:
+                error = CallRefused(
+                    f"with its state, all take more than {MAX_STATES_SIZE} bytes", instance=own.instance
+                )
+                own = InstanceState(own.instance, error=error.report())
+            if not own.more:
+                self._found[own.instance] = own
 
     def settle(self, now: float) -> None:
         """Go on if all states are there, or if there will be no checkpoint."""
@@ -129,7 +138,7 @@ class Checkpoints:
             if self._every_s is not None:
                 took_s = now - (self._stands_since if self._stands_since is not None else now)
                 self._due_at = now + max(self._every_s, _LEAST_TIMES * took_s)
-            self._complete = at, {name: found[name].state for name in states.plan.system.instances}
+            self._complete = at, {name: bytes(self._came.pop(name)) for name in states.plan.system.instances}
         elif now - (self._stands_since if self._stands_since is not None else math.inf) > limit_s:
             nodes = sorted({states.plan.node_of(name) for name in missing})
             text = f"the states of {spoken(*nodes)} at point {at} have not come within {limit_s:g} s"
@@ -156,6 +165,7 @@ class Checkpoints:
 
     def give_up(self, error: FmuMeshError) -> None:
         """There is no checkpoint, and why; nothing happens if none is under way."""
+        self._came.clear()
         if self._states.saves_at is not None:
             self._states.saved()
             if self._every_s is not None:

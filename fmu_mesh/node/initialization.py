@@ -15,6 +15,7 @@ from typing import NamedTuple
 from ..awake import AwakeClock
 from ..errors import DeadlineExceeded, InitializationFailed, ProtocolBroken
 from ..rings.array_elements import element_of, merged
+from ..rings.packed_member import PackedMember
 from ..rings.value_change import ValueChange
 from ..simtime import ENDLESS
 from ..system.algebraic_loop import FixedPoint
@@ -22,6 +23,7 @@ from ..system.feeds import FeedColumn
 from ..system.initialization_plan import Loop
 from ..system.layout import Column
 from ..system.plan import InstancePlan, Link, NodePlan
+from ..system.states import BeginsWith
 from ..variables.value_types import PlainValue, Value, split_element
 from ..wire.frames import initial_values
 from .links import OutLink
@@ -83,6 +85,7 @@ class Initialization:
         self._known: dict[tuple[str, str, int | None], Value] = {}
         self._settled: set[Key] = set()
         self._parameters: dict[Key, str] = {}
+        self._rows: dict[str, dict[str, Value]] = {}  # of the states of instances beside those that begin anew
         self._clock, self._end = AwakeClock(), 0.0
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
@@ -98,8 +101,12 @@ class Initialization:
         start_values: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
         *,
         again: bool = False,
+        begins_with: BeginsWith | None = None,
     ) -> None:
         """Take all instances through Initialization Mode; afterwards their outputs are those of point 0.
+
+        An instance that begins anew beside others with states does so at the first point of the run: what the others
+        give it are the rows in their states.
 
         May be called again for another run, but not after an exception.
 
@@ -107,17 +114,15 @@ class Initialization:
             runners: the instances.
             start_values: by instance and variable, those that are not as in the plan.
             again: whether the instances were bound for an earlier run.
+            begins_with: the states that the instances will get.
 
         Raises:
             DeadlineExceeded: the initial value of another node did not come in time.
             FmuError: an FMU refused a value.
             LoopNotConverged: a loop has no consistent values.
         """
-        start_time = self._plan.grid.start_time
         for runner in runners:
-            own, others = runner.plan.start_values, start_values.get(runner.name)
-            stop_time = self._stop_times[runner.plan.step_points]
-            runner.instance.enter_initialization(start_time, stop_time, {**own, **others} if others else own)
+            self._enter(runner, start_values.get(runner.name, {}), begins_with or BeginsWith())
         self._end = self._clock() + self._plan.timeouts.initialize
         for level in self._sequence:
             if level in self._loops:
@@ -131,11 +136,23 @@ class Initialization:
             if self._moves[runner.name]:
                 self._set_inputs(runner, ENDLESS)
         self.out_links.clear()
-        for values_of_run in (self._known, self._settled, self._parameters):
+        for values_of_run in (self._known, self._settled, self._parameters, self._rows):
             values_of_run.clear()
         for runner in runners:
             runner.instance.exit_initialization()
             runner.bind_again() if again else runner.bind()
+
+    def _enter(self, runner: Runner, others: Mapping[str, PlainValue], begins: BeginsWith) -> None:
+        grid, name, anew = self._plan.grid, runner.name, begins.anew.get(runner.name)
+        if anew is not None:
+            runner.begin_at(grid.first_point // runner.plan.step_points)
+        elif begins.anew:
+            state = PackedMember.decoded(begins.states[name], name)
+            self._rows[name] = state.last_row(runner.plan.outputs, name)
+        start_time = grid.time(grid.first_point) if anew is not None else grid.start_time
+        own = runner.plan.start_values
+        values = {**own, **(anew or {}), **others} if anew or others else own
+        runner.instance.enter_initialization(start_time, self._stop_times[runner.plan.step_points], values)
 
     def _iterate(self, loop: Loop, runners: Collection[Runner]) -> None:
         """Iterate the levels of a loop until its values are consistent."""
@@ -231,6 +248,8 @@ class Initialization:
 
     def _get_outputs(self, runner: Runner, names: Sequence[str], sweep: int | None = None) -> dict[str, Value]:
         values = dict(zip(names, runner.instance.get_values(names), strict=True))
+        if (row := self._rows.get(runner.name)) is not None:
+            values = {name: row.get(name, value) for name, value in values.items()}
         self._known |= {(runner.name, name, sweep): value for name, value in values.items()}
         return values
 

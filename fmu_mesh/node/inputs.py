@@ -95,6 +95,7 @@ class TimedInputs(AroundNativeSteps):
         warn: called with the first fallback of each input.
 
     Attributes:
+        last: when inputs with a timeout got their last values.
         late: the inputs without a value for too long, and the own steps of their last values; for any thread.
         python_at: the next own step that `do_step` has to take, because a value may change in it.
         tracks: inputs that change in each step before it: where each lies in the row of inputs, and its values.
@@ -116,7 +117,7 @@ class TimedInputs(AroundNativeSteps):
         self._asked: list[Callable[[], None]] = []
         self._recorded = iter(recorded)
         self._next = next(self._recorded, None)
-        self._last = LastValues(timeouts, courses, instance.description)
+        self.last = LastValues(timeouts, courses, instance.description)
         self._warn, self._timeouts = warn, {own.variable: own for own in timeouts}
         self._unwarned = {*self._timeouts}
         self.late: dict[str, int] = {}
@@ -132,8 +133,7 @@ class TimedInputs(AroundNativeSteps):
         self._trajectories: dict[str, Trajectory] = {}
         self._used: dict[str, Value] = {}
         self._grid: TimeGrid  # from `start` on
-        self._points = 1
-        self._step = 0
+        self._points, self._step = 1, 0
 
     def bind(self, inputs: Ring, outputs: Sequence[Ring], grid: TimeGrid, points: int, step: int = 0) -> None:
         """Bind the inner instance. From now on there is a time."""
@@ -202,7 +202,7 @@ class TimedInputs(AroundNativeSteps):
         is_needed_now = name in self._courses or when <= own.last if name in self._tracked else own.linear
         # The value that it has fallen back to is as if it had been sent, and would be newer than one with a past time.
         own.add(max(when, now) if name in self.late else when, value)
-        self._last.came(name, step)
+        self.last.came(name, step)
         self.python_at = min(self.python_at, self._step if is_needed_now else step)
         return step
 
@@ -223,7 +223,7 @@ class TimedInputs(AroundNativeSteps):
         for ask in self._asked:
             ask()
         changes = {name: value for name, own in self._courses.items() if (value := own.change(step)) is not None}
-        if self._last.sent:
+        if self.last.sent:
             changes |= self._fall_back(step, time)
         for name, value in changes.items():
             if name in self._trajectories:
@@ -253,8 +253,8 @@ class TimedInputs(AroundNativeSteps):
         """What inputs fall back to in own step ``step``, which begins at ``time`` (s)."""
         for name, own in self._trajectories.items():
             if own.linear and own.after(time + self._grid.rounding(time)) is not None:
-                self._last.came(name, step)  # a line to a later value
-        values, self.late = self._last.fall_back(step), self._last.late(step)
+                self.last.came(name, step)  # a line to a later value
+        values, self.late = self.last.fall_back(step), self.last.late(step)
         for name in [name for name in self._timeouts if name in self._unwarned and name in self.late]:
             self._unwarned.remove(name)
             timeout, point = self._timeouts[name], self.late[name] * self._points
@@ -282,7 +282,7 @@ class TimedInputs(AroundNativeSteps):
         }
         others = [change for name, change in (*changes.items(), *sent.items()) if name not in {*soon, *came}]
         recorded = self._next[1] // self._points if self._next is not None else ENDLESS
-        others += self._last.next(step), recorded
+        others += self.last.next(step), recorded
         end = min([*others, *came.values(), step + _AHEAD])
         self.tracks, self._tracked, self.tracks_from = [], [], step
         if not (soon or came) or end - step < _LEAST:
@@ -316,7 +316,7 @@ class TimedInputs(AroundNativeSteps):
             FmuError: the inputs get values of keys, or the inner instance has no states.
         """
         trajectories = {name: own.save() for name, own in self._trajectories.items()}
-        sent = {name: [*steps] for name, steps in self._last.sent.items()}
+        sent = {name: [*steps] for name, steps in self.last.sent.items()}
         unwarned = tuple(sorted(self._unwarned))
         own = _OverTime(self._step, trajectories, dict(self._used), sent, dict(self.late), unwarned)
         return _TimedState(super().get_state(), own)
@@ -330,7 +330,7 @@ class TimedInputs(AroundNativeSteps):
             name: Trajectory(linear=kept.linear, saved=kept) for name, kept in own.trajectories.items()
         }
         self._used, self.late, self._unwarned = dict(own.used), dict(own.late), {*own.unwarned}
-        self._last.sent.update((name, [*steps]) for name, steps in own.sent.items())
+        self.last.sent.update((name, [*steps]) for name, steps in own.sent.items())
         self._step = self.python_at = own.step
         self.tracks, self._tracked = [], []
 
@@ -366,8 +366,8 @@ class TimedInputs(AroundNativeSteps):
         known = packed_member
         if known.over_time:
             return msgspec.msgpack.encode((msgspec.Raw(known.over_time), known.state))
-        self._last.sent.update((name, [*steps]) for name, steps in known.sent.items())
-        late = self._last.late(known.step - 1)
+        self.last.sent.update((name, [*steps]) for name, steps in known.sent.items())
+        late = self.last.late(known.step - 1)
         unwarned = tuple(sorted(self._timeouts.keys() - late.keys()))
         return packed(_OverTime(known.step, {}, {}, known.sent, late, unwarned), known.state)
 

@@ -310,7 +310,7 @@ class Node:
         """Initialization Mode: set, get and exchange values level by level; then the outputs are those of point 0."""
         self._activity.enter("initializing")
         plan = self._plan
-        self._initialization.run(self._runners.values())
+        self._initialization.run(self._runners.values(), begins_with=self._begins_with)
         load_states(self._begins_with, self._runners)
         units = [[self._runners[name] for name in names] for names in plan.units]
         self._engine = engine = self._make_engine(

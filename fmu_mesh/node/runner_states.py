@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import cast
 
 from msgspec.structs import replace
@@ -12,7 +13,7 @@ from ..instances.contract import KeepsState
 from ..rings.packed_member import PackedMember, columns_of, put_columns
 from ..system.states import BeginsWith
 from ..variables.value_conversion import to_value
-from ..wire.messages import MAX_STATE_SIZE, InstanceState, encode_state
+from ..wire.messages import InstanceState, encode_state
 from .inputs import TimedInputs, set_input
 from .stepping import Runner
 
@@ -27,6 +28,9 @@ def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
     """
     for name, data in begins_with.states.items():
         _load(runners[name], data)
+    for name in begins_with.anew.keys() & runners.keys():
+        if isinstance(timed := runners[name].instance, TimedInputs):
+            timed.last.count_from(runners[name].step)
 
 
 def set_again(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
@@ -42,7 +46,7 @@ def set_again(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
             set_input(runners[name], own, to_value(value, variables[own]), None)
 
 
-def state_messages(runners: Mapping[str, Runner], at: int) -> list[bytes] | None:
+def state_messages(runners: Mapping[str, Runner], at: int) -> Iterable[bytes] | None:
     """The states of all runners at the point of a checkpoint, as messages; None before that point.
 
     The master cannot go on without an answer: where an instance has no state to send, it gets the reason. After that
@@ -51,16 +55,15 @@ def state_messages(runners: Mapping[str, Runner], at: int) -> list[bytes] | None
     points = [runner.point for runner in runners.values()]
     if min(points) < at:
         return None
-    messages = []
-    for name, runner in runners.items() if max(points) == at else ():
-        try:
-            own = InstanceState(name, _packed(runner))
-            if (size := len(own.state)) > MAX_STATE_SIZE:
-                raise FmuError(f"its state takes {size} bytes; the limit is {MAX_STATE_SIZE}", instance=name)  # noqa: TRY301  as from an FMU
-        except FmuError as error:
-            own = InstanceState(name, error=error.at(at, runner.grid.time(at)).report())
-        messages.append(encode_state(own, at))
-    return messages
+    return chain.from_iterable(_state_of(own, at) for own in (runners.values() if max(points) == at else ()))
+
+
+def _state_of(runner: Runner, at: int) -> Iterable[bytes]:
+    try:
+        own = InstanceState(runner.name, _packed(runner))
+    except FmuError as error:
+        own = InstanceState(runner.name, error=error.at(at, runner.grid.time(at)).report())
+    return encode_state(own, at)
 
 
 def _packed(runner: Runner) -> bytes:
@@ -92,9 +95,7 @@ def _load(runner: Runner, data: bytes) -> None:
     own, grid, name = PackedMember.decoded(data, runner.name), runner.grid, runner.name
     if (at := own.step * runner.plan.step_points) != grid.first_point:
         raise FmuError(f"its state is of point {at}, and the run begins at point {grid.first_point}", instance=name)
-    runner.table.note(step=own.step)
-    for link in runner.out_links:
-        link.begin_at(own.step)
+    runner.begin_at(own.step)
     runner.bind()
     if own.over_time and not isinstance(runner.instance, TimedInputs):
         timed = TimedInputs(runner.instance, "hold")

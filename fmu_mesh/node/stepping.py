@@ -100,6 +100,12 @@ class Runner:
         self.is_finite = FiniteRows(plan, outputs, self.inputs)
         self.follow(native.MemberTable())
 
+    def begin_at(self, step: int) -> None:
+        """The run begins after so many own steps: call before `bind`."""
+        self.table.note(step=step)
+        for link in self.out_links:
+            link.begin_at(step)
+
     def bind(self) -> None:
         """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode.
 
@@ -136,8 +142,7 @@ class Runner:
         Raises:
             NotFinite: one is not finite.
         """
-        if self.step == 0:
-            self.is_finite.check_first(self.grid, self.instance.get_values)
+        self.is_finite.check_first(self.step, self.grid, self.instance.get_values)
         self.outputs.stamp(self.step)
         self.counter.raise_to(self.step + 1)
 

@@ -38,7 +38,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
 from pathlib import Path
 from types import TracebackType
-from typing import Self, cast
+from typing import Self
 
 import zenoh
 from msgspec import to_builtins
@@ -173,7 +173,7 @@ class Recorder:
         self._membership = Membership(plan, session, self._inbox, launch, self._router, memory=memory)
         self._put_progress: Callable[[bytes], None]
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
-        self._clock, self._watched, self._watched_at = AwakeClock(), cast("object", None), 0.0
+        self._clock = AwakeClock()
 
     @property
     def files(self) -> tuple[tuple[str, int], ...]:
@@ -214,14 +214,11 @@ class Recorder:
         Raises:
             DeadlineExceeded: one has not returned for `timeouts.write`. The thread stays in it.
         """
-        now, writing = self._clock(), self._files.writing
-        if writing is not self._watched:
-            self._watched, self._watched_at = writing, now
-        elif writing is not None and (blocked_s := now - self._watched_at) > self._plan.timeouts.write:
-            text = f"'{writing[0]}' has not taken what the recorder writes for {blocked_s:.1f} s"
-            hint = "Does its file system answer? `timeouts.write` limits it."
+        try:
+            self._files.check_writing(self._clock(), self._plan.timeouts.write)
+        except DeadlineExceeded as error:
             point = max(self._written - 1, 0)
-            raise DeadlineExceeded(text, point=point, time=self._plan.grid.time(point), hint=hint)
+            raise error.at(point, self._plan.grid.time(point))  # noqa: B904  it is the same error
 
     def _finish(self, error: BaseException | None, last: Future[None]) -> None:
         """Write all that is complete after the end, and close the files."""

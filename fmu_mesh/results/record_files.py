@@ -23,7 +23,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from ..config.loading import LoadedConfig
-from ..errors import ConfigurationError
+from ..errors import ConfigurationError, DeadlineExceeded
 from ..files import Kept, is_file, open_alone, unwritable
 from ..simtime import TimeGrid
 from ..system.coupling_rule import Consistent
@@ -108,15 +108,14 @@ class RecordFiles:
 
     Attributes:
         in_memory: whether no file has a path.
-        writing: the file that the thread of this object writes or closes just now, another tuple for each call; None:
-            none. For any thread.
     """
 
     def __init__(
         self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
     ) -> None:
         self._growth = growth
-        self.writing: tuple[Path] | None = None
+        self._writing: tuple[Path] | None = None  # the file of the call under way, another tuple for each
+        self._watched: tuple[tuple[Path] | None, float] = None, 0.0
         self._files = [
             _RecordFile(file, notes / _note_of(number) if notes is not None else None)
             for number, file in enumerate(files)
@@ -215,17 +214,30 @@ class RecordFiles:
             self._keys.close()
         self._raise_first([(own, self._write_to(own.file.path, own.close)) for own in self._files])
 
+    def check_writing(self, now: float, limit_s: float) -> None:
+        """From another thread, at least twice a second: look whether each call returns in time; ``now`` is in s.
+
+        Raises:
+            DeadlineExceeded: one has not returned for ``limit_s``. Its thread stays in it.
+        """
+        writing, (watched, since) = self._writing, self._watched
+        if writing is not watched:
+            self._watched = writing, now
+        elif writing is not None and now - since > limit_s:
+            text = f"'{writing[0]}' has not taken what the recorder writes for {now - since:.1f} s"
+            raise DeadlineExceeded(text, hint="Does its file system answer? `timeouts.write` limits it.")
+
     def _each(self, call: Callable[[_RecordFile], None]) -> None:
         """Do something with each file that can be written; then raise the first error."""
         if any(errors := [self._write_to(own.file.path, partial(own.tried, call)) for own in self._files]):
             self._raise_first([*zip(self._files, errors, strict=True)])
 
     def _write_to(self, path: Path, call: Callable[[], Result]) -> Result:
-        self.writing = (path,)
+        self._writing = (path,)
         try:
             return call()
         finally:
-            self.writing = None
+            self._writing = None
 
     @staticmethod
     def _raise_first(done: Sequence[tuple[_RecordFile, OSError | None]]) -> None:

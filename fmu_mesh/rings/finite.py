@@ -45,14 +45,14 @@ class FiniteRows:
         self.spans = [Span(start, count, NUMBER_TYPES[type_]) for type_, start, _, count in runs]
         self.check = _check(outputs, runs)
 
-    def check_first(self, grid: TimeGrid, get: Get) -> None:
+    def check_first(self, row: int, grid: TimeGrid, get: Get) -> None:
         """Check the row of the first point; ``get`` reads the inputs.
 
         Raises:
             NotFinite: it is not finite.
         """
-        if not self.check(0):
-            error = self.error(0, grid)
+        if not self.check(row):
+            error = self.error(row, grid)
             self.explain(error, get)
             raise error
 

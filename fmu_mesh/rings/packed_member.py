@@ -11,6 +11,8 @@ from typing import Annotated, Any, Self
 import msgspec
 
 from ..errors import FmuError
+from ..system.layout import Layout
+from ..variables.value_types import Value
 from .ring import Ring, Rows
 
 __all__ = ["PackedMember", "columns_of", "put_columns"]
@@ -57,6 +59,16 @@ class PackedMember(msgspec.Struct, frozen=True, forbid_unknown_fields=True, arra
             return msgspec.msgpack.decode(data, type=cls)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise FmuError(f"this is no state of an instance: {error}", instance=instance) from error
+
+    def last_row(self, layout: Layout, instance: str) -> dict[str, Value]:
+        """The outputs of this layout that its newest row has.
+
+        Raises:
+            FmuError: the values are none of these columns.
+        """
+        ring = Ring(layout, 1)
+        missing = put_columns(ring, ring.parts, [self.step], self.outputs, instance)
+        return {name: ring.value(self.step, name) for name in layout.names if name not in missing}
 
 
 def columns_of(ring: Ring, parts: Rows, rows: Sequence[int]) -> Columns:

@@ -43,12 +43,14 @@ class _Question(NamedTuple):
 def with_feedthrough(
     system: ResolvedSystem, sections: Mapping[str, InstanceSection], findings: Findings, warnings: Findings
 ) -> ResolvedSystem:
-    """The system with the derivatives of outputs by inputs; warns where one is not known.
+    """The system with the derivatives of outputs by inputs, if loops are solved; warns where one is not known.
 
     Raises:
         ConfigurationError: a cycle needs one that is not known, or one that is given has a wrong name. It has the
             ``findings``.
     """
+    if system.config.simulation.loops == "delayed":
+        return system
     questions = _questions(system)
     with ThreadPoolExecutor(_AT_ONCE) as threads:
         answers = threads.map(lambda name: _answer(system, sections, name, questions[name], findings), questions)

@@ -129,8 +129,9 @@ class HostedSystem:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
-        self._initialization.run(self.runners.values(), start_values, again=engine is not None)
-        load_states(self._begins_with, self.runners)
+        begins, again = self._begins_with, engine is not None
+        self._initialization.run(self.runners.values(), start_values, again=again, begins_with=begins)
+        load_states(begins, self.runners)
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point
             engine = self._engine = make_engine(node, units, self.memory, spins=False)

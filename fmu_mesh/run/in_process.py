@@ -4,10 +4,11 @@
 a second where an FMU does not return.
 """
 
-# Who meets here (ADR 12, 73). The thread that called `InProcessRun.run` only waits. A thread of the run does all the
-# work, and alone calls FMUs. The thread of `CallWatch` takes a hang: the thread of the run is inside an FMU then and
-# changes nothing, so that the rows can be saved from outside. `interrupt` may come from any thread or a signal handler;
-# a thread "grace" gives up if the run does not come to its next point.
+# Who meets here (ADR 12, 73). A thread of the run does all the work, and alone calls FMUs. The thread that called
+# `InProcessRun.run` waits, and looks whether each write returns in time (ADR 89). The thread of `CallWatch` takes a
+# hang: the thread of the run is inside an FMU then and changes nothing, so that the rows can be saved from outside.
+# `interrupt` may come from any thread or a signal handler; a thread "grace" gives up if the run does not come to its
+# next point.
 #
 # What may go wrong: a call into an FMU that does not return cannot be ended from within a process. Then the run is over
 # for whoever waits for it, what was recorded is kept, and the thread is left. Neither signal handlers nor the process
@@ -26,7 +27,8 @@ from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 
-from ..errors import FmuMeshError, Interrupted
+from ..awake import AwakeClock
+from ..errors import DeadlineExceeded, FmuMeshError, Interrupted
 from ..files import remove_tree
 from ..instances.call_guard import ENDED
 from ..instances.contract import LogMessage
@@ -77,11 +79,14 @@ class InProcessRun:
             FmuMeshError: the run ended early, and why.
         """
         threading.Thread(target=self._work, name=f"run of {self._run.mesh}", daemon=True).start()
-        self._over.wait()
+        clock = AwakeClock()
+        while not self._over.wait(_STATUS_S):
+            self._check_writing(clock())
         if self._error is not None:
             if isinstance(self._error, FmuMeshError):
                 runs = self._runs
-                point, files, warnings = (runs.point, runs.files, runs.warnings) if runs is not None else (0, (), ())
+                point, warnings = (runs.point, runs.warnings) if runs is not None else (0, ())
+                files = runs.writer.counted if runs is not None and runs.writer is not None else ()
                 self.outcome = outcome_at(self._run.plan, point, files, self._error, warnings=warnings)
                 self._on_event(self.outcome)
             raise self._error
@@ -95,6 +100,17 @@ class InProcessRun:
         if self._runs is not None:
             self._runs.interrupt("interrupted")
         threading.Thread(target=self._give_up, name="grace", daemon=True).start()
+
+    def _check_writing(self, now: float) -> None:
+        """On the thread that waits: if a disk does not take what is written, the run is over."""
+        if (runs := self._runs) is None or (writer := runs.writer) is None:
+            return
+        try:
+            writer.check_writing(now, self._run.plan.system.config.timeouts.write)
+        except DeadlineExceeded as error:
+            runs.interrupt("a write has not returned")  # if it does later, nothing goes on
+            self._take(error.at(runs.point, self._run.plan.grid.time(runs.point)))
+            self._leave()
 
     def _work(self) -> None:
         plan = self._run

@@ -59,6 +59,7 @@ class LocalMember:
         self._courses: dict[str, Course] = {}
         self._last = LastValues((), {}, instance.description)
         self._parameters: dict[str, str] = {}
+        self._given: dict[str, Value] = {}
         self.settled: set[str] = set()
         self.step, self._set_at = 0, -1
         self._setters: dict[str, Callable[[Value], None]] = {}
@@ -73,6 +74,7 @@ class LocalMember:
         self.step, self._set_at = 0, -1
         self.settled.clear()
         self._parameters.clear()
+        self._given.clear()
         for ring in (self._inputs, self._outputs):
             ring.clear()
         return True
@@ -107,6 +109,17 @@ class LocalMember:
         if values:
             self.instance.set_values(values)
 
+    def begin_at(self, point: int, data: bytes | None) -> None:
+        """Begin anew at a point, or beside those that do: then its outputs there are those of the state ``data``."""
+        if data is None:
+            self.step = point // self._points
+        else:
+            self._given.update(PackedMember.decoded(data, self.plan.name).last_row(self.plan.outputs, self.plan.name))
+
+    def initial_output(self, name: str) -> Value:
+        """The value of an output in Initialization Mode."""
+        return self._given[name] if name in self._given else self.instance.get_values([name])[0]
+
     def _has(self, parameter: str, value: Value) -> bool:
         """Whether a connected parameter has this value already; FMI 1.0 cannot set it a second time."""
         before = self._parameters.get(parameter)
@@ -118,11 +131,12 @@ class LocalMember:
         self._grid = grid
         self._courses = courses_of(self.plan.scenario, self.instance.description, grid, self._points)
         self._last = LastValues(self.plan.timeouts, self._courses, self.instance.description)
+        if self.step:
+            self._last.count_from(self.step)
         names = [column.name for column in self._inputs.layout.columns if column.shape or column.name in self._courses]
         for name, value in zip(names, self.instance.get_values(names) if names else [], strict=True):
             self._inputs.put(0, name, value)  # elements that are not connected keep it
-        self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points)
-        self.is_finite.check_first(grid, self.instance.get_values)
+        self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points, self.step)
         self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
         self._do_step = self.instance.do_step
         self._setters.clear()

@@ -27,6 +27,8 @@ from ..rings.value_change import ValueChange
 from ..system.algebraic_loop import FixedPoint
 from ..system.initialization_plan import Loop
 from ..system.plan import Plan
+from ..system.states import BeginsWith
+from ..variables.value_conversion import to_value
 from ..variables.value_types import PlainValue, Value
 from .local_member import LocalMember, SavedMember, element_at
 from .run_plan import opening_in
@@ -70,6 +72,8 @@ class LocalSystem:
         open_instance: Callable[[str], Guarded],
         plan: Plan | None = None,
         start_values: Mapping[str, Mapping[str, PlainValue]] = MappingProxyType({}),
+        begins_with: BeginsWith | None = None,
+        point: int = 0,
     ) -> None:
         """Open all instances and initialize them; then they are at point 0. Those of before are closed first.
 
@@ -77,9 +81,11 @@ class LocalSystem:
             open_instance: opens an instance by name; it is closed here.
             plan: replaces that of before; it has the same instances, with other start values.
             start_values: by instance and variable, those that are not as in the plan.
+            begins_with: states that a system of an equal plan has written by `packed`, or a run; None: there are none.
+            point: the point of these states, where the system is then.
 
         Raises:
-            FmuError: an instance cannot be opened or initialized.
+            FmuError: an instance cannot be opened or initialized, or cannot use its state.
         """
         self.point, self.stepping, self._look_at = 0, "", 0
         self._plan = plan = plan or self._plan
@@ -95,7 +101,11 @@ class LocalSystem:
                 self._members = before | members
             self._members = members
             self._limit_threads()  # with the libraries that a component has imported
-            self._initialize(start_values)
+            begins = begins_with or BeginsWith()
+            self._initialize(start_values, begins, point)
+            self._load(begins, point)
+            for member in members.values():
+                member.is_finite.check_first(member.step, self._grid, member.instance.get_values)
         self._steps = tuple((name, member.step_from) for name, member in self._members.items())
         self._looked_after = tuple((name, partial(self._look_after, step)) for name, step in self._steps)
 
@@ -197,15 +207,12 @@ class LocalSystem:
         """
         return {name: self._members[name].packed(own) for name, own in saved.members.items()}
 
-    def load(self, point: int, states: Mapping[str, bytes]) -> None:
-        """Go to a state of `packed`, which a system of an equal plan has written at this point.
-
-        Raises:
-            FmuError: an instance cannot use its state.
-        """
-        members = self._members
-        for self.stepping, member in members.items():
-            member.load(states[self.stepping])
+    def _load(self, begins_with: BeginsWith, point: int) -> None:
+        for self.stepping, data in begins_with.states.items():
+            self._members[self.stepping].load(data)
+        for name, values in begins_with.set_again.items():
+            variables = {v.name: v for v in self._plan.system.instances[name].description.variables}
+            self.set(name, {own: to_value(value, variables[own]) for own, value in values.items()})
         self.point, self.stepping = point, ""
 
     def free(self, saved: SavedSystem) -> None:
@@ -243,14 +250,19 @@ class LocalSystem:
         for name, own in saved.members.items():
             self._members[name].instance.free_state(own.state)
 
-    def _initialize(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> None:
-        grid, members = self._grid, self._members
-        for member in members.values():
-            stop_time = grid.told_stop_time(member.plan.step_points)
-            values = {**member.plan.start_values, **start_values.get(member.plan.name, {})}
-            member.instance.enter_initialization(grid.start_time, stop_time, values)
-        levels = self._plan.initialization.levels
+    def _initialize(
+        self, start_values: Mapping[str, Mapping[str, PlainValue]], begins_with: BeginsWith, point: int
+    ) -> None:
+        grid, members, anew = self._grid, self._members, begins_with.anew
         known: dict[tuple[str, str], Value] = {}
+        for name, member in members.items():
+            start_time = grid.time(point) if name in anew else grid.start_time
+            stop_time = grid.told_stop_time(member.plan.step_points)
+            values = {**member.plan.start_values, **anew.get(name, {}), **start_values.get(name, {})}
+            member.instance.enter_initialization(start_time, stop_time, values)
+            if anew:
+                member.begin_at(point, begins_with.states.get(name))
+        levels = self._plan.initialization.levels
         loops = iter((*self._plan.initialization.loops, None))
         loop = next(loops)
         for (name, variable), level in sorted(levels.items(), key=lambda item: item[1]):
@@ -259,7 +271,7 @@ class LocalSystem:
                 loop = next(loops)
             if (name, variable) not in known:
                 members[name].set_initial_inputs(known)
-                known[(name, variable)] = members[name].instance.get_values([variable])[0]
+                known[(name, variable)] = members[name].initial_output(variable)
         for member in members.values():
             member.set_initial_inputs(known)
         for member in members.values():
@@ -277,7 +289,7 @@ class LocalSystem:
             known.update(before)
             for name, variable in loop.outputs:
                 members[name].set_initial_inputs(known, point.assumed)
-                known[(name, variable)] = members[name].instance.get_values([variable])[0]
+                known[(name, variable)] = members[name].initial_output(variable)
             brought = []
             for tear in loop.tears:
                 ends = tear.target, tear.input

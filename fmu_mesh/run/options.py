@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BatchOptions",
+    "BeginOptions",
     "OpenOptions",
     "PlanOptions",
     "RerunOptions",
     "RunOptions",
     "SimulateOptions",
     "StartOptions",
-    "State",
     "VariantOptions",
 ]
 
@@ -72,7 +72,17 @@ class VariantOptions(CallOptions, frozen=True, kw_only=True):
     on_notice: OnNotice = None
 
 
-class OpenOptions(VariantOptions, frozen=True):
+class BeginOptions(VariantOptions, frozen=True, kw_only=True):
+    """With which state it begins."""
+
+    state: State = None
+    replaced: Annotated[
+        Sequence[str],
+        Option("begin this instance anew in that state, also with another model", "--replace", "INSTANCE"),
+    ] = ()
+
+
+class OpenOptions(BeginOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
@@ -97,7 +107,7 @@ class BatchOptions(VariantOptions, frozen=True):
     memory_limit: MemoryLimit = MEMORY_LIMIT
 
 
-class PlanOptions(VariantOptions, frozen=True, kw_only=True):
+class PlanOptions(BeginOptions, frozen=True, kw_only=True):
     """What `Mesh.plan` and `Mesh.check` take; each option of the configuration replaces its key for this run.
 
     Example:
@@ -118,7 +128,6 @@ class PlanOptions(VariantOptions, frozen=True, kw_only=True):
     scenario: Annotated[
         File | Mapping[str, Any], Option("values over time: a file, or what such a file has", "--scenario", "FILE")
     ] = None
-    state: State = None
     listen: Annotated[Sequence[str] | None, Option(None, "--listen", "ENDPOINT", "zenoh.listen")] = None
     connect: Annotated[Sequence[str] | None, Option(None, "--connect", "ENDPOINT", "zenoh.connect")] = None
     security: Annotated[

@@ -189,8 +189,7 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
-    if loaded.config.simulation.loops == "solved":
-        system = with_feedthrough(system, sections, loaded.findings(), warnings)
+    system = with_feedthrough(system, sections, loaded.findings(), warnings)
     _check_host(loaded.config, obstacles, warnings)
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
@@ -207,7 +206,8 @@ def planned(
         connect=tuple(options.connect or ()),
     )
     obstacles.raise_any(run)
-    return StateFile.read(Path(options.state)).begin(run) if options.state is not None else run
+    state = StateFile.of(options)
+    return state.begin(run, options.replaced) if state is not None else run
 
 
 def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:

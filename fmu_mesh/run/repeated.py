@@ -172,9 +172,9 @@ class RepeatedRuns:
         return self._run.writer.warnings if self._run is not None else ()
 
     @property
-    def files(self) -> tuple[tuple[str, int], ...]:
-        """Each result file of the last run, and the number of its rows."""
-        return self._run.writer.counted if self._run is not None else ()
+    def writer(self) -> RowWriter | None:
+        """What writes the rows of the last run; None: there was none."""
+        return self._run.writer if self._run is not None else None
 
     def save(self, error: FmuMeshError) -> None:
         """From another thread, where that of the runs does not return from a model: keep all complete rows.

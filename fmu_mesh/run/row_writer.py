@@ -107,6 +107,10 @@ class RowWriter:
                 self._files.flush()
             self._flushed = now if is_late else self._flushed
 
+    def check_writing(self, now: float, limit_s: float) -> None:
+        """See `RecordFiles`."""
+        self._files.check_writing(now, limit_s)
+
     def note_event(self, what: str, instance: str, point: int, message: str) -> None:
         """See `RecordFiles`; from any thread."""
         with self._writing:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -25,16 +25,28 @@ import msgspec
 from msgspec.structs import replace
 
 from .. import __version__, files
-from ..errors import ConfigurationError, Finding
+from ..errors import CallRefused, ConfigurationError, Finding
 from ..files import Kept
-from ..system.plan import RECORDER
+from ..system.plan import RECORDER, make_plan
 from ..system.records import RecordPlan
+from ..system.series_files import courses_of
 from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
-from ..text import short_number
+from ..text import nearest, option_text, short_number
+from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
+from .options import BeginOptions
 from .run_plan import RunPlan
 
-__all__ = ["STATE", "StateFile", "again_from_checkpoint", "drop_older", "keeper", "state_bytes", "write_state"]
+__all__ = [
+    "STATE",
+    "StateFile",
+    "again_from_checkpoint",
+    "drop_older",
+    "keeper",
+    "state_bytes",
+    "with_replaced",
+    "write_state",
+]
 
 STATE: Final = ".state"
 """How the names of checkpoints in the folder of a run end."""
@@ -62,6 +74,19 @@ class StateFile(NamedTuple):
     file: Path
     head: _Head
     states: Mapping[str, bytes]
+
+    @classmethod
+    def of(cls, options: BeginOptions) -> Self | None:
+        """The state with which a run begins, if its options name one; errors as of `read`.
+
+        Raises:
+            CallRefused: instances are replaced without a state.
+        """
+        if options.state is None and options.replaced:
+            raise CallRefused(
+                f"{option_text('replaced', options.replaced)} needs a state", hint="Give it by `state=...`."
+            )
+        return cls.read(Path(options.state)) if options.state is not None else None
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -102,13 +127,13 @@ class StateFile(NamedTuple):
             raise damaged
         return cls(file, known, states)
 
-    def check(self, run: RunPlan) -> dict[str, dict[str, PlainValue]]:
-        """Check that a run can go on from here; returns the start values to set, by instance and variable.
+    def check(self, run: RunPlan) -> BeginsWith:
+        """Check that a run can go on from here; returns the states, and what is set besides.
 
         Raises:
             ConfigurationError: what must agree does not; carries all differences.
         """
-        grid, head, findings = run.plan.grid, self.head, []
+        grid, head, findings, system = run.plan.grid, self.head, list[Finding](), run.plan.system
         for what in ("start_time", "step_size"):
             if (was := getattr(head, what)) != (now := getattr(grid, what)):
                 text = f"was {short_number(was)} s where the state was written, and is {short_number(now)} s"
@@ -121,25 +146,40 @@ class StateFile(NamedTuple):
         if findings:
             text = f"the state '{self.file}' is not one of this mesh"
             hint = "Open the mesh as it was when the state was written; tunable parameters and free inputs may differ."
+            if other := next((name for name, why in refused if why.startswith("model: ")), None):
+                option = option_text("replaced", [other])
+                hint += f" With {option}, an instance with another model of the same interface begins anew there."
             raise ConfigurationError(text, findings=tuple(findings), hint=hint)
-        return values
+        if system.replaced:
+            self._check_point(run, {})
+        anew = {name: _prescribed(run, name, head.point) for name in system.replaced}
+        return BeginsWith({name: own for name, own in self.states.items() if name not in anew}, values, anew)
 
-    def begin(self, run: RunPlan) -> RunPlan:
+    def _check_point(self, run: RunPlan, lost: Mapping[str, str]) -> None:
+        """Check that each instance has a point of its own here, and that none has ``lost`` its state; by name, why."""
+        instances, point = run.plan.system.instances, self.head.point
+        whys = [
+            (name, f"its step is {own.step_points} points, and the state is of point {point}, within one")
+            for name, own in instances.items()
+            if point % own.step_points
+        ]
+        whys += [(name, f"its state cannot be restored: {why}") for name, why in lost.items()]
+        if whys:
+            findings = tuple(Finding(str(self.file), f"instances.{name}", why, "") for name, why in whys)
+            raise ConfigurationError(f"a run cannot begin with the state '{self.file}'", findings=findings)
+
+    def begin(self, run: RunPlan, replaced: Iterable[str] = ()) -> RunPlan:
         """The plan of a run that begins here: this point is its first one, and times are as they are.
+
+        The ``replaced`` instances begin anew: see `with_replaced`.
 
         Raises:
             ConfigurationError: it cannot begin here; carries all differences.
         """
-        values, plan, point, findings = self.check(run), run.plan, self.head.point, []
-        for name, own in plan.system.instances.items():
-            if point % own.step_points:
-                text = f"its step is {own.step_points} points, and the state is of point {point}, within one"
-                findings.append(Finding(str(self.file), f"instances.{name}", text, ""))
-        for name, why in stateless(plan.system).items():
-            findings.append(Finding(str(self.file), f"instances.{name}", f"its state cannot be restored: {why}", ""))
-        if findings:
-            text = f"a run cannot begin with the state '{self.file}'"
-            raise ConfigurationError(text, findings=tuple(findings))
+        run = with_replaced(run, replaced)
+        begins_with, plan, point = self.check(run), run.plan, self.head.point
+        lost = {name: why for name, why in stateless(plan.system).items() if name not in begins_with.anew}
+        self._check_point(run, lost)
         grid = replace(plan.grid, first_point=point)
         records = tuple(replace(own, first=own.point_of(own.rows_before(point))) for own in plan.system.records)
         system = replace(plan.system, grid=grid, records=records, begins_with=str(self.file.absolute()))
@@ -147,8 +187,31 @@ class StateFile(NamedTuple):
             name: replace(node, grid=grid, records=records if name == RECORDER else ())
             for name, node in plan.nodes.items()
         }
-        begins_with = BeginsWith(dict(self.states), values)
         return replace(run, plan=replace(plan, system=system, nodes=nodes), begins_with=begins_with)
+
+
+def with_replaced(run: RunPlan, names: Iterable[str]) -> RunPlan:
+    """The plan of a run with a state in which these instances begin anew: Initialization Mode is another one.
+
+    Raises:
+        ConfigurationError: there is no such instance.
+    """
+    if not (replaced := tuple(dict.fromkeys(names))):
+        return run
+    for name in replaced:
+        if name not in (known := run.plan.system.instances):
+            near = nearest(name, known)
+            text = f"{option_text('replaced', [name])}: mesh '{run.mesh}' has no such instance"
+            raise ConfigurationError(text, hint=f"Did you mean '{near}'?" if near else None)
+    return replace(run, plan=make_plan(replace(run.plan.system, replaced=replaced), contents=run.contents))
+
+
+def _prescribed(run: RunPlan, name: str, point: int) -> dict[str, PlainValue]:
+    """What a scenario has set of an instance by this point."""
+    own, grid = run.plan.system.instances[name], run.plan.grid
+    courses = courses_of(own.scenario, own.description, grid, own.step_points)
+    values = {variable: course.value(point // own.step_points) for variable, course in courses.items()}
+    return {variable: to_plain(value) for variable, value in values.items() if value is not None}
 
 
 def state_bytes(

@@ -68,6 +68,8 @@ def planned_sweep(
     _check_names(own, list(variants[0]))
     given = options.given()
     base = {name: given[name] for name in _OF_EACH_RUN if name in given}
+    if options.replaced:
+        base["replaced"] = [*options.replaced]
     if options.state is not None:
         base["state"] = str(Path(options.state).absolute())
     folder = SweepFolder(Path(options.folder).absolute() if options.folder is not None else _usual_folder(own, base))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ..config.call_options import Option
-from ..run.options import State, VariantOptions
+from ..run.options import BeginOptions
 
 if TYPE_CHECKING:
     from ..api.result import Result
@@ -17,10 +17,9 @@ Own = Callable[["Result"], object]
 """A reduction of the user: a function of a module, since workers import it."""
 
 
-class SweepOptions(VariantOptions, frozen=True, kw_only=True):
+class SweepOptions(BeginOptions, frozen=True, kw_only=True):
     """What `fmu_mesh.sweep` takes beside the mesh and what varies."""
 
-    state: State = None
     executor: Annotated[
         Executor | None,
         Option(

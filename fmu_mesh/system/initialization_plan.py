@@ -184,7 +184,10 @@ def _tear(system: ResolvedSystem, connection: Connection) -> Tear:
 
 
 def _reached(system: ResolvedSystem, connections: Sequence[Connection]) -> dict[int, list[Key]]:
-    """The connected outputs that depend on the target of a connection, by the id of the connection."""
+    """The connected outputs that depend on the target of a connection, by the id of the connection.
+
+    Where instances begin anew beside others with states, the rows in these states depend on nothing.
+    """
     outputs: dict[str, dict[str, Variable]] = {}
     parameters: dict[str, list[str]] = {}
     for c in connections:
@@ -193,10 +196,13 @@ def _reached(system: ResolvedSystem, connections: Sequence[Connection]) -> dict[
             parameters.setdefault(c.target_instance, []).append(c.target.name)
     # By instance and known: the outputs that depend on it, with their places; those that may depend on all by None.
     dependents: dict[tuple[str, str | None], list[tuple[int, str]]] = {}
+    in_rows = {_source(c) for c in connections if not c.initial_only}
     for instance, own in outputs.items():
         for number, output in enumerate(own.values()):
             description = system.instances[instance].description
             declared = _dependencies(output, parameters.get(instance, []), description)
+            if system.replaced and instance not in system.replaced and (instance, output.name) in in_rows:
+                declared = ()
             for known in dict.fromkeys(declared) if declared is not None else (None,):
                 dependents.setdefault((instance, known), []).append((number, output.name))
     reached = {}

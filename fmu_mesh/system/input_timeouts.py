@@ -64,6 +64,11 @@ class LastValues:
         if name in self.sent:
             insort(self.sent[name], step)
 
+    def count_from(self, step: int) -> None:
+        """Its instance begins at this own step: without a value, this one counts."""
+        for name in self.sent:
+            self.came(name, step)
+
     def late(self, step: int) -> dict[str, int]:
         """The inputs without a value for too long at the start of an own step, and the steps of their last values."""
         last = [(own, self._last(own, course, step)) for own, course in self._own]

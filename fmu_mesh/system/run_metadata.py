@@ -107,6 +107,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
         started: when the run was started, in UTC, after ISO 8601.
         host: name of the host that wrote the file.
         state: the state file with which the run began, absolute; empty: it began at point 0.
+        replaced: the instances that began anew there.
     """
 
     format: int
@@ -128,6 +129,7 @@ class RunMetadata(msgspec.Struct, frozen=True):
     started: str
     host: str
     state: str = ""
+    replaced: tuple[str, ...] = ()
 
 
 def metadata_of(
@@ -177,6 +179,7 @@ def metadata_of(
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         host=socket.gethostname(),
         state=system.begins_with,
+        replaced=system.replaced,
     )
 
 

@@ -22,6 +22,7 @@ from .system import ResolvedSystem
 __all__ = ["BeginsWith", "SavedInstance", "differences", "saved_instances", "stateless"]
 
 _DIGITS = 16
+_OF_MODEL = ("kind", "model", "variables", "options")
 
 
 class SavedInstance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,10 +43,12 @@ class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         states: that of each instance.
         set_again: the start values that are others now, by instance and variable.
+        anew: of each instance of the mesh that begins anew there, what its scenario has set by then.
     """
 
     states: dict[str, bytes] = {}
     set_again: dict[str, dict[str, PlainValue]] = {}
+    anew: dict[str, dict[str, PlainValue]] = {}
 
     def only(self, names: Iterable[str]) -> BeginsWith:
         """What these instances need."""
@@ -53,6 +56,7 @@ class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return BeginsWith(
             {name: state for name, state in self.states.items() if name in known},
             {name: values for name, values in self.set_again.items() if name in known},
+            self.anew,
         )
 
 
@@ -81,6 +85,8 @@ def saved_instances(
     ``contents`` is the SHA-256 of each model, and ``others`` are the start values that are not as in the plan.
     """
     found = {}
+    ends = [(c.source_instance, c.source.name) for c in plan.connections]
+    ends += [(c.target_instance, c.target.name) for c in plan.connections]
     for name, own in plan.system.instances.items():
         described = own.description
         fed = [
@@ -88,6 +94,7 @@ def saved_instances(
             for c in plan.connections
             if c.target_instance == name
         ]
+        used = {schedule.variable for schedule in own.scenario} | {variable for end, variable in ends if end == name}
         agreed = {
             "kind": f"{described.kind} {described.fmi_version}".strip(),
             "step": counted(own.step_points, "point"),
@@ -100,6 +107,11 @@ def saved_instances(
         }
         if plan.consistent:
             agreed["consistent outputs"] = _hash(plan.nodes[own.node].instance(name).step_feeds)
+        agreed |= {
+            f"variable '{v.name}'": f"{v.type}{[*v.shape] if v.shape else ''} {v.causality}"
+            for v in described.variables
+            if v.name in used
+        }
         given = {variable: to_plain(value) for variable, value in own.start_values.items()}
         found[name] = SavedInstance(agreed, given | dict(others.get(name, {})))
     return found
@@ -108,22 +120,26 @@ def saved_instances(
 def differences(
     saved: Mapping[str, SavedInstance], plan: Plan, contents: Mapping[str, str]
 ) -> tuple[list[tuple[str, str]], dict[str, dict[str, PlainValue]]]:
-    """What differs between the mesh of a state and that of a plan.
+    """What differs between the mesh of a state and that of a plan; of an instance that is replaced, its interface.
 
     Returns:
         Why the state cannot be restored: instances, and what differs, in words. And the start values that differ and
         can be set between two steps, by instance and variable: of tunable parameters, and of inputs that are free.
     """
     own, set_again = saved_instances(plan, contents), dict[str, dict[str, PlainValue]]()
+    replaced = plan.system.replaced
     refused = [(name, "the mesh has no such instance") for name in saved if name not in own]
     for name, there in own.items():
         if name not in saved:
             refused.append((name, "the state has no such instance"))
             continue
         for what, now in there.agreed.items():
+            if name in replaced and what in _OF_MODEL:
+                continue
             if (was := saved[name].agreed.get(what, "not known")) != now:
                 refused.append((name, f"{what}: {now} here, and {was} in the state"))
-        for variable, value, why in _start_values(plan, name, saved[name].start_values, there.start_values):
+        before = there.start_values if name in replaced else saved[name].start_values
+        for variable, value, why in _start_values(plan, name, before, there.start_values):
             if why:
                 refused.append((name, why))
             else:

@@ -84,7 +84,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         scenario_files: the SHA-256 of each file with values of the scenario, by absolute path.
         topics: those in ROS.
         recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
-        begins_with: the state file with which it begins, absolute, or nothing.
+        begins_with: the state file with which it begins, absolute, or nothing; the ``replaced`` begin anew there.
         feedthrough: the derivatives of outputs by inputs at the same point, if outputs are made consistent.
     """
 
@@ -99,6 +99,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     recorded_keys: RecordedKeys | None = None
     begins_with: str = ""
     feedthrough: dict[str, dict[str, dict[str, float]]] = {}
+    replaced: tuple[str, ...] = ()
 
     @property
     def keys(self) -> tuple[KeyView, ...]:

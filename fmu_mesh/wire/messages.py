@@ -5,18 +5,19 @@ four spare bytes, point (i64). In a frame the rows follow (`fmu_mesh.wire.frames
 `ErrorReport`, in a RESET a `NewStart`, and for the recorder (`FOR_METADATA`) in a SET a `SetValue`, in a NOTED a
 `Noted`, in a KEYS values that have come by keys, and for the audit in a REFUSED an `AuditEntry`. LAST says that no more
 rows of a link come, because the run has ended early. SAVE asks the nodes for their states at a point, and a STATE has
-that of one instance, as MessagePack (`InstanceState`). Every decoder checks sizes before it reads anything, and raises
-only `MessageRefused`.
+that of one instance, or a part of it, as MessagePack (`InstanceState`). Every decoder checks sizes before it reads
+anything, and raises only `MessageRefused`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from ..errors import ErrorReport, MessageRefused
 from ..files import decoded_json
@@ -38,7 +39,7 @@ __all__ = [
     "KEYS",
     "LAST",
     "MAX_MESSAGE_SIZE",
-    "MAX_STATE_SIZE",
+    "MAX_STATES_SIZE",
     "PROGRESS",
     "REFUSED",
     "RESET",
@@ -78,8 +79,10 @@ STATE: Final = 16
 FOR_METADATA: Final = (SET, KEYS, NOTED)
 
 MAX_MESSAGE_SIZE: Final = 64 * 2**20
-MAX_STATE_SIZE: Final = MAX_MESSAGE_SIZE - 2**16
-"""Of the state of an instance in a message, with room for the rest."""
+MAX_STATES_SIZE: Final = 2**30 - 2**24
+"""Of all instances at a point: the largest message of Zenoh, with room for the head of a file."""
+
+_PART = 2**20
 
 T = TypeVar("T")
 
@@ -122,10 +125,11 @@ class SetValue(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class InstanceState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The state of an instance for a checkpoint; an error in its place: it cannot be written."""
+    """The state of an instance for a checkpoint, or a part of it; an error in its place: it cannot be written."""
 
     instance: str
     state: bytes = b""
+    more: bool = False
     error: ErrorReport | None = None
 
 
@@ -178,9 +182,13 @@ def encode_news(news: SetValue | AuditEntry | Noted | Sequence[KeyValue]) -> byt
     return encode_json(KEYS, news, news[-1][1])
 
 
-def encode_state(state: InstanceState, point: int) -> bytes:
-    """A STATE message of the communication point of the state."""
-    return HEADER.pack(STATE, 0, 0, point) + msgspec.msgpack.encode(state)
+def encode_state(state: InstanceState, point: int) -> Iterator[bytes]:
+    """The STATE messages of the communication point of the state, in their order."""
+    size = len(state.state)
+    for first in range(0, max(size, 1), _PART):
+        end = first + _PART
+        part = replace(state, state=state.state[first:end], more=end < size)
+        yield HEADER.pack(STATE, 0, 0, point) + msgspec.msgpack.encode(part)
 
 
 def decode_state(data: bytes) -> InstanceState:

@@ -35,6 +35,7 @@ RIGHT: Mapping[str, Any] = {
     "scenario": {"events": []},
     "keys_from": os.devnull,
     "state": None,
+    "replaced": [],
     "listen": ["tcp/127.0.0.1:0"],
     "connect": ["tcp/127.0.0.1:7447"],
     "security": "lab/host",

@@ -6,13 +6,16 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+import fmu_mesh
 from fmu_mesh.config.mesh import TimeoutsConfig
+from fmu_mesh.errors import DeadlineExceeded
 from fmu_mesh.instances.gazebo.gazebo_process import GazeboGone, GazeboProcess
 from fmu_mesh.run import fork_server
 from fmu_mesh.run.fork_server import ForkServer
@@ -32,8 +35,11 @@ def full_pipe(path: Path) -> Iterator[None]:
         os.close(reader)
 
 
+@pytest.mark.parametrize("local", [(), ("--local",)], ids=["in processes", "local"])
 @pytest.mark.parametrize("stop_time", [None, 3.0], ids=["in the run", "at its end"])
-def test_a_write_that_does_not_return_ends_the_run(place: Place, stop_time: float | None) -> None:
+def test_a_write_that_does_not_return_ends_the_run(
+    place: Place, stop_time: float | None, local: tuple[str, ...]
+) -> None:
     """3000 rows have more than 64 KiB, and are written when all of them are there."""
     config = write_config(
         place.folder,
@@ -43,12 +49,27 @@ def test_a_write_that_does_not_return_ends_the_run(place: Place, stop_time: floa
     )
 
     with full_pipe(place.folder / "blocked.csv"):
-        launched = place.run("launch", config, "--no-progress")
+        launched = place.run("launch", config, "--no-progress", *local)
 
     assert launched.wait() == 4, launched.story()
     assert f"'{place.folder / 'blocked.csv'}' has not taken what the recorder writes for 0." in launched.errors
     assert "Does its file system answer? `timeouts.write` limits it." in launched.errors
     place.assert_nothing_left(within_s=5.0)
+
+
+def test_a_write_of_a_program_that_returns_too_late_ends_its_thread(tmp_path: Path) -> None:
+    config = write_config(
+        tmp_path, simulation={"stop_time": None}, timeouts={"write": 0.3}, record={"file": "blocked.csv"}
+    )
+
+    with full_pipe(tmp_path / "blocked.csv"):
+        with pytest.raises(DeadlineExceeded, match=r"has not taken what the recorder writes for 0\.") as refused:
+            fmu_mesh.load(config).run(processes=False)
+        assert refused.value.point is not None
+        [left] = [own for own in threading.enumerate() if own.name.startswith("run of")]
+
+    left.join(5.0)  # the pipe is closed, and so the write returns
+    assert not left.is_alive()
 
 
 def test_a_node_says_what_it_waits_for_and_so_does_the_error(place: Place) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 import fmu_mesh
@@ -26,6 +27,20 @@ class Words(fmu_mesh.Component):
     def step(self, time, step_size):
         self.count += self.u
         self.word = f"{self.count:.3f}"
+"""
+LARGE = """
+import numpy as np
+import fmu_mesh
+
+class Large(fmu_mesh.Component):
+    y = fmu_mesh.Output(start=0.0)
+
+    def __init__(self):
+        self.memory = np.arange(2**24, dtype=float)
+
+    def step(self, time, step_size):
+        self.memory[0] += 0.5
+        self.y = self.memory[0] + self.memory[-1]
 """
 AT = 200
 """The point of the branch: 20 s."""
@@ -124,6 +139,34 @@ def test_a_run_is_saved_and_begins_there_in_every_way(tmp_path: Path, event_fmu:
             assert system.point == points[number]
             system.step(4)
             assert system.get("slow.y") == whole["slow.y"][system.point]
+
+
+def large(folder: Path) -> fmu_mesh.Mesh:
+    """A mesh with a component whose state takes 128 MiB."""
+    (folder / "large.py").write_text(LARGE, encoding="utf-8")
+    instances = {"large": {"python": "large.py:Large"}, "gain": {"fmu": "Gain"}}
+    return fmu_mesh.load(write_config(folder, instances=instances, connections=["large.y -> gain.u"]))
+
+
+def test_a_large_state_comes_in_parts_and_leaves_no_memory_behind(tmp_path: Path) -> None:
+    mesh, state = large(tmp_path), tmp_path / "a.state"
+    whole = alone(mesh)
+
+    def in_use() -> float:
+        """The memory of all processes of the run, in MiB."""
+        return sum(own.memory_info().rss for own in psutil.Process().children(recursive=True)) / 2**20
+
+    with mesh.start(record="memory", paused=True) as run:
+        run.step(100)
+        found = []
+        for _ in range(4):
+            assert run.checkpoint(state, timeout=DEADLINE_S) == 100
+            found.append(in_use())
+        run.resume()
+        assert_goes_on(run.wait(), whole, 0)
+    assert state.stat().st_size > 2**27
+    assert max(found[1:]) < found[0] + 64  # each state has twice as much
+    assert_goes_on(mesh.run(record="memory", state=state), whole, 100)
 
 
 def test_values_that_wait_for_their_time_are_in_a_checkpoint(tmp_path: Path) -> None:

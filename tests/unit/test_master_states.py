@@ -19,11 +19,14 @@ from fmu_mesh.errors import (
     TerminationRequested,
 )
 from fmu_mesh.master.actions import Action, AnswerAll, Commanded, EndAll, FollowClock, RaiseGrant, SendToAll
+from fmu_mesh.master.checkpoints import Checkpoints
 from fmu_mesh.master.master_states import MasterStates
+from fmu_mesh.master.mesh_server import MasterSettings
 from fmu_mesh.simtime import ENDLESS
 from fmu_mesh.system.plan import RECORDER, Plan
 from fmu_mesh.wire.membership import NodeReady, Registration
-from fmu_mesh.wire.messages import FINISH, GRANT, SAVE, NodeReport, sealed
+from fmu_mesh.wire.messages import FINISH, GRANT, SAVE, InstanceState, NodeReport, encode_state, sealed
+from fmu_mesh.wire.refusals import Refusals
 from fmu_mesh.wire.views import Command
 from fmu_mesh.wire.ways import Ways
 from tests.helpers import write_config
@@ -620,6 +623,40 @@ def test_all_nodes_are_held_at_a_common_point_until_saved(plan: Plan) -> None:
     run.states.saved()
     run.decide()
     assert run.states.granting.grant > 16
+
+
+def test_states_in_parts_are_put_together_and_refused_beyond_a_limit(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, kept = running(plan), list[tuple[int, bytes]]()
+    settings = MasterSettings(
+        as_file=lambda _point, states: b"|".join(states.values()),
+        checkpoint_s=0.2,
+        keep=lambda point, data: kept.append((point, data)),
+    )
+    checkpoints = Checkpoints("pair", run.states, lambda: 13, settings, Refusals())
+
+    def come(state: bytes) -> None:
+        """A checkpoint to which `pendulum` gives this state, and `delay` three bytes."""
+        run.now += 100.0
+        checkpoints.settle(run.now)
+        at = run.states.saves_at
+        assert at is not None
+        for name, own in (("pendulum", state), ("delay", b"abc")):
+            for message in encode_state(InstanceState(name, own), at):
+                assert len(message) < 200
+                checkpoints.take(name, at, message)
+        checkpoints.settle(run.now)
+        checkpoints.answer()
+
+    monkeypatch.setattr("fmu_mesh.wire.messages._PART", 10)
+    come(bytes(range(25)))
+    assert [data for _, data in kept] == [bytes(range(25)) + b"|abc"]
+
+    monkeypatch.setattr("fmu_mesh.master.checkpoints.MAX_STATES_SIZE", 25)
+    come(bytes(25))
+    assert run.states.saves_at is None
+    assert len(kept) == 1
 
 
 def test_a_pause_before_a_common_point_saves_nothing(plan: Plan) -> None:

@@ -46,6 +46,7 @@ GIVEN: dict[str, tuple[str | None, Any]] = {
     "config_values": ("zenoh.mode=client", {"zenoh.mode": "client"}),
     "keys_from": ("first.csv", Path("first.csv")),
     "state": ("at20s.state", Path("at20s.state")),
+    "replaced": ("pump", ("pump",)),
     "output": ("r.csv", Path("r.csv")),
     "listen": ("tcp/127.0.0.1:1", ("tcp/127.0.0.1:1",)),
     "connect": ("tcp/127.0.0.1:2", ("tcp/127.0.0.1:2",)),

@@ -73,6 +73,8 @@ def encoded(value: object) -> bytes:  # noqa: C901  one case for each type
         return msgspec.msgpack.encode(tree(value, ""))
     except (RecursionError, UnicodeEncodeError) as error:
         raise NotPlain(f"has a value that cannot be written: {error}") from error
+    finally:
+        alive.clear()  # a function that calls itself is in a circle of objects, and would keep them
 
 
 def plain(data: bytes) -> Any:  # noqa: ANN401, C901  what was encoded
@@ -127,6 +129,8 @@ def plain(data: bytes) -> Any:  # noqa: ANN401, C901  what was encoded
         return value(msgspec.msgpack.decode(data))
     except (msgspec.MsgspecError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(str(error)) from error
+    finally:
+        known.clear()  # as above
 
 
 def check_memory(attributes: Mapping[str, object]) -> None:
